@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gripmon.daemon.config import Config, load_config
     from gripmon.daemon.forecast import Forecast, forecast
     from gripmon.daemon.replaying import replay
-    from gripmon.daemon.simulating import simulate_images
+    from gripmon.daemon.simulated import simulate_images
     from gripmon.laser.api import calibrate_laser
     from gripmon.model.errors import InputError, NoResultError
     from gripmon.model.records import Frame, FrameRecord
@@ -60,7 +60,7 @@ _WHERE = {
     "open_source": "daemon.api",
     "replay": "daemon.replaying",
     "report": "analyse.api",
-    "simulate_images": "daemon.simulating",
+    "simulate_images": "daemon.simulated",
     "teach_edges": "teach.api:teach",
     "verify": "calibrate.api",
 }

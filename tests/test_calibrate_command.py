@@ -18,7 +18,7 @@ from support.plates import Look, fingers, pose, render
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.intrinsics import lens_vector
 from gripmon.cli import main
-from gripmon.cli.calibration_files import target_of
+from gripmon.daemon.calibrations import target_of
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.camera import BrownConradyLens, PaperLens
 from gripmon.model.errors import InputError

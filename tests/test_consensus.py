@@ -12,15 +12,13 @@ from gripmon.track.edges.consensus import (
     Consensus,
     ConsensusSettings,
     Prior,
-    Votes,
     agree,
     agree_from_grid,
-    base_weights,
     grid_of_starts,
     prior_information,
 )
 from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.track.edges.profiles import Candidates, profile_offsets_px
+from gripmon.track.edges.profiles import Candidates, Votes, base_weights, profile_offsets_px
 from gripmon.track.edges.uncertainty import CONTRADICTION, assess, without_one_edge
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()

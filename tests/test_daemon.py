@@ -18,7 +18,9 @@ from support.daemon_bench import NEVER, Bench, pause
 from support.loopback import frame_record, reference_record
 from support.stand_ins import REFUSED, ScriptedMonitor
 
-from gripmon.daemon import EstimatesFile, Reports, log_to_stderr
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.neighbours import Reports
+from gripmon.daemon.running import log_to_stderr
 from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     Alert,

@@ -11,7 +11,8 @@ from support.daemon_bench import Bench
 from support.loopback import frame_record, reference_record, wait_until
 from support.stand_ins import ScriptedMonitor
 
-from gripmon.daemon import StateKeeper, supervised
+from gripmon.daemon import supervised
+from gripmon.daemon.keeping import StateKeeper
 from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     Alert,

@@ -15,7 +15,7 @@ import pytest
 from support.gripmon_process import gripmon
 
 from gripmon.analyse.comparison import compare
-from gripmon.daemon import demo
+from gripmon.daemon import simulated as demo
 from gripmon.model.geometry import from_record, make_transform, to_record
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
 from gripmon.simulate import FrameTruth
@@ -47,9 +47,10 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
 def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch):
     with socket.create_server(("127.0.0.1", 0)) as server:
         taken = server.getsockname()[1]
-        monkeypatch.setattr(demo, "_PREFERRED_PORT", taken)
-        assert demo._free_port() != taken
-    assert demo._free_port() == taken
+        monkeypatch.setattr(demo, "_ZENOH_PORT", taken)
+        (other,) = demo.demo_config(4.0).settings.publish.listen
+        assert other.startswith("tcp/127.0.0.1:") and other != f"tcp/127.0.0.1:{taken}"
+    assert demo.demo_config(4.0).settings.publish.listen == (f"tcp/127.0.0.1:{taken}",)
 
 
 def record(seq: int, error_m: tuple[float, float, float], **changes: Any) -> FrameRecord:

@@ -6,9 +6,7 @@ import pytest
 from support.daemon_bench import Bench, pause
 from support.stand_ins import ScriptedSource
 
-from gripmon.daemon.drops import OVER_S, Drops
-from gripmon.daemon.settings import DaemonSettings
-from gripmon.daemon.watch import Watch
+from gripmon.daemon.watch import OVER_S, DaemonSettings, Drops, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity
 
 
@@ -65,8 +63,8 @@ def test_the_alert_is_raised_and_cleared_once():
 
 
 def test_the_daemon_raises_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gripmon.daemon.drops.OVER_S", 0.02)
-    monkeypatch.setattr("gripmon.daemon.drops._LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr("gripmon.daemon.watch.OVER_S", 0.02)
+    monkeypatch.setattr("gripmon.daemon.watch._LOOK_EVERY_S", 0.0)
 
     def drop(source: object) -> None:
         assert isinstance(source, ScriptedSource)

@@ -134,10 +134,13 @@ def test_a_narrow_bar_gives_two_candidates_of_opposite_signs():
 def test_smooth_shading_and_pure_noise_are_no_edges():
     shading = np.tile(np.linspace(60.0, 140.0, SIZE), (SIZE, 1)).astype(np.float32) / 255.0
     assert len(candidates_of(shading, 0.0, np.zeros(60)).sample) == 0
-    rng = np.random.default_rng(3)
-    noise = np.clip(128.0 + rng.normal(scale=6.0, size=(SIZE, SIZE)), 0, 255).astype(np.uint8)
-    # A limit of five standard deviations: next to nothing of sixty profiles with about ten independent places each.
-    assert len(candidates_of(noise, 33.0, np.zeros(60)).sample) <= 3
+    rng, found = np.random.default_rng(3), []
+    for _ in range(60):
+        noise = np.clip(128.0 + rng.normal(scale=6.0, size=(SIZE, SIZE)), 0, 255).astype(np.uint8)
+        found.append(len(candidates_of(noise, 33.0, np.zeros(60)).sample))
+    # Next to nothing of sixty profiles with about ten independent places each; samples in whole grey levels show twice
+    # as many.
+    assert np.median(found) <= 3
 
 
 def test_profiles_that_leave_the_image_are_not_measured():

@@ -282,7 +282,7 @@ def test_a_reach_in_millimetres_is_refused(tmp_path, camera, capsys):
     plan = ("--plan", tmp_path / "next.csv", "--reach", "850")
     with pytest.raises(SystemExit) as stopped:
         calibrate(table, "--camera", camera, "--out", tmp_path / "no.yaml", *plan)
-    assert stopped.value.code == 2 and "850 m is no arm's reach (millimetres?)" in capsys.readouterr().err
+    assert stopped.value.code == 2 and "850 m isn't an arm's reach (millimetres?)" in capsys.readouterr().err
 
 
 def out_of_step(data, uv):

@@ -18,8 +18,7 @@ from support.daemon_bench import Bench
 from support.loopback import alert_record
 from support.recorded import Recorded, frame, record, recorder, trace, wait_until
 
-from gripmon.daemon import DaemonSettings
-from gripmon.daemon.watch import Watch
+from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Severity
 from gripmon.record.write import ProcessRecorder
 from gripmon.record.write.health import SILENT_AFTER_S, Health

@@ -19,7 +19,7 @@ from support.gripmon_process import GRIPMON
 from support.loopback import frame_record
 
 from gripmon.cli import main
-from gripmon.cli.replay import _Counts
+from gripmon.daemon.replaying import Counts
 from gripmon.model.records import Frame, FrameRecord, Origin, Refusal
 from gripmon.monitor import Monitor
 
@@ -186,13 +186,15 @@ def test_an_output_that_cannot_be_written_is_said_before_work_begins(
 ):
     arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", str(tmp_path)]
     assert main(arguments) == 2
-    assert "can't be written" in capsys.readouterr().err
+    assert capsys.readouterr().err.splitlines() == [f"--out {tmp_path}: is a folder; a file"]
 
 
 def test_a_recording_that_cannot_be_written_is_said_before_work_begins(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    replayed(sequence, tmp_path / "out.jsonl", "--recording", str(tmp_path), code=2)
+    config, out = str(sequence / "config.yaml"), tmp_path / "out.jsonl"
+    assert main(["replay", str(sequence), "--config", config, "--out", str(out), "--recording", str(tmp_path)]) == 2
+    assert not out.exists()
     assert capsys.readouterr().err.splitlines() == [f"--recording {tmp_path}: is a folder; a file"]
 
 
@@ -226,7 +228,7 @@ def test_a_monitor_that_fails_on_a_frame_costs_that_frame_only(
 
 
 def test_the_summary_needs_no_memory_for_each_frame():
-    counts = _Counts()
+    counts = Counts()
     latencies_ns = np.random.default_rng(3).lognormal(14.0, 0.5, 5001).astype(int).tolist()
     for seq, latency_ns in enumerate(latencies_ns):
         counts.add(frame_record(seq, latency_ns=latency_ns, source=Origin.HELD, reason=f"few_points: {seq} left"))

@@ -20,11 +20,9 @@ from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import main
-from gripmon.cli.recorded_run import RecordedRun
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
-from gripmon.daemon.one_recording import one_recording
-from gripmon.daemon.recorded_run import as_recorded_before_bounds
+from gripmon.daemon.recorded_run import RecordedRun, as_recorded_before_bounds, one_recording
 from gripmon.daemon.replaying import replay
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (
@@ -145,7 +143,7 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
     capsys.readouterr()
     assert main(["replay", str(tmp_path / "a"), str(tmp_path / "b"), "--out", "-"]) == 2
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("replay: these are files of 2 runs (") and said.endswith("; the files of one")
+    assert said.startswith("these are files of 2 runs (") and said.endswith("; the files of one")
     assert str(paths["a"][0]) in said and str(paths["b"][0]) in said
     with_frames = [path for path in paths["b"] if contents(path, "record", "json")]
     last = replayed(with_frames[-1:], tmp_path / "last.jsonl")
@@ -281,7 +279,7 @@ def test_another_calibration_begins_with_its_own_reference(
     capsys.readouterr()
     lines = replayed(recording, tmp_path / "now.jsonl", "--config", str(sequence / "other.yaml"))
     assert {json.loads(line)["reference_id"] for line in lines} == {"another"}
-    assert "--config has another calibration" in capsys.readouterr().err
+    assert "the configuration has another calibration" in capsys.readouterr().err
 
 
 def test_what_cannot_be_replayed_is_said_in_one_line(
@@ -301,15 +299,15 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
     other.disconnect()
     (tmp_path / "empty").mkdir()
     cases = [
-        ([tmp_path / "old-0001.rrd"], 2, "holds no configuration; the one to replay with, by --config"),
+        ([tmp_path / "old-0001.rrd"], 2, "holds no configuration; the one to replay with"),
         ([tmp_path / "other.rrd"], 3, "is a recording of the application 'somebody_else'"),
         ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
         ([tmp_path / "nothing.rrd"], 3, "is empty"),
         ([tmp_path / "none.rrd"], 2, "there is no such file; recordings of gripmon run"),
-        ([tmp_path / "old-0001.rrd", sequence], 2, "is no .rrd file; one input, or several .rrd files of one run"),
+        ([tmp_path / "old-0001.rrd", sequence], 2, "isn't an .rrd file; one input, or several .rrd files of one run"),
         ([tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
         ([tmp_path / "old-0001.rrd", tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
-        ([sequence], 2, "only a recording brings its own configuration; --config CONFIG"),
+        ([sequence], 2, "isn't a recording, which alone brings its own configuration; name one"),
     ]
     (tmp_path / "picture.rrd").write_bytes(next(sequence.glob("*.png")).read_bytes())
     (tmp_path / "nothing.rrd").touch()
@@ -332,13 +330,13 @@ def test_a_recording_from_before_protection_levels_is_compared_by_what_it_says()
     run._differences, run._unbounded, run.recorded_config = Differences(), 0, None
     run.compare(record)
     assert run.summary() == (
-        "replay: all 1 as they were recorded, every number the same; "
+        "all 1 as they were recorded, every number the same; "
         "1 frames were recorded by a version without protection levels"
     )
     run.source.record = msgspec.structs.replace(then, rms_px=9.0)
     run.compare(record)
     assert run.summary().startswith(
-        "replay: verdicts, states and alerts of all 2 frames as recorded; numbers differ in 1, the TCP by up to 0 mm; "
+        "verdicts, states and alerts of all 2 frames as recorded; numbers differ in 1, the TCP by up to 0 mm; "
     )
 
 

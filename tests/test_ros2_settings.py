@@ -18,8 +18,11 @@ from support.loopback import (
 from support.ros2_graph import ON, layout, tokens
 from support.stand_ins import Listener, ScriptedMonitor, TickingSource
 
-from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.loop import Daemon
+from gripmon.daemon.neighbours import Reports
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish import Publishers
 from gripmon.io.ros2 import (
     Layout,
@@ -32,6 +35,7 @@ from gripmon.io.ros2 import (
     network_of,
 )
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.stopping import StopRequest
 
 
 def test_one_line_turns_it_on(tmp_path: Path):

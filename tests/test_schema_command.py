@@ -23,7 +23,7 @@ from support.published import Published
 from test_schemas import ONE_OF_EACH
 
 from gripmon.cli import main
-from gripmon.cli.schema import _NAMES
+from gripmon.cli.network import _MESSAGES as _NAMES
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import (
     MESSAGES,

@@ -14,8 +14,9 @@ from support.pulsed_scenes import PULSE_NS, cell, dark, lit
 from support.rubbish import broken_json
 from support.stand_ins import Listener, ScriptedSource
 
-from gripmon.daemon import DaemonSettings, run_second
 from gripmon.daemon.config.second import read_laser
+from gripmon.daemon.running import run_second
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.sources import Waiting
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import LONGEST_S, Told, of_message

@@ -22,7 +22,9 @@ from test_security import own_files
 import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
-from gripmon.daemon import DaemonSettings, Reports, run
+from gripmon.daemon.neighbours import Reports
+from gripmon.daemon.running import run
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.sources import FolderSettings, FolderSource, Waiting
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes

@@ -287,7 +287,7 @@ def test_a_calibration_with_a_plate_becomes_the_reference(rig: Rig, tmp_path: Pa
     other = msgspec.structs.replace(made, gripper=CalibratedGripper(name="other", sha256="0" * 64))
     (tmp_path / "hand_eye.yaml").write_text(as_yaml(msgspec.to_builtins(other)))
     code, out, err = run([*command, "--force"], capsys)
-    assert (code, out) == (2, "") and "gripper: is other, --gripper is" in err and len(err.splitlines()) == 1
+    assert (code, out) == (2, "") and "gripper: is other, the one given is" in err and len(err.splitlines()) == 1
 
 
 def test_a_calibrated_camera_is_named_and_its_doubt_counts(rig: Rig, tmp_path: Path, capsys):
@@ -327,11 +327,11 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([tmp_path / "none.png", *page], "the file is missing"),
         ([tmp_path, *page], "is a folder"),
         ([tmp_path / "small.png", *page], "320x240 pixels; 768x576"),
-        ([image, "--page", "--camera", camera, "--robot", "arm"], "no gripper; --gripper FILE"),
+        ([image, "--page", "--camera", camera, "--robot", "arm"], "--gripper: is missing; a gripper file"),
         ([image, image, "--page", "--camera", camera], "2 images, and no gripper; one image"),
         ([tmp_path / "small.png", "--page", "--camera", camera], "320 x 240 px; the camera's 768 x 576 px"),
         ([tmp_path / "broken.png", "--page"], "truncated, damaged or not an image"),
-        ([image, "--page", "--gripper", gripper], "no camera; --camera FILE"),
+        ([image, "--page", "--gripper", gripper], "--camera: is missing; a file of gripmon calibrate intrinsics"),
         ([image, "--page", "--camera", camera, "--gripper", tmp_path / "none.yaml"], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "none.yaml", "--gripper", gripper], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "no.yaml", "--gripper", gripper], "not YAML"),
@@ -349,7 +349,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *given, "--corners", tmp_path / "flat.yaml"], "corners.L_in_near: has 1 values"),
         ([image, *given, "--corners", tmp_path / "none.yaml"], "there is no such file"),
         ([image, "--gripper", gripper], "teach: --config is missing"),
-        ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera goes with --page"),
+        ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera: goes with --page"),
         ([], "no image"),
     ):
         code, out, err = run(["teach", *arguments], capsys)

@@ -22,7 +22,7 @@ from gripmon.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, P
 from gripmon.client.inbox import SENDS_S, Inbox
 from gripmon.client.judging import judge
 from gripmon.client.names import MonitorName, Start
-from gripmon.daemon import Reports
+from gripmon.daemon.neighbours import Reports
 from gripmon.io.publish.presence import Presence, new_monitor_id
 from gripmon.io.wire import Keys, Link, PublishSettings
 from gripmon.model.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json

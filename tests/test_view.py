@@ -194,7 +194,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(
     for arguments, code, said in (
         (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run, or their folder"),
         (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run, or their folder"),
-        (("text.rrd",), 2, f"{tmp_path}/text.rrd: is no recording; an .rrd file of gripmon's"),
+        (("text.rrd",), 2, f"{tmp_path}/text.rrd: isn't a recording; an .rrd file of gripmon's"),
         (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
     ):
         assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == code
@@ -214,7 +214,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(
         assert refused("run", str(config), "--view", "web") == (
             f"{config}: view.web_port: {port} is in use on 127.0.0.1; another port"
         )
-        assert refused("run", str(config), "--view", "native") == "--view native: there is no display; --view web"
+        assert refused("run", str(config), "--view", "native") == "--view native: there is no display; web"
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import pytest
 from support.loopback import frame_record
 from support.stand_ins import REFUSED
 
-from gripmon.daemon import DaemonSettings
-from gripmon.daemon.watch import Watch
+from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.model.records import Alert, AlertKind, Cause, OpenAlert, Severity, State, Verdict
 
 RAISED, CLEARED = "source raised", "source cleared"

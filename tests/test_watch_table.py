@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import random
 import resource
@@ -12,8 +13,8 @@ import pytest
 from support.loopback import alert_record, state_record
 
 from gripmon.cli import fleet_table
-from gripmon.cli.alert_log import AlertLog
-from gripmon.client import Condition, MonitorName, MonitorStatus, trouble
+from gripmon.cli.watch import _print_alerts
+from gripmon.client import AlertLog, Condition, MonitorName, MonitorStatus, trouble
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
 GONE_NS = 1_700_000_000_000_000_000
@@ -187,16 +188,27 @@ def test_json_has_what_the_table_is_made_from():
 ARM = MonitorName("arm", "wrist")
 
 
+class Log(AlertLog):
+    """As ``gripmon watch --alerts`` shows it."""
+
+    def __init__(self, path: Path | None, *, as_json: bool) -> None:
+        super().__init__(path)
+        self._arguments = argparse.Namespace(out=path, json=as_json)
+
+    def show(self) -> None:
+        _print_alerts(self, self._arguments)
+
+
 def test_the_alert_log_has_every_alert_once_over_restarts(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "alerts.jsonl"
     records = [alert_record(f"moved {i} mm") for i in range(3)]
     payloads = [to_json(record).replace(b'","', b'",\n"') for record in records]  # however its writer lays it out
     for first in (0, 1):  # the second run gets again what the monitor kept
-        log = AlertLog(path, as_json=False)
+        log = Log(path, as_json=False)
         for record, payload in zip(records[: 2 + first], payloads[: 2 + first], strict=True):
             log.alert(ARM, record, payload)
-        log.write()
-        log.write()
+        log.show()
+        log.show()
     assert [json.loads(line) for line in path.read_text().splitlines()] == [json.loads(p) for p in payloads]
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 3 and "arm/wrist  warning  drift, revision 3: moved 0 mm" in said[0]
@@ -209,19 +221,19 @@ def test_no_number_from_the_network_stops_the_table_or_the_log(number: int, caps
     for shown in (fleet_table.plain([strange], ""), fleet_table.line(strange)):
         assert str(number) in shown
     assert json.loads(msgspec.json.encode(fleet_table.as_data(strange)))["state"]["seq"] == number
-    log = AlertLog(None, as_json=False)
+    log = Log(None, as_json=False)
     record = msgspec.structs.replace(alert_record(), stamp_ns=number)
     log.alert(ARM, record, to_json(record))
-    log.write()
+    log.show()
     assert "arm/wrist" in capsys.readouterr().out
 
 
 def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "alerts.jsonl"
-    log = AlertLog(path, as_json=True)
+    log = Log(path, as_json=True)
     log.presence(status("arm"))
     log.presence(status("arm", gone=True))
-    log.write()
+    log.show()
     came, went = (json.loads(line) for line in path.read_text().splitlines())
     assert (came["event"], went["event"], went["stamp_ns"]) == ("appeared", "vanished", GONE_NS)
     assert {came["schema"], went["schema"]} == {"gripmon.presence/1"}
@@ -231,11 +243,11 @@ def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest
 def test_while_nobody_reads_what_is_printed_the_oldest_are_lost(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("gripmon.cli.alert_log._WAITING_MOST", 3)
-    log = AlertLog(None, as_json=True)
+    monkeypatch.setattr("gripmon.client.alert_log._WAITING_MOST", 3)
+    log = Log(None, as_json=True)
     for i in range(5):
         log.alert(ARM, alert_record(str(i)), to_json(alert_record(str(i))))
-    log.write()
+    log.show()
     assert [json.loads(line)["text"] for line in capsys.readouterr().out.splitlines()] == ["2", "3", "4"]
 
 
@@ -243,13 +255,13 @@ def test_a_log_that_can_not_be_written_is_said_once_and_complete_in_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     path = tmp_path / "there" / "alerts.jsonl"
-    log = AlertLog(path, as_json=True)
+    log = Log(path, as_json=True)
     for i in range(3):
         log.alert(ARM, alert_record(str(i)), to_json(alert_record(str(i))))
-        log.write()
+        log.show()
     path.parent.mkdir()
     path.write_bytes(b'{"cut off')  # by whoever wrote last
-    log.write()
+    log.show()
     lines = path.read_text().splitlines()
     assert lines[0] == '{"cut off' and [json.loads(line)["text"] for line in lines[1:]] == ["0", "1", "2"]
     errors = capsys.readouterr().err.splitlines()
@@ -260,18 +272,18 @@ def test_a_disk_that_is_full_in_the_middle_of_a_line_leaves_no_half_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     path = tmp_path / "alerts.jsonl"
-    log = AlertLog(path, as_json=False)
+    log = Log(path, as_json=False)
     payloads = [to_json(alert_record(str(i))) for i in range(2)]
     log.alert(ARM, alert_record("0"), payloads[0])
-    log.write()
+    log.show()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(payloads[0]) + 20, limits[1]))  # as large as a file may become
     try:
         log.alert(ARM, alert_record("1"), payloads[1])
-        log.write()
+        log.show()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == payloads[0] + b"\n"
-    log.write()
+    log.show()
     assert path.read_bytes().splitlines() == payloads
     assert capsys.readouterr().err == f"watch: --out {path}: File too large; trying again\n"

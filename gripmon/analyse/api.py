@@ -127,9 +127,9 @@ def correct(
 
 def _check_target(out: Path, recordings: Sequence[Path]) -> None:
     if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"--out {out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}")
+        raise InputError(f"{out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}", "out")
     if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
-        raise InputError(f"--out {out}: is a recording to correct; another file")
+        raise InputError(f"{out}: is a recording to correct; another file", "out")
 
 
 def _targets(out: Path, runs: int) -> list[Path]:
@@ -140,7 +140,7 @@ def _targets(out: Path, runs: int) -> list[Path]:
     there = next((target for target in targets if target.exists()), None)
     if there is not None:
         raise InputError(
-            f"--out {out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
+            f"{out}: each of {runs} runs gets a file of its own, and {there} is there already; another name", "out"
         )
     return targets
 
@@ -152,18 +152,18 @@ def _stamps(path: Path) -> NDArray[np.int64]:
         texts = csv.read_csv(path, convert_options=options)["stamp_ns"].to_pylist()
     except KeyError:
         right = "a first line with the columns' names, capture times in Unix ns"
-        raise InputError(f"--stamps {path}: has no column stamp_ns; {right}") from None
+        raise InputError(f"{path}: has no column stamp_ns; {right}", "stamps") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"--stamps {path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
+        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})", "stamps") from None
     stamps = []
     for number, text in enumerate(texts, 2):
         try:
             stamps.append(np.int64(int(text)))
         except (ValueError, OverflowError):
             wrong = f"line {number}: '{text}' is not a capture time; a whole number, Unix ns"
-            raise InputError(f"--stamps {path}: {wrong}") from None
+            raise InputError(f"{path}: {wrong}", "stamps") from None
     if not stamps:
-        raise InputError(f"--stamps {path}: holds no capture times")
+        raise InputError(f"{path}: holds no capture times", "stamps")
     return np.array(stamps, np.int64)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -69,6 +69,24 @@ class CameraFromViews:
     def outliers(self) -> int:
         """Points that were left out."""
         return sum(int((~used).sum()) for used in self.fit.used)
+
+    def values(self) -> dict[str, Any]:
+        """The result as plain values: px, and the lens's own units."""
+        fit, sigmas = self.fit, self.sigmas
+        views = zip(self.sightings, fit.used, fit.view_rms_px, strict=True)
+        return {
+            "model": fit.model,
+            "parameters": {name: {"value": value, "sigma": sigmas[name]} for name, value in fit.values.items()},
+            "rms_px": fit.rms_px,
+            "cross_validated_rms_px": fit.cross_validated_rms_px,
+            "criterion": fit.criterion,
+            "views": [
+                {"image": s.name, "points": len(s), "left_out": int((~used).sum()), "rms_px": rms, "note": s.note}
+                for s, used, rms in views
+            ],
+            "not_found": [{"image": name, "reason": reason} for name, reason in self.not_found.items()],
+            "warnings": list(fit.warnings),
+        }
 
     def document(self, provenance: Provenance) -> CameraCalibration:
         """What a file holds of it."""

@@ -1,4 +1,4 @@
-"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs.
+"""The command ``gripmon``: one declaration a subcommand, nothing heavy imported before a subcommand runs.
 
 ``argparse`` stays: it costs no import time, and its error lines and exit codes are what scripts rely on.
 """
@@ -11,46 +11,38 @@ import sys
 
 from gripmon import __version__
 from gripmon.cli import (
-    calibrate,
+    calibrate_arm,
+    calibrate_exchange,
+    calibrate_intrinsics,
+    calibrate_plane,
+    calibrate_verify,
     certificates,
     check,
-    correct,
     demo,
-    export,
-    feed,
+    network,
+    recordings,
     replay,
-    report,
-    router,
     run,
-    schema,
     send,
     simulate,
     teach,
-    view,
     watch,
 )
-from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED
+from gripmon.cli.common import Command
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.stopping import EXIT_INTERRUPTED
 
 _COMMANDS = (
-    demo,
-    run,
-    watch,
-    send,
-    router,
-    schema,
-    feed,
-    replay,
-    view,
-    report,
-    export,
-    correct,
-    simulate,
-    check,
-    calibrate,
-    teach,
-    certificates,
-)
+    demo.demo, run.run, watch.watch, send.send, network.router, network.schema, network.feed, replay.replay,
+    recordings.view, recordings.report, recordings.export, recordings.correct, simulate.simulate, check.check,
+)  # fmt: skip
+_METHODS = (
+    calibrate_intrinsics.intrinsics, calibrate_plane.plane, calibrate_arm.laser, calibrate_arm.robot_world,
+    calibrate_verify.verify, calibrate_exchange.import_, calibrate_exchange.export,
+)  # fmt: skip
+_LAST = (teach.teach, certificates.certificates)
+
+_EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 
 # To be set before NumPy and OpenCV are imported; what the user has set stays.
 _ENVIRONMENT = {
@@ -58,7 +50,7 @@ _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    # A camera that is absent, or a file that is no video, we report in our own words.
+    # A camera that is absent, or a file that isn't a video, we report in our own words.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
     # rerun's own lines, read when it is imported: so are a disk that is full and a file that is damaged.
@@ -79,17 +71,41 @@ first steps:
 exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what
 would be right); 3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
 
+_CALIBRATE = """\
+The off-line methods, from images alone.  Each writes a file with residuals, covariance and
+provenance, whole or not at all, and replaces none without --force."""
+
+_CALIBRATE_EPILOG = """\
+examples:
+  gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
+  gripmon calibrate plane on_plate.png --camera camera.yaml --target circles:8x8:0.008:0.004 \\
+      --gripper gripper.yaml --corners rough.yaml --out hand_eye.yaml
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml
+
+exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why"""
+
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all subcommands; each sets ``handler``."""
-    parser = argparse.ArgumentParser(
-        prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """The parser of all subcommands; each sets ``command``."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=raw)
     parser.add_argument("--version", action="version", version=f"gripmon {__version__}")
     parser.add_argument("--print-completion", action=_PrintCompletion, choices=("bash", "zsh"), help=argparse.SUPPRESS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in _COMMANDS:
-        command.add_parser(commands)
+        command.add_to(commands)
+    calibrate = commands.add_parser(
+        "calibrate",
+        help="calibrate from images: camera, hand/eye and more",
+        description=_CALIBRATE,
+        epilog=_CALIBRATE_EPILOG,
+        formatter_class=raw,
+    )
+    methods = calibrate.add_subparsers(title="methods", metavar="METHOD", required=True)
+    for method in _METHODS:
+        method.add_to(methods)
+    for command in _LAST:
+        command.add_to(commands)
     return parser
 
 
@@ -109,16 +125,17 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command line (default: the process's own) return its exit code; wrong usage raises ``SystemExit(2)``."""
     parser = build_parser()
     chosen = parser.parse_args(arguments)
-    if not hasattr(chosen, "handler"):
+    if not hasattr(chosen, "command"):
         parser.print_help()
         return 0
     for variable, value in _ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
+    command: Command = chosen.command
     try:
-        code: int = chosen.handler(chosen)
+        code = command.run(chosen)
         sys.stdout.flush()
     except (InputError, NoResultError) as error:
-        print(error, file=sys.stderr)
+        print(_in_words(error, chosen), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
@@ -126,5 +143,19 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:
         # Whoever read our output has seen enough.  Python would complain once more at exit without this.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
+        return _EXIT_BROKEN_PIPE
     return code
+
+
+def _in_words(error: InputError | NoResultError, arguments: argparse.Namespace) -> str:
+    """The line that says it; where a function's argument is wrong, the option stands in front."""
+    command: Command = arguments.command
+    if isinstance(error, InputError):
+        for name in (error.argument, error.argument.rpartition("_")[0]):
+            if option := command.arguments.get(name):
+                given = getattr(arguments, name)
+                values = tuple(map(str, given if isinstance(given, list) else [given]))
+                return f"{option} {error.wrong}" if error.wrong.startswith(values) else f"{option}: {error.wrong}"
+        return str(error)
+    details = getattr(error, "details", None)  # of gripmon.calibrate.sighting.CalibrationError
+    return str(error) if details is None else "\n".join([*details, f"{command.prog}: {error}"])

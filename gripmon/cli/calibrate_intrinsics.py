@@ -6,11 +6,17 @@ import argparse
 import json
 import math
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gripmon.cli import calibration_files as files
-from gripmon.cli import common
+from gripmon.cli.common import (
+    REQUIRED,
+    Command,
+    check_outputs,
+    command_line,
+    progress_bar,
+    write_document,
+    write_picture,
+)
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +31,21 @@ view, corners included, the target tilted by 20 to 45 degrees to different sides
 comes a calibration with the principal point at the image's centre and square pixels, as in the
 self-viewing method."""
 
+_OPTIONS = """
+IMAGE...               image file, or folder with images
+--target TARGET        chequerboard:COLUMNSxROWS:SQUARE (inner corners, m),
+                       charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m),
+                       circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), or FILE.yaml of a calibration with it
+--model                lens model; auto: the one with the smallest information criterion
+                       (default: brown_conrady; of a single image paper)
+--fix NAME[=VALUE]...  hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square
+                       pixels) or fx_px=870.5 (there); may be given several times
+--out FILE.yaml        file to write
+--picture FILE.png     also draw the residuals over the image, and how each view fits
+--force                replace files that are there
+--json                 one JSON object instead of text; px, the lens's own units
+"""
+
 _EXAMPLES = """\
   gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
   gripmon calibrate intrinsics plate/ --target charuco:8x6:0.03:0.022:DICT_4X4_250 --model auto \\
@@ -35,69 +56,34 @@ exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated 
 nothing is written then"""
 
 
-def add_parser(methods: Any) -> None:
-    """Add the method."""
-    parser = common.add_command(
-        methods, "intrinsics", run, "a camera from images of a flat target", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="image file, or folder with images")
-    parser.add_argument(
-        "--target",
-        required=True,
-        metavar="TARGET",
-        help="chequerboard:COLUMNSxROWS:SQUARE (inner corners, m), charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] "
-        "(squares, m), circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), or FILE.yaml of a calibration with it",
-    )
-    parser.add_argument(
-        "--model",
-        choices=(*MODELS, "auto"),
-        help="lens model; auto: the one with the smallest information criterion "
-        "(default: brown_conrady; of a single image paper)",
-    )
-    parser.add_argument(
-        "--fix",
-        action="append",
-        default=[],
-        metavar="NAME[=VALUE]",
-        help="hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square pixels) or "
-        "fx_px=870.5 (there); may be given several times",
-    )
-    parser.add_argument("--out", required=True, metavar="FILE.yaml", help="file to write")
-    parser.add_argument(
-        "--picture", metavar="FILE.png", help="also draw the residuals over the image, and how each view fits"
-    )
-    parser.add_argument("--force", action="store_true", help="replace files that are there")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of text; px, the lens's own units")
-
-
-def run(arguments: argparse.Namespace) -> int:
+@Command(
+    "intrinsics", "a camera from images of a flat target", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    target=REQUIRED, model={"choices": (*MODELS, "auto")}, fix={"default": []}, out=REQUIRED,
+)  # fmt: skip
+def intrinsics(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate intrinsics``."""
     import cv2
 
     from gripmon.calibrate.api import calibrate_intrinsics
     from gripmon.calibrate.picture import draw_maps
+    from gripmon.daemon.calibrations import target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
 
     cv2.setNumThreads(1)
-    out, picture = Path(arguments.out), arguments.picture and Path(arguments.picture)
-    files.check_output(out, force=arguments.force)
-    if picture:
-        files.check_picture(picture, force=arguments.force)
-    target = files.target_of(arguments.target)
-    fixed = _fixed(arguments)
-    paths = image_paths(arguments.images)
-    with files.errors_of("intrinsics"):
-        found = calibrate_intrinsics(paths, target, model=arguments.model, fixed=fixed, progress=common.progress_bar)
+    check_outputs(arguments, "out", "picture")
+    target, fixed, paths = target_of(arguments.target), _fixed(arguments), image_paths(arguments.image)
+    found = calibrate_intrinsics(paths, target, model=arguments.model, fixed=fixed, progress=progress_bar)
     for name, reason in found.not_found.items():
         print(f"{name}: {reason}", file=sys.stderr)
-    options = files.options_of(arguments, "target", "model", "fix", "out", "picture", "force")
-    document = found.document(provenance_of(files.command_line("intrinsics", arguments.images, options), paths))
-    if picture:
-        files.write_picture(draw_maps(found.fit, found.sightings), picture)
-    files.write_document(document, out)
-    print(json.dumps(_values(found, out), indent=2) if arguments.json else _summary(found, out, fixed))
-    return common.EXIT_DONE
+    document = found.document(provenance_of(command_line(arguments), paths))
+    if arguments.picture is not None:
+        write_picture(draw_maps(found.fit, found.sightings), arguments.picture)
+    write_document(document, arguments.out)
+    if arguments.json:
+        print(json.dumps({"out": str(arguments.out), **found.values()}, indent=2))
+    else:
+        print("\n".join([*_summary(found, fixed), f"written: {arguments.out}"]))
 
 
 def _fixed(arguments: argparse.Namespace) -> dict[str, float | None]:
@@ -121,25 +107,7 @@ def _fixed(arguments: argparse.Namespace) -> dict[str, float | None]:
     return fixed
 
 
-def _values(found: CameraFromViews, out: Path) -> dict[str, Any]:
-    fit, sigmas = found.fit, found.sigmas
-    return {
-        "out": str(out),
-        "model": fit.model,
-        "parameters": {name: {"value": value, "sigma": sigmas[name]} for name, value in fit.values.items()},
-        "rms_px": fit.rms_px,
-        "cross_validated_rms_px": fit.cross_validated_rms_px,
-        "criterion": fit.criterion,
-        "views": [
-            {"image": s.name, "points": len(s), "left_out": int((~used).sum()), "rms_px": rms, "note": s.note}
-            for s, used, rms in zip(found.sightings, fit.used, fit.view_rms_px, strict=True)
-        ],
-        "not_found": [{"image": name, "reason": reason} for name, reason in found.not_found.items()],
-        "warnings": list(fit.warnings),
-    }
-
-
-def _summary(found: CameraFromViews, out: Path, fixed: dict[str, float | None]) -> str:
+def _summary(found: CameraFromViews, fixed: dict[str, float | None]) -> list[str]:
     fit, views = found.fit, len(found.sightings)
     lines = [f"{'parameter':<15} {'value':>14} {'±':>11}"]
     for name, value in fit.values.items():
@@ -160,5 +128,4 @@ def _summary(found: CameraFromViews, out: Path, fixed: dict[str, float | None]) 
         lines.append("model            information criterion above the best")
         ranked = sorted(fit.criterion.items(), key=lambda item: item[1])
         lines += [f"{name:<16} {value - least:>8.1f}" for name, value in ranked]
-    lines += [f"warning: {warning}" for warning in fit.warnings]
-    return "\n".join([*lines, f"written: {out}"])
+    return [*lines, *(f"warning: {warning}" for warning in fit.warnings)]

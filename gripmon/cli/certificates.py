@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import re
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gripmon.cli import common
+from gripmon.cli.common import REQUIRED, Command, make_directory, writing
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +21,15 @@ alone.
 
 The authority's key, ca-key.pem, makes more certificates: keep it away from the robots."""
 
+_OPTIONS = """
+[NAME...]         common names; default: router, controller, operator and those of the robots
+--robot ROBOT...  a robot's name, for its two certificates; several times if need be; default: arm1
+--rules FILE      add the rules for these robots to the router's file (router.json5 or like it)
+--out DIR         the folder; made if it is missing
+--host HOST...    name or address at which the router, or who is named, will be reached; several times if need be;
+                  default: localhost, 127.0.0.1, ::1 for the router
+"""
+
 _EXAMPLES = """\
   gripmon certificates --out certificates                     router, controller, operator, robot arm1
   gripmon certificates --out certificates --host 10.0.0.5     the router will be reached at 10.0.0.5
@@ -33,122 +41,71 @@ _EXAMPLES = """\
 It needs the package cryptography: pip install -e '.[certificates]' in gripmon's checkout.
 exit codes: 0 done; 2 wrong usage, a folder that can't be written to"""
 
-_CLIENTS = ("controller", "operator")
-_ROBOT = "arm1"  # the one in the shipped files
-_LOCAL = ("localhost", "127.0.0.1", "::1")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _LONGEST_NAME = 50
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands, "certificates", make, "make keys and certificates for mutual TLS", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument(
-        "names",
-        metavar="NAME",
-        nargs="*",
-        type=_name,
-        help=f"common names; default: router, {', '.join(_CLIENTS)} and those of the robots",
-    )
-    parser.add_argument(
-        "--robot",
-        action="append",
-        metavar="ROBOT",
-        default=[],
-        help=f"a robot's name, for its two certificates; several times if need be; default: {_ROBOT}",
-    )
-    parser.add_argument(
-        "--rules", metavar="FILE", help="add the rules for these robots to the router's file (router.json5 or like it)"
-    )
-    parser.add_argument("--out", required=True, metavar="DIR", help="the folder; made if it is missing")
-    parser.add_argument(
-        "--host",
-        action="append",
-        metavar="HOST",
-        default=[],
-        help="name or address at which the router, or who is named, will be reached; several times if need be; "
-        f"default: {', '.join(_LOCAL)} for the router",
-    )
+def _name(text: str) -> str:
+    if not _NAME.fullmatch(text) or len(text) > _LONGEST_NAME or text == "ca":
+        right = f"letters, digits, - _ and ., at most {_LONGEST_NAME}, not ca"
+        raise argparse.ArgumentTypeError(f"'{text}' can't be a name; {right}")
+    return text
 
 
-def make(arguments: argparse.Namespace) -> int:
+@Command(
+    "certificates", "make keys and certificates for mutual TLS", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    name=_name, robot={"default": []}, out=REQUIRED, host={"default": []},
+)  # fmt: skip
+def certificates(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon certificates``."""
     try:
         from gripmon.io.wire.certificates import Authority, read
     except ImportError:
-        text = (
-            "certificates: the package cryptography is missing; pip install -e '.[certificates]' in gripmon's checkout"
-        )
-        raise InputError(text) from None
+        right = "pip install -e '.[certificates]' in gripmon's checkout"
+        raise InputError(f"certificates: the package cryptography is missing; {right}") from None
+    from gripmon.io.wire.rules import wanted_names
+
     if arguments.rules and not arguments.robot:
         raise InputError("certificates: --rules for whom? add --robot NAME")
-    wanted = _wanted(arguments)
-    folder = common.make_directory(Path(arguments.out))
-    if arguments.rules:
-        _add_rules(Path(arguments.rules), arguments.robot)
     try:
-        authority = Authority(folder)
-        if authority.is_new:
-            print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
-        for name, hosts in wanted.items():
-            made = authority.issue(name, hosts)
-            what = _in_words(read(folder / f"{name}.pem"))
-            if made and not hosts:
-                what += " (--host makes it a router's)"
-            said = f"made, {what}" if made else f"there already, left alone: {what}; to change that, delete both files"
-            print(f"{folder / name}.pem, {name}-key.pem: {said}")
-    except OSError as error:
-        raise common.not_writable(folder, error) from None
-    except ValueError as error:
-        raise InputError(f"certificates: {error}") from None
-    return common.EXIT_DONE
-
-
-def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
-    """The names for which there shall be certificates, each with its hosts."""
-    from gripmon.io.wire.rules import names_of
-
-    try:
-        robots = [name for robot in arguments.robot for name in names_of(robot)]
-        if arguments.names:
-            return dict.fromkeys(arguments.names, arguments.host) | {name: [] for name in robots}
-        names = (*_CLIENTS, *(robots or names_of(_ROBOT)))
+        wanted = wanted_names(arguments.name, arguments.robot, arguments.host)
     except ValueError as error:
         raise InputError(f"certificates: --robot: {error}") from None
-    return {"router": [*_LOCAL, *arguments.host], **{name: [] for name in names}}
-
-
-def _add_rules(path: Path, robots: list[str]) -> None:
-    """Put rules for the robots into a router's file."""
-    from gripmon.io.wire.rules import with_robot
-    from gripmon.model.atomic import write_atomically
-
+    folder = make_directory(arguments.out)
+    if arguments.rules:
+        _add_rules(arguments)
     try:
-        before = text = path.read_text(encoding="utf-8")
-        for robot in robots:
-            text = with_robot(text, robot)
-        if text != before:
-            write_atomically(path, text.encode())
-    except OSError as error:
-        raise common.not_writable(path, error, "--rules") from None
+        with writing(folder):
+            authority = Authority(folder)
+            if authority.is_new:
+                print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
+            for name, hosts in wanted.items():
+                made = authority.issue(name, hosts)
+                issued = _issued(made, read(folder / f"{name}.pem"), hosts)
+                print(f"{folder / name}.pem, {name}-key.pem: {issued}")
     except ValueError as error:
-        said = "is no text" if isinstance(error, UnicodeDecodeError) else str(error)
-        raise InputError(f"certificates: --rules {path} {said}") from None
-    which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
-    print(f"{path}: {which}{'; restart the router' if text != before else ' already'}")
+        raise error if isinstance(error, InputError) else InputError(f"certificates: {error}") from None
 
 
-def _in_words(issued: Issued) -> str:
+def _issued(made: bool, issued: Issued, hosts: list[str]) -> str:
+    what = f"common name {issued.name}, for a client only"
     if issued.serves:
-        return f"common name {issued.name}, for a router (and as a client) at {', '.join(issued.hosts)}"
-    return f"common name {issued.name}, for a client only"
+        what = f"common name {issued.name}, for a router (and as a client) at {', '.join(issued.hosts)}"
+    if made and not hosts:
+        what += " (--host makes it a router's)"
+    return f"made, {what}" if made else f"there already, left alone: {what}; to change that, delete both files"
 
 
-def _name(text: str) -> str:
-    if not _NAME.fullmatch(text) or len(text) > _LONGEST_NAME or text == "ca":
-        raise argparse.ArgumentTypeError(
-            f"'{text}' can't be a name; letters, digits, - _ and ., at most {_LONGEST_NAME}, not ca"
-        )
-    return text
+def _add_rules(arguments: argparse.Namespace) -> None:
+    """Put rules for the robots into a router's file."""
+    from gripmon.io.wire.rules import add_robots
+
+    path, robots = arguments.rules, arguments.robot
+    try:
+        with writing(path, "--rules"):
+            changed = add_robots(path, robots)
+    except ValueError as error:
+        wrong = "isn't text" if isinstance(error, UnicodeDecodeError) else str(error)
+        raise error if isinstance(error, InputError) else InputError(f"certificates: --rules {path} {wrong}") from None
+    which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
+    print(f"{path}: {which}{'; restart the router' if changed else ' already'}")

@@ -1,16 +1,19 @@
-"""``gripmon check``: is this configuration sound, and what does it expect to see?"""
+"""``gripmon check``: is this configuration sound, and what does it expect to see?  Does a laser calibration hold?"""
 
 from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, common, second_check, second_run, sweep
+from gripmon.cli import check_laser, check_text, sweep
+from gripmon.cli.common import Command, arm_noise, positive_number, progress_bar, refuse_without
 from gripmon.model.errors import InputError
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
-    from gripmon.daemon.config import Config
+    from gripmon.laser.watch import SpotWatchSettings
 
 _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and say of each thing that matters whether
@@ -30,6 +33,25 @@ camera, plane and laser pointer fresh spots would tell, or do tell.
 With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
 anyone drills a hole."""
 
+_OPTIONS = """
+[CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
+--json       one JSON object instead of text; metres, radians, px
+--verbose    what the calibration expects to see, in numbers
+"""
+
+_LASER = """\
+Instead of a configuration: does a file of gripmon calibrate laser still hold?  SPOTS are fresh tables of \
+spots and poses as for gripmon calibrate laser, in the order in which they were taken.  Without any: which \
+motions fresh spots would tell."""
+
+_LASER_OPTIONS = """
+--laser LASER.yaml  the calibration; what else is named are SPOTS, if any
+--arm-noise M:RAD   standard deviations of the arm's poses, position (m) and rotation (rad), each axis
+                    (default 0.0001:0.0002)
+--false-alarms N    how often in 1000 spots an unmoved set-up may be said to have moved (default 0.1, at most 10)
+--wrong-spots PART  part of the spots that may be reflections (default 0.2, at most 0.5)
+"""
+
 _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
   gripmon check configs/demo.yaml --verbose
@@ -44,55 +66,78 @@ names, or a package that it needs is missing (one line says file, key, what is w
 right); 3 a line says FAIL, such as a camera that can't be reached now; or something has moved since a
 laser calibration, or its spots don't tell"""
 
-
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands, "check", run, "validate a configuration and show what it expects to see", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument(
-        "config", nargs="*", metavar="CONFIG", help="configuration file (YAML); with --laser: tables of fresh spots"
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of text; metres, radians, px")
-    parser.add_argument("--verbose", action="store_true", help="what the calibration expects to see, in numbers")
-    sweep.add_options(parser)
-    check_laser.add_options(parser)
+_MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
-def run(arguments: argparse.Namespace) -> int:
+@Command(
+    "check", "validate a configuration and show what it expects to see", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
+    arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
+)  # fmt: skip
+def check(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon check``."""
+    if arguments.laser is not None and arguments.sweep:
+        raise InputError("--sweep: not with --laser; one of them")
+    if not arguments.sweep:
+        refuse_without(arguments, sweep.NAMES, "only has a meaning for a sweep; add --sweep")
     if arguments.laser is not None:
-        if arguments.sweep:
-            raise InputError("--sweep: not with --laser; one of them")
-        sweep.refuse_without_sweep(arguments)
-        return check_laser.run(arguments)
-    check_laser.refuse_without_laser(arguments)
+        return _check_laser(arguments)
+    names, why = ("arm_noise", *_MOST), "only has a meaning for a laser calibration; add --laser LASER.yaml"
+    refuse_without(arguments, names, why)
     if len(arguments.config) != 1:
         raise InputError(f"check: {len(arguments.config)} configurations; one, or --laser LASER.yaml")
-    arguments.config = arguments.config[0]
-    if arguments.sweep:
-        return sweep.run(arguments)
-    sweep.refuse_without_sweep(arguments)
-    second = second_run.load(arguments.config)
-    if second is not None:
-        return second_check.run(second, as_json=arguments.json, verbose=arguments.verbose)
-    return _check(common.load(arguments.config), as_json=arguments.json, verbose=arguments.verbose)
+    return sweep.run(arguments) if arguments.sweep else _check(arguments)
 
 
-def _check(config: Config, *, as_json: bool, verbose: bool) -> int:
-    import msgspec
+def _check(arguments: argparse.Namespace) -> int:
+    from gripmon.daemon.findings import check_file
 
-    from gripmon.cli import check_text
-    from gripmon.daemon.findings import findings
-    from gripmon.daemon.forecast import forecast
-    from gripmon.daemon.surroundings import surroundings
-
-    expected, around = forecast(config), surroundings(config)
-    found = findings(expected, around)
-    if as_json:
-        values = {**msgspec.to_builtins(expected), **msgspec.to_builtins(around)}
-        print(json.dumps({"findings": [each._asdict() for each in found], **values}, indent=2))
+    found = check_file(arguments.config[0])
+    if arguments.json:
+        _print_json({"findings": [each._asdict() for each in found.findings], **found.values()})
     else:
-        lines = check_text.lines(expected.config, found)
-        print("\n".join([*lines, "", *check_text.details(expected, around)] if verbose else lines))
-    return check_text.exit_code(found)
+        lines = check_text.lines(str(arguments.config[0]), found.findings)
+        if arguments.verbose:
+            lines += ["", *([] if found.forecast is None else check_text.details(found.forecast))]
+            lines += [] if found.second is None else check_laser.details(found.second)
+            lines += check_text.surrounding_lines(found.around)
+        print("\n".join(lines))
+    return EXIT_FAILED if any(each.level == "FAIL" for each in found.findings) else EXIT_DONE
+
+
+def _check_laser(arguments: argparse.Namespace) -> int:
+    from gripmon.daemon.config.second import read_laser
+    from gripmon.laser.api import check_laser as judge
+    from gripmon.laser.report import check_values, expectation
+
+    settings, path = _watch_settings(arguments), arguments.laser
+    if not path.is_file():
+        raise InputError(f"--laser {path}: there is no such file; a file of gripmon calibrate laser")
+    calibration = read_laser(path, path)
+    if not arguments.config:
+        report = expectation(str(path), calibration, settings)
+        _print_json(report) if arguments.json else print("\n".join(check_laser.expectation_lines(report)))
+        return EXIT_DONE
+    found = judge(calibration, [Path(name) for name in arguments.config], settings, progress_bar)
+    report = check_values(str(path), calibration, settings, found)
+    _print_json(report) if arguments.json else print("\n".join(check_laser.judged_lines(report)))
+    return EXIT_DONE if found.verdict == "same" else EXIT_FAILED
+
+
+def _watch_settings(arguments: argparse.Namespace) -> SpotWatchSettings:
+    from gripmon.laser.watch import SpotWatchSettings
+
+    given: dict[str, Any] = {}
+    if arguments.arm_noise is not None:
+        given["arm_noise_m"], given["arm_noise_rad"] = arguments.arm_noise
+    for name, most in _MOST.items():
+        value = getattr(arguments, name)
+        if value is not None and value > most:
+            raise InputError(f"--{name.replace('_', '-')} {value:g}: too many; at most {most:g}")
+        if value is not None:
+            given["false_alarms_per_1000_pulses" if name == "false_alarms" else name] = value
+    return SpotWatchSettings(**given)
+
+
+def _print_json(values: dict[str, Any]) -> None:
+    print(json.dumps(values, indent=2))

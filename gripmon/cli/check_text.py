@@ -6,29 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import EXIT_DONE, EXIT_FAILED
-
 if TYPE_CHECKING:
-    from gripmon.daemon.findings import Finding
-    from gripmon.daemon.forecast_values import (
-        Accuracy,
-        CameraValues,
-        CornerView,
-        DriftForecast,
-        Forecast,
-        GripperValues,
-        InView,
-        JawAccuracy,
-        JawTravelForecast,
-        JawValues,
-        OpeningCertainty,
-        PoseValues,
-        RecalibrationForecast,
-        ReferenceValues,
-        TaughtValues,
-        UnknownJaw,
-    )
-    from gripmon.daemon.surroundings import Joined, Surroundings
+    from gripmon.daemon import forecast_values as forecasts
+    from gripmon.daemon.findings import Finding, Joined, Surroundings
 
 _POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
 _JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given
@@ -46,16 +26,11 @@ def lines(path: str, findings: Sequence[Finding]) -> list[str]:
     return [f"{path}: {', '.join(parts)}", *rows]
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
-    """3 where something fails."""
-    return EXIT_FAILED if any(each.level == "FAIL" for each in findings) else EXIT_DONE
-
-
 def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' if count > 1 else ''}"
 
 
-def details(report: Forecast, around: Surroundings) -> list[str]:
+def details(report: forecasts.Forecast) -> list[str]:
     """The forecast for a person: px, mm, degrees."""
     edges = [edge.id for edge in report.edges if edge.visible]
     seen = sum(corner.visible for corner in report.corners)
@@ -76,17 +51,16 @@ def details(report: Forecast, around: Surroundings) -> list[str]:
     lines += [_corner_line(corner, width) for corner in report.corners]
     lines += _accuracy_lines(report.accuracy)
     lines.append(f"promise    {report.promise}")
-    lines += _in_view_lines(report.in_view)
-    return lines + surrounding_lines(around)
+    return lines + _in_view_lines(report.in_view)
 
 
-def _camera_line(camera: CameraValues) -> str:
+def _camera_line(camera: forecasts.CameraValues) -> str:
     across, down = (math.degrees(angle) for angle in camera.field_of_view_rad)
     size = f"{camera.width_px} x {camera.height_px} px, f = {camera.fx_px:g}, {camera.fy_px:g} px"
     return f"{size}, lens {camera.model}, sees about {across:.0f}° x {down:.0f}°"
 
 
-def _gripper_line(gripper: GripperValues, jaw: JawValues) -> str:
+def _gripper_line(gripper: forecasts.GripperValues, jaw: forecasts.JawValues) -> str:
     name = f"{gripper.name} ({gripper.file})"
     if gripper.jaw_m is None or jaw.opening_m is None:
         return f"{name}: no jaw"
@@ -97,14 +71,14 @@ def _gripper_line(gripper: GripperValues, jaw: JawValues) -> str:
     return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, opening from {jaw.source}; the following at {opening}"
 
 
-def _reference_line(reference: ReferenceValues) -> str:
+def _reference_line(reference: forecasts.ReferenceValues) -> str:
     x, y, z = (1e3 * v for v in reference.translation_m)
     place = f"{reference.id}: TCP at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the camera frame"
     turn = f"{math.degrees(reference.turn_rad):.1f}° between camera and gripper"
     return f"{place}, {turn}, 1 px is {1e3 * reference.metres_per_px:.3f} mm at the TCP"
 
 
-def _taught_line(taught: TaughtValues | None, visible: list[str]) -> str:
+def _taught_line(taught: forecasts.TaughtValues | None, visible: list[str]) -> str:
     if taught is None:
         return "nothing; `gripmon teach` takes out what bevels, rounded edges and shading shift the edges by"
     largest, images = taught.largest, "1 image" if taught.images == 1 else f"{taught.images} images"
@@ -114,13 +88,13 @@ def _taught_line(taught: TaughtValues | None, visible: list[str]) -> str:
     return f"{count}; {farthest}" + (f"; visible, but not taught: {', '.join(missing)}" if missing else "")
 
 
-def _corner_line(corner: CornerView, width: int) -> str:
+def _corner_line(corner: forecasts.CornerView, width: int) -> str:
     reason = {None: "", "outside": "outside of the image", "self_hidden": "hidden by its own finger"}[corner.reason]
     place = "       —       " if corner.uv_px is None else "({:6.1f}, {:6.1f})".format(*corner.uv_px)
     return f"           {corner.id:<{width}} {place} px  {1e3 * corner.distance_m:6.1f} mm  {reason}".rstrip()
 
 
-def _accuracy_lines(values: Accuracy) -> list[str]:
+def _accuracy_lines(values: forecasts.Accuracy) -> list[str]:
     edges, expected, weakest = values.edges, values.expected, values.weakest
     if expected is None or weakest is None:
         accuracy = [f"accuracy   NONE: {edges} edges can be sampled, at least {values.edges_needed} are needed"]
@@ -137,20 +111,20 @@ def _accuracy_lines(values: Accuracy) -> list[str]:
     return [*accuracy, *jaw, *drift, f"new pose   {_recalibration_text(values.recalibration)}"]
 
 
-def _jaw_accuracy_lines(jaw: JawAccuracy) -> list[str]:
+def _jaw_accuracy_lines(jaw: forecasts.JawAccuracy) -> list[str]:
     unknown, growth = jaw.unknown, jaw.growth
     shift_m = [_JAW_ERROR_M * v for v in jaw.pose_per_jaw_m.tcp_m]
-    told = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw.like}"
+    separates = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw.like}"
     less = f"{growth:.1f} times less certain than with it"
     return [
         f"jaw        opening reported to {1e3 * jaw.reported_sigma_m:.3f} mm; if it were unknown:",
         f"           {_sigmas(unknown)}; opening {1e3 * unknown.jaw_m:.3f} mm",
-        f"           the image {told}: correlation {jaw.correlation:.2f}, {less}",
+        f"           the image {separates}: correlation {jaw.correlation:.2f}, {less}",
         f"           taken as exact but wrong by {1e3 * _JAW_ERROR_M:.3f} mm it shifts the TCP by {_mm(shift_m)} mm",
     ]
 
 
-def _drift_lines(drift: DriftForecast) -> list[str]:
+def _drift_lines(drift: forecasts.DriftForecast) -> list[str]:
     alarms, frames_per_s = drift.false_alarms_per_day, drift.frames_per_s
     lines = [
         f"drift      at most {alarms:g} false alarms a day at {frames_per_s:g} frames/s; where errors last for",
@@ -167,7 +141,7 @@ def _drift_lines(drift: DriftForecast) -> list[str]:
     return lines
 
 
-def _recalibration_text(values: RecalibrationForecast) -> str:
+def _recalibration_text(values: forecasts.RecalibrationForecast) -> str:
     if not values.possible:
         return f"NOT from corners in this view: {values.reason}; past the limit the reference stays"
     where = "in one plane (4 are needed)" if values.coplanar else "(6 are needed)"
@@ -183,7 +157,7 @@ def _recalibration_text(values: RecalibrationForecast) -> str:
     return f"{text}; certain to {1e3 * sigma_m:.3f} mm: {asked}"
 
 
-def _sigmas(values: PoseValues | UnknownJaw) -> str:
+def _sigmas(values: forecasts.PoseValues | forecasts.UnknownJaw) -> str:
     x, y, z = (1e3 * v for v in values.tcp_m)
     a, b, c = (math.degrees(v) for v in values.rotation_rad)
     return f"TCP x {x:.3f}, y {y:.3f}, z {z:.3f} mm, turn about x {a:.3f}, y {b:.3f}, z {c:.3f}°"
@@ -197,11 +171,11 @@ def _degrees(values: Sequence[float]) -> str:
     return "({:+.3f}, {:+.3f}, {:+.3f})".format(*(math.degrees(v) for v in values))
 
 
-def _in_view_lines(values: InView) -> list[str]:
+def _in_view_lines(values: forecasts.InView) -> list[str]:
     return [*_border_lines(values), *_camera_lines(values), *_jaw_lines(values.jaw_travel)]
 
 
-def _border_lines(values: InView) -> list[str]:
+def _border_lines(values: forecasts.InView) -> list[str]:
     nearest, behind = values.border, values.behind_another_finger
     if nearest is None:
         return ["margin     NONE: no corner is visible"]
@@ -211,7 +185,7 @@ def _border_lines(values: InView) -> list[str]:
     return lines + ([f"           behind another finger: {', '.join(behind)}"] if behind else [])
 
 
-def _camera_lines(values: InView) -> list[str]:
+def _camera_lines(values: forecasts.InView) -> list[str]:
     free = values.camera_may_move
     if free is None:
         return [f"           NOT enough to measure: {values.reason}"]
@@ -232,7 +206,7 @@ def _camera_lines(values: InView) -> list[str]:
         lines.append(f"           the shortest way is {1e3 * amount_m:.1f} mm along {way}: then {reason}")
         if amount_m < values.limit_m:
             limit = f"{1e3 * values.limit_m:g} mm (monitor.policy.limit_m)"
-            lines.append(f"           LESS than the shift past which the reference is measured anew, {limit}")
+            lines.append(f"           LESS than the shift past which the reference is measured again, {limit}")
     return lines
 
 
@@ -243,7 +217,7 @@ def _span(amounts: Sequence[float | None], factor: float, sought: float) -> str:
     return f"{low}{low_amount} to {high}{high_amount}"
 
 
-def _jaw_lines(jaw: JawTravelForecast | None) -> list[str]:
+def _jaw_lines(jaw: forecasts.JawTravelForecast | None) -> list[str]:
     if jaw is None:
         return []
     low_mm, high_mm = 1e3 * jaw.from_m, 1e3 * jaw.to_m
@@ -254,7 +228,7 @@ def _jaw_lines(jaw: JawTravelForecast | None) -> list[str]:
     return [seen, *gaps, *_certainty_lines(jaw.certainty)]
 
 
-def _certainty_lines(values: OpeningCertainty) -> list[str]:
+def _certainty_lines(values: forecasts.OpeningCertainty) -> list[str]:
     from gripmon.daemon.findings import past_limit
 
     known = [(s, m) for m, s in zip(values.opening_m, values.worst_sigma_m, strict=True) if s is not None]
@@ -283,13 +257,13 @@ def _percent(share: float) -> str:
 def surrounding_lines(around: Surroundings) -> list[str]:
     """Where frames come from, and where messages, recording and metrics go."""
     source = around.source
-    said = {
+    sections = {
         "source": f"{source.kind}: {'NOT REACHABLE: ' if source.reachable is False else ''}{source.detail}",
         "Zenoh": _zenoh_line(around.keys, around.zenoh),
         "recording": around.recording or "off",
         "metrics": around.metrics or "off",
     }
-    return [f"{name:<10} {text}" for name, text in said.items()]
+    return [f"{name:<10} {text}" for name, text in sections.items()]
 
 
 def _zenoh_line(keys: str | None, session: Joined | None) -> str:

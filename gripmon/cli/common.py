@@ -1,47 +1,150 @@
-"""What several subcommands share.  Nothing heavy at the top: this is imported for ``--help``."""
+"""What all commands share: how they are declared, the files that they write, progress bars.
+
+Nothing heavy at the top: this is imported for ``--help``.
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
-import os
+import re
+import shlex
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.daemon.config import Config
+    from gripmon.model.records import Image
 
-EXIT_DONE = 0
-EXIT_USAGE = 2
-EXIT_FAILED = 3
-EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
+REQUIRED = {"required": True}
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
+NETWORK_OPTIONS = f"""
+--connect ENDPOINT...  {{}} or a router's Zenoh endpoint, several times if need be; default: {DEFAULT_ENDPOINT}
+--zenoh-config FILE    a configuration file of Zenoh's instead of --connect
+"""
+"""Of the commands that join the network as a client, which say whose endpoint it is."""
+
+_PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
+_NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
+_PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
 
 
-def add_command(
-    commands: Any,
-    name: str,
-    handler: Callable[[argparse.Namespace], int],
-    summary: str,
-    description: str,
-    examples: str,
-) -> argparse.ArgumentParser:
-    """A subcommand's parser with its help texts."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name,
-        help=summary,
-        description=description,
-        epilog=f"examples:\n{examples}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(handler=handler)
-    return parser
+class Command:
+    """A command's declaration, and the decorator of the function that carries it out.
+
+    ``options`` is a table like that of ``--help``.  A row is what is typed, two blanks or a new line, and its meaning,
+    which goes on in lines that are indented: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most
+    one, some, any number; ``--flag``, ``--option VALUE``, ``--option VALUE...`` for one that may be repeated.  A row
+    that begins with ``|`` excludes the row before.  ``groups``: more such tables by title, each with a description.
+    Values called FILE, DIR and the like are paths.  ``more``: keywords of ``add_argument`` for single arguments, or
+    only a type.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        summary: str,
+        description: str,
+        options: str,
+        examples: str,
+        groups: Mapping[str, tuple[str | None, str]] | None = None,
+        /,
+        **more: Any,
+    ) -> None:
+        self._name, self._summary, self._texts = name, summary, (description, f"examples:\n{examples}")
+        self._tables, self._more = {"": (None, options), **(groups or {})}, more
+        self.arguments: dict[str, str] = {}  # by name: the option, empty for a positional one
+        self.defaults: dict[str, Any] = {}
+        self.prog = ""
+
+    def __call__(self, handler: Callable[[argparse.Namespace], int | None]) -> Command:
+        self._handler = handler
+        return self
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Carry it out; the exit code."""
+        return self._handler(arguments) or 0
+
+    def add_to(self, commands: Any) -> None:
+        """Add it below a parser."""
+        description, epilog = self._texts
+        raw = argparse.RawDescriptionHelpFormatter
+        parser: argparse.ArgumentParser = commands.add_parser(
+            self._name, help=self._summary, description=description, epilog=epilog, formatter_class=raw
+        )
+        parser.set_defaults(command=self)
+        self.prog = parser.prog.partition(" ")[2]
+        for title, (about, table) in self._tables.items():
+            self._add_rows(parser.add_argument_group(title, about) if title else parser, _rows(table))
+
+    def _add_rows(self, group: Any, rows: list[tuple[str, str]]) -> None:
+        choice: Any = None
+        for number, (typed, text) in enumerate(rows):
+            if not typed.startswith("| "):
+                follows = number + 1 < len(rows) and rows[number + 1][0].startswith("| ")
+                choice = group.add_mutually_exclusive_group() if follows else None
+            self._add(choice or group, typed.removeprefix("| "), text)
+
+    def _add(self, group: Any, typed: str, text: str) -> None:
+        word, _, value = typed.partition(" ")
+        option = word if word.startswith("--") else ""
+        metavar = (value if option else word.strip("[]")).removesuffix("...")
+        name = (option or metavar).strip("-").replace("-", "_").lower()
+        more = self._more.get(name, {})
+        more = {"type": more} if callable(more) else more
+        keywords: dict[str, Any] = {"help": text}
+        if metavar:
+            keywords["metavar"] = metavar
+        if _PATHS.match(metavar):
+            keywords["type"] = Path
+        if not option:
+            keywords["nargs"] = _NUMBERS[re.sub(r"[^][.]", "", word.replace(metavar, ""))]
+        elif value.endswith("..."):
+            keywords["action"] = "append"
+        elif not value and "choices" not in more:
+            keywords["action"] = "store_true"
+        group.add_argument(option or name, **(keywords | more))
+        self.arguments[name], self.defaults[name] = option, more.get("default")
+
+
+def _rows(table: str) -> list[tuple[str, str]]:
+    """What is typed and what it means."""
+    rows: list[tuple[str, str]] = []
+    for line in table.strip("\n").splitlines():
+        typed, _, text = line.partition("  ")
+        if not typed:
+            typed, before = rows.pop()
+            text = f"{before} {line.strip()}"
+        rows.append((typed, text.strip()))
+    return rows
+
+
+def command_line(arguments: argparse.Namespace, **instead: Any) -> str:
+    """The command with what was given to it, for a file's provenance; ``instead``: other values than those given."""
+    command: Command = arguments.command
+    words = ["gripmon", *command.prog.split()]
+    for name, option in command.arguments.items():
+        value = instead.get(name, getattr(arguments, name))
+        if name == "json" or value in (None, False, [], command.defaults[name]):
+            continue
+        for each in value if isinstance(value, list) else [value]:
+            words += [option] if option else []
+            if isinstance(each, tuple):
+                each = ("x" if isinstance(each[0], int) else ":").join(f"{part:g}" for part in each)
+            words += [] if each is True else [str(each)]
+    return shlex.join(words)
+
+
+def refuse_without(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
+    """End the command with exit code 2 if one of these options was given."""
+    for name in names:
+        if getattr(arguments, name) not in (None, False):
+            raise InputError(f"--{name.replace('_', '-')}: {why}")
 
 
 def positive_number(text: str) -> float:
@@ -55,70 +158,129 @@ def positive_number(text: str) -> float:
     return value
 
 
+def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:
+    """The type of an argument within these bounds; ``wrong``: what another text is not, and what would be right."""
+
+    def convert(text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"'{text}' {wrong}")
+        return int(text)
+
+    return convert
+
+
+port = whole_number(1, 65535, "isn't a TCP port; 1 to 65535")
+seed = whole_number(0, _LARGEST_SEED, f"isn't a seed; a whole number, 0 to {_LARGEST_SEED}")
+
+
 def arm_noise(text: str) -> tuple[float, float]:
     """An argument M:RAD, standard deviations of an arm's poses."""
-    parts = text.split(":")
     try:
-        position, rotation = (float(part) for part in parts)
+        position, rotation = (float(part) for part in text.split(":"))
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
     if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
-        raise argparse.ArgumentTypeError(f"{text} is no arm's noise; metres and radians, e.g. 0.0001:0.0002")
+        raise argparse.ArgumentTypeError(f"{text} isn't an arm's noise; metres and radians, e.g. 0.0001:0.0002")
     return position, rotation
 
 
-def seed(text: str) -> int:
-    """An argument that seeds a simulation."""
-    if not text.isdecimal() or int(text) > _LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"'{text}' is no seed; a whole number, 0 to {_LARGEST_SEED}")
-    return int(text)
+def network_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """``--connect`` and ``--zenoh-config``, as the clients take them."""
+    if arguments.connect and arguments.zenoh_config:
+        raise InputError(f"{arguments.command.prog}: --connect has no effect beside --zenoh-config; one of them")
+    file = arguments.zenoh_config
+    return {
+        "connect": arguments.connect or (DEFAULT_ENDPOINT,),
+        "zenoh_config_file": None if file is None else str(file),
+    }
 
 
-def load(path: str, *, check_source: bool = True, with_taught: bool = True) -> Config:
-    """The checked configuration in a file."""
-    from gripmon.daemon.config import load_config
+@contextmanager
+def network_errors(arguments: argparse.Namespace) -> Iterator[None]:
+    """Where there is no session, the error names the option: no key was written."""
+    from gripmon.io.wire import PublishError
 
-    return load_config(Path(path), check_source=check_source, with_taught=with_taught)
-
-
-def load_demo_or(path: str | None) -> Config:
-    """The configuration in a file, or that of the demo."""
-    from gripmon.daemon.config import builtin_config
-
-    return load(str(builtin_config("demo.yaml")) if path is None else path, check_source=False)
+    try:
+        yield
+    except PublishError as error:
+        option = {"connect": "--connect", "zenoh_config": "--zenoh-config"}.get(error.key, error.key)
+        raise InputError(f"{arguments.command.prog}: {option}: {error.text}") from None
 
 
 def make_directory(path: Path, option: str = "--out") -> Path:
-    """Create a directory for output, which ``option`` names; a fault ends the command with exit code 2."""
+    """Create a directory for output, which ``option`` names."""
+    from gripmon.model.atomic import writable_folder
+
     try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{option} {path}: can't be made ({error.strerror}); a directory to write to") from None
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"{option} {path}: may not be written to; a directory of your own")
-    return path
+        return writable_folder(path)
+    except InputError as error:
+        raise InputError(f"{option} {error.wrong}") from None
 
 
-def not_writable(path: Path, error: OSError, option: str = "--out") -> InputError:
-    """What to raise when a file for output can't be opened."""
-    return InputError(f"{option} {path}: can't be written ({error.strerror or error}); a file")
+def check_outputs(arguments: argparse.Namespace, *names: str) -> None:
+    """Refuse, before any work, files that can't be written; or are there already, of a command with ``--force``."""
+    for name in names:
+        path, option = getattr(arguments, name), f"--{name.replace('_', '-')}"
+        if path is None:
+            continue
+        make_directory(path.parent, option)
+        if path.is_dir():
+            raise InputError(f"{option} {path}: is a folder; a file")
+        if path.exists() and not getattr(arguments, "force", True):
+            raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
+        if name == "picture" and path.suffix.lower() not in _PICTURES:
+            raise InputError(f"{option} {path}: has no known ending; .png or .jpg")
 
 
 def check_file(path: Path, option: str = "--out") -> None:
-    """End the command with exit code 2, before any work, if a file can't be written; it is made but not changed."""
-    try:
+    """Refuse, before any work, a file that can't be written; it is made but not changed."""
+    with writing(path, option):
         path.open("ab").close()
+
+
+def write(data: bytes, path: Path, option: str = "--out") -> None:
+    """Write a file, whole or not at all."""
+    from gripmon.model.atomic import write_atomically
+
+    with writing(path, option):
+        write_atomically(path, data)
+
+
+def write_document(document: Any, path: Path, option: str = "--out") -> None:
+    """Write a calibration as YAML, whole or not at all."""
+    from gripmon.daemon.calibrations import write_document as write_yaml
+
+    with writing(path, option):
+        write_yaml(document, path)
+
+
+def write_picture(picture: Image, path: Path) -> None:
+    """Write it, whole or not at all, in the format that the file's name ends in."""
+    import cv2
+
+    write(cv2.imencode(path.suffix, picture)[1].tobytes(), path, "--picture")
+
+
+@contextmanager
+def writing(path: Path, option: str = "--out") -> Iterator[None]:
+    """A fault of a file for output ends the command with exit code 2."""
+    try:
+        yield
     except OSError as error:
-        raise not_writable(path, error, option) from None
+        raise InputError(f"{option} {path}: can't be written ({error.strerror or error}); a file") from None
 
 
 def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[..., None]]:
     """A context that gives a function to call once for each step, with the total if that is known then; it draws on
     stderr, and only for a person.
     """
-    if not sys.stderr.isatty():
-        return nullcontext(lambda *_total: None)
-    return _TqdmSteps(total, unit)
+    return _Bar(lambda bar: bar.step, total=total, unit=unit) if sys.stderr.isatty() else nullcontext(lambda *_: None)
+
+
+def reading_bar() -> AbstractContextManager[Callable[[int, int], None]]:
+    """The same of bytes: the function takes those that are read and all."""
+    shown = {"unit": "B", "unit_scale": True, "desc": "reading", "leave": False}
+    return _Bar(lambda bar: bar.reached, **shown) if sys.stderr.isatty() else nullcontext(lambda _done, _total: None)
 
 
 def messages_above_bar(logger: str) -> AbstractContextManager[object]:
@@ -133,18 +295,23 @@ def messages_above_bar(logger: str) -> AbstractContextManager[object]:
     return redirected
 
 
-class _TqdmSteps(AbstractContextManager[Callable[..., None]]):
-    def __init__(self, total: int | None, unit: str):
+class _Bar(AbstractContextManager[Callable[..., None]]):
+    def __init__(self, function: Callable[[_Bar], Callable[..., None]], **shown: Any):
         from tqdm import tqdm
 
-        self._bar = tqdm(total=total, unit=unit, file=sys.stderr, dynamic_ncols=True)
+        self._function = function
+        self._bar = tqdm(file=sys.stderr, dynamic_ncols=True, **shown)
 
     def __enter__(self) -> Callable[..., None]:
-        return self._step
+        return self._function(self)
 
     def __exit__(self, *_exception: object) -> None:
         self._bar.close()
 
-    def _step(self, total: int | None = None) -> None:
+    def step(self, total: int | None = None) -> None:
         self._bar.total = total or self._bar.total
         self._bar.update()
+
+    def reached(self, done: int, total: int) -> None:
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)

@@ -9,15 +9,26 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gripmon.cli import common, viewing
+from gripmon.cli.common import (
+    Command,
+    check_file,
+    make_directory,
+    messages_above_bar,
+    positive_number,
+    progress_bar,
+    seed,
+)
+from gripmon.cli.run import VIEW, VIEW_OPTION
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import signals_exit
 
 if TYPE_CHECKING:
     from gripmon.analyse.comparison import Distribution, EventReport, TcpErrors
-    from gripmon.daemon.demo import DemoSummary, Latency
+    from gripmon.daemon.simulated import DemoSummary, Latency
+
+_SHORTEST_S = 4.0
 
 _DESCRIPTION = """\
 Run the whole daemon on a simulated wrist camera: a cable pulls the camera aside (creep), a collision
@@ -27,6 +38,14 @@ position of the tool centre point (TCP) is compared with the truth (mm).
 
 DIR gets demo-0001.rrd (the recording), estimates.jsonl (one JSON line a frame) and summary.json."""
 
+_OPTIONS = f"""
+--seconds S  length; its events are spread over it (s; default 20, at least {_SHORTEST_S:g})
+--out DIR    folder for the results (default: gripmon-demo-DATE-TIME here)
+--fps HZ     frame rate of the camera (1/s; default 60)
+--seed N     random seed of the simulation (default 1)
+{VIEW_OPTION.strip()}
+"""
+
 _EXAMPLES = """\
   gripmon demo
   gripmon demo --seconds 60 --out demo/
@@ -34,55 +53,33 @@ _EXAMPLES = """\
 
 exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
-_SHORTEST_S = 4.0
 
-
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands, "demo", run, "everything at work on a simulated camera", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument(
-        "--seconds",
-        type=common.positive_number,
-        default=20.0,
-        metavar="S",
-        help=f"length; its events are spread over it (s; default 20, at least {_SHORTEST_S:g})",
-    )
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: gripmon-demo-DATE-TIME here)")
-    parser.add_argument(
-        "--fps", type=common.positive_number, metavar="HZ", help="frame rate of the camera (1/s; default 60)"
-    )
-    parser.add_argument(
-        "--seed", type=common.seed, default=1, metavar="N", help="random seed of the simulation (default 1)"
-    )
-    viewing.add_option(parser)
-
-
-def run(arguments: argparse.Namespace) -> int:
+@Command(
+    "demo", "everything at work on a simulated camera", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    seconds={"type": positive_number, "default": 20.0}, fps=positive_number, seed={"type": seed, "default": 1},
+    view=VIEW,
+)  # fmt: skip
+def demo(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon demo``."""
     if arguments.seconds < _SHORTEST_S:
         raise InputError(f"demo: --seconds {arguments.seconds:g} is too short for its events; at least {_SHORTEST_S:g}")
-    from gripmon.daemon.demo import Demo, demo_config
+    from gripmon.daemon.simulated import Demo, demo_config
 
     viewed = arguments.view is not None
     config = demo_config(arguments.seconds, fps=arguments.fps, seed=arguments.seed, viewed=viewed)
     demo = Demo(config)
-    out = common.make_directory(Path(arguments.out or f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
-    common.check_file(out / "estimates.jsonl")
+    out = make_directory(arguments.out or Path(f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
+    check_file(out / "estimates.jsonl")
     settings = config.settings
     where = f"{settings.publish.listen[0]}, key gripmon/{settings.robot}/{settings.camera_name}/transform"
-    print(
-        f"{arguments.seconds:g} s of a simulated wrist camera; transforms on {where}; results in {out}",
-        file=sys.stderr,
-    )
-    view = viewing.LiveView(settings.view, arguments.view, str(config.path)) if viewed else None
-    with signals_exit() as stop, common.progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
+    length = f"{arguments.seconds:g} s of a simulated wrist camera"
+    print(f"{length}; transforms on {where}; results in {out}", file=sys.stderr)
+    with signals_exit() as stop, progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
         code, summary = demo.run(
             out,
             step=step,
-            on_network=lambda: messages.enter_context(common.messages_above_bar("gripmon")),
-            view=view,
+            on_network=lambda: messages.enter_context(messages_above_bar("gripmon")),
+            view=arguments.view,
             stop=stop,
         )
     if summary is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from gripmon.client import MonitorStatus
+    from gripmon.client import Event, MonitorStatus
     from gripmon.model.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
@@ -32,9 +32,10 @@ class Row(NamedTuple):
 
 
 def row(status: MonitorStatus) -> Row:
-    """The cells in the order of :data:`COLUMNS`; drift, sigma and bound are what a monitor that is gone said last."""
+    """The cells in the order of :data:`COLUMNS`; of a monitor that is gone they are what it reported last."""
     state = status.state
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
+    age_s = status.state_age_s if status.transform_age_s is None else status.transform_age_s
     rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
     cells = (
         printable(f"{status.name} {status.monitor_id}" if status.several else str(status.name)),
@@ -44,7 +45,7 @@ def row(status: MonitorStatus) -> Row:
         _number(1e3, None if state is None else state.sigma_m, ".3f"),
         _bound(state),
         _number(1.0, rate if there else None, ".1f"),
-        f"{_age_s(status):.1f}",
+        f"{age_s:.1f}",
         "-" if state is None else f"{state.revision} {printable(state.reference_id)}",
         _alerts(status),
     )
@@ -75,6 +76,16 @@ def line(status: MonitorStatus) -> str:
     return f"{cells[0]}: {cells[1]}, {cells[2]}, {named}, reference {cells[-2]}; {cells[-1] or 'no open alerts'}"
 
 
+def event_line(event: Event) -> str:
+    """An alert, or that a monitor came or vanished, in one line of a log."""
+    head, record = f"{clock(event.stamp_ns)}  {event.name}", event.alert
+    if record is None:
+        return printable(f"{head}  {event.what}")
+    which = f" ({record.alert_id})" if record.alert_id else ""
+    text = f"{record.severity.value:7}  {event.what}, revision {record.revision}: {record.text}{which}"
+    return printable(f"{head}  {text}")
+
+
 def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int) -> RenderableType:
     """For a terminal of that size: the worst monitors, as many as fit; a narrow one does without sigma."""
     from rich.table import Table
@@ -84,14 +95,8 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
     out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
     chosen = [name for name in COLUMNS if name != _SPARED or width >= _WIDE]
     for name in chosen:
-        number = name in COLUMNS[3:8]
-        out.add_column(
-            name,
-            justify="right" if number else "left",
-            no_wrap=True,
-            overflow="ellipsis",
-            ratio=1 if name == "alerts" else None,
-        )
+        ratio, number = 1 if name == "alerts" else None, name in COLUMNS[3:8]
+        out.add_column(name, justify="right" if number else "left", no_wrap=True, overflow="ellipsis", ratio=ratio)
     for status in shown:
         condition, cells = row(status)
         # Text, not markup: what came from the network has no say in how it looks.
@@ -148,10 +153,6 @@ def _what(status: MonitorStatus) -> str:
     state = "starting" if status.state is None else printable(status.state.state)
     before = {"silent": "silent, was ", "several": "several, "}
     return f"{before.get(status.condition, '')}{state}"
-
-
-def _age_s(status: MonitorStatus) -> float:
-    return status.state_age_s if status.transform_age_s is None else status.transform_age_s
 
 
 def _alerts(status: MonitorStatus) -> str:

@@ -5,12 +5,20 @@ from __future__ import annotations
 import argparse
 import datetime
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gripmon.cli import common, joining
+from gripmon.cli.common import (
+    NETWORK_OPTIONS,
+    REQUIRED,
+    Command,
+    make_directory,
+    network_errors,
+    network_of,
+    positive_number,
+)
 from gripmon.cli.fleet_table import printable
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
     from gripmon.model.records import CommandReply, MonitorState, ReferenceRecord
@@ -32,6 +40,22 @@ Tell a running monitor something, and print its answer.
 What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
 answer came, --request with that id asks for the same again, which is not carried out twice."""
 
+_NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state", "snapshot")
+_WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
+
+_OPTIONS = f"""
+NAME               {", ".join(_NAMES)}
+[ID]               the reference, proposal or alert that is meant
+--robot NAME       the robot's name in the configuration
+--camera NAME      the camera's name; needed if the robot has several
+--monitor ID       which one, where two monitors have one name: its id, as printed
+{NETWORK_OPTIONS.format("the monitor's").strip()}
+--timeout S        how long to wait (s); default: 5
+--out DIR          where a snapshot goes; made if it is missing
+--request REQUEST  id of an earlier request that got no answer
+--json             print the whole answer as one line of JSON
+"""
+
 _EXAMPLES = """\
   gripmon send state --robot arm1
   gripmon send undo --robot arm1
@@ -40,40 +64,20 @@ _EXAMPLES = """\
 
 exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
 
-_WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
-_NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state", "snapshot")
 
-
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands, "send", send, "tell a running monitor something: undo, accept, state, …", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument("name", metavar="COMMAND", choices=_NAMES, help=", ".join(_NAMES))
-    parser.add_argument(
-        "id", metavar="ID", nargs="?", default="", help="the reference, proposal or alert that is meant"
-    )
-    parser.add_argument("--robot", required=True, metavar="NAME", help="the robot's name in the configuration")
-    parser.add_argument("--camera", metavar="NAME", help="the camera's name; needed if the robot has several")
-    parser.add_argument(
-        "--monitor", metavar="ID", default="", help="which one, where two monitors have one name: its id, as printed"
-    )
-    joining.add_options(parser, "the monitor's")
-    parser.add_argument(
-        "--timeout", type=common.positive_number, default=5.0, metavar="S", help="how long to wait (s); default: 5"
-    )
-    parser.add_argument("--out", metavar="DIR", help="where a snapshot goes; made if it is missing")
-    parser.add_argument("--request", metavar="REQUEST", help="id of an earlier request that got no answer")
-    parser.add_argument("--json", action="store_true", help="print the whole answer as one line of JSON")
-
-
+@Command(
+    "send", "tell a running monitor something: undo, accept, state, …", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    name={"choices": _NAMES, "metavar": "COMMAND"}, id={"default": ""}, robot=REQUIRED, monitor={"default": ""},
+    timeout={"type": positive_number, "default": 5.0},
+)  # fmt: skip
 def send(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon send``."""
     from gripmon.client import snapshots
 
     if wrong := _misuse(arguments):
         raise InputError(f"send: {wrong}")
-    out = None if arguments.out is None else common.make_directory(Path(arguments.out))
+    network_of(arguments)
+    out = None if arguments.out is None else make_directory(arguments.out)
     if out is not None:
         snapshots.check_table(out)
     reply, image = _ask(arguments)
@@ -88,7 +92,7 @@ def send(arguments: argparse.Namespace) -> int:
         print("\n".join([printable(reply.text), *map(str, written)]))
         if reply.monitor is not None and reply.snapshot is None:
             print("\n".join(map(printable, _table(reply.monitor))))
-    return common.EXIT_DONE if reply.done else common.EXIT_FAILED
+    return EXIT_DONE if reply.done else EXIT_FAILED
 
 
 def _misuse(arguments: argparse.Namespace) -> str:
@@ -96,8 +100,6 @@ def _misuse(arguments: argparse.Namespace) -> str:
     name = arguments.name
     if arguments.id and name not in _WITH_ARGUMENT:
         return f"{name} takes no ID, but {arguments.id} is given; leave it out"
-    if wrong := joining.misuse(arguments):
-        return wrong
     if name == "snapshot" and arguments.out is None:
         return "snapshot has nowhere to go; --out DIR"
     if name != "snapshot" and arguments.out is not None:
@@ -110,37 +112,27 @@ def _misuse(arguments: argparse.Namespace) -> str:
 def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
     from gripmon.client import Ambiguous, Client, NotCarriedOut
-    from gripmon.io.wire import PublishError
     from gripmon.model.records import CommandFault, CommandName
 
+    timeout_s, monitor_id = arguments.timeout, arguments.monitor
     try:
-        client = Client(
-            arguments.robot,
-            arguments.camera,
-            connect=arguments.connect or (joining.DEFAULT_ENDPOINT,),
-            zenoh_config_file=arguments.zenoh_config,
-        )
-    except PublishError as error:
-        raise joining.failure("send", error) from None
+        with network_errors(arguments):
+            client = Client(arguments.robot, arguments.camera, **network_of(arguments))
+        with client:
+            if arguments.out is not None:
+                return client.snapshot(timeout_s, monitor_id=monitor_id)
+            name, request = CommandName(arguments.name), arguments.request
+            return client.send(name, arguments.id, timeout_s, request_id=request, monitor_id=monitor_id), None
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"send: {error}") from None
-    with client:
-        try:
-            if arguments.out is not None:
-                return client.snapshot(arguments.timeout, monitor_id=arguments.monitor)
-            name = CommandName(arguments.name)
-            reply = client.send(
-                name, arguments.id, arguments.timeout, request_id=arguments.request, monitor_id=arguments.monitor
-            )
-            return reply, None
-        except ValueError as error:
-            raise InputError(f"send: {error}") from None
-        except Ambiguous as error:
-            option = {"camera": "--camera", "monitor_id": "--monitor ID"}[error.argument]
-            raise InputError(f"send: {error} ({option})") from None
-        except NotCarriedOut as error:
-            again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
-            raise NoResultError(f"send: {printable(str(error))}{again}") from None
+    except Ambiguous as error:
+        option = {"camera": "--camera", "monitor_id": "--monitor ID"}[error.argument]
+        raise InputError(f"send: {error} ({option})") from None
+    except NotCarriedOut as error:
+        again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
+        raise NoResultError(f"send: {printable(str(error))}{again}") from None
 
 
 def _table(state: MonitorState) -> list[str]:

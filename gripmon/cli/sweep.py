@@ -5,234 +5,86 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli import common, sweep_table
+from gripmon.cli.common import check_outputs, progress_bar, write
 from gripmon.model.errors import InputError
+from gripmon.model.stopping import EXIT_DONE
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
-
     from gripmon.daemon.config import Config
+    from gripmon.daemon.sweeping import Sweep
     from gripmon.model.camera import Camera
-    from gripmon.teach.forecast import Grid
+    from gripmon.teach.forecast import Trial
 
-_MOST_VALUES, _MOST_MOUNTS = 100, 20000
-_NEAREST_M, _FARTHEST_M = 0.005, 5.0
-_DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), "0:75:6"
+ABOUT = """\
+RANGE is FIRST:LAST:COUNT, or single values with commas; write --roll=-90:90:3 where it begins with a minus. \
+What isn't given stays as in the configuration, but for distance (0.6 to 1.8 times) and tilt (0 to 75°)."""
 
+OPTIONS = """
+--sweep           try other camera mounts, and lenses; the source is left out
+--distance RANGE  from the camera's centre to the TCP (m)
+--tilt RANGE      of the optical axis against the gripper's z axis (degrees, 0 along the fingers)
+--side RANGE      where the camera sits about the gripper's z axis (degrees; 0 at -y, 90 at +x)
+--roll RANGE      about the optical axis: how far the picture is turned clockwise (degrees)
+--focal RANGE     focal length, same sensor (px); any but the calibrated one without distortion
+| --fov RANGE     the same by the image's width (degrees)
+| --lens FILE...  a calibrated one, by gripmon calibrate intrinsics; may be repeated
+--at U,V          where the TCP shows in the present camera's image (px; default: as now)
+--jaw MIN:MAX     openings at which it has to work (m; default: all)
+--picture FILE    draw the sweep (.png, .jpg)
+"""
+NAMES = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "jaw", "picture")
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep's options to the parser of ``check``."""
-    group = parser.add_argument_group(
-        "sweep of camera mounts",
-        "RANGE is FIRST:LAST:COUNT, or single values with commas; write --roll=-90:90:3 where it begins with a minus. "
-        "What isn't given stays as in the configuration, but for distance (0.6 to 1.8 times) and tilt (0 to 75°).",
-    )
-    group.add_argument(
-        "--sweep", action="store_true", help="try other camera mounts, and lenses; the source is left out"
-    )
-    group.add_argument("--distance", metavar="RANGE", help="from the camera's centre to the TCP (m)")
-    group.add_argument(
-        "--tilt",
-        metavar="RANGE",
-        help="of the optical axis against the gripper's z axis (degrees, 0 along the fingers)",
-    )
-    group.add_argument(
-        "--side",
-        metavar="RANGE",
-        help="where the camera sits about the gripper's z axis (degrees; 0 at -y, 90 at +x)",
-    )
-    group.add_argument(
-        "--roll", metavar="RANGE", help="about the optical axis: how far the picture is turned clockwise (degrees)"
-    )
-    lens = group.add_mutually_exclusive_group()
-    lens.add_argument(
-        "--focal", metavar="RANGE", help="focal length, same sensor (px); any but the calibrated one without distortion"
-    )
-    lens.add_argument("--fov", metavar="RANGE", help="the same by the image's width (degrees)")
-    lens.add_argument(
-        "--lens",
-        metavar="FILE",
-        action="append",
-        help="a calibrated one, by gripmon calibrate intrinsics; may be repeated",
-    )
-    group.add_argument(
-        "--at",
-        metavar="U,V",
-        help="where the TCP shows in the present camera's image (px; default: as now)",
-    )
-    group.add_argument("--jaw", metavar="MIN:MAX", help="openings at which it has to work (m; default: all)")
-    group.add_argument("--picture", metavar="FILE", help="draw the sweep (.png, .jpg)")
-
-
-_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "jaw", "picture")
-
-
-def refuse_without_sweep(arguments: argparse.Namespace) -> None:
-    """End the command if an option of the sweep stands alone."""
-    for name in _OPTIONS:
-        if getattr(arguments, name) is not None:
-            raise InputError(f"--{name}: only has a meaning for a sweep; add --sweep")
+_MOST_VALUES = 100
+_BOUNDS = {
+    "distance": (0.005, 5.0, "m"), "tilt": (0.0, 180.0, "degrees"), "side": (-360.0, 360.0, "degrees"),
+    "roll": (-360.0, 360.0, "degrees"), "focal": (1.0, 1e6, "px"), "fov": (1.0, 170.0, "degrees"),
+}  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Try the mounts, print the table, draw the picture."""
-    config = common.load(arguments.config, check_source=False)
-    grid, at_px = _grid(config, arguments)
-    travel_m = _travel(config, arguments.jaw)
-    picture = None if arguments.picture is None else Path(arguments.picture)
-    if picture is not None:
-        _check_picture(picture)
+    from gripmon.daemon.config import load_config
     from gripmon.daemon.forecast import rig_of
-    from gripmon.daemon.sweeping import as_plain, sweep
-    from gripmon.teach.forecast.picture import draw_sweep
+    from gripmon.daemon.sweeping import as_plain, make_grid, sweep
+    from gripmon.teach.forecast.picture import draw_sweep, encoded
 
-    with common.progress_bar(len(grid), "mount") as step:
-        swept = sweep(config, grid, at_px, travel_m, step)
-    print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(sweep_table.as_text(swept)))
-    if picture is not None:
+    config = load_config(arguments.config[0], check_source=False)
+    ranges = {name: _range(name, getattr(arguments, name)) for name in _BOUNDS if getattr(arguments, name) is not None}
+    at_px = _numbers(arguments.at, ",")
+    if at_px is None and arguments.at is not None:
+        width_px, height_px = config.camera.width_px, config.camera.height_px
+        right = f"two numbers inside {width_px} x {height_px} px, such as --at {width_px // 2},{height_px // 2}"
+        raise InputError(f"--at {arguments.at}: isn't a point of the image; {right}")
+    travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", _numbers(arguments.jaw, ":")
+    if travel_m is None and arguments.jaw is not None:
+        raise InputError(f"--jaw {arguments.jaw}: isn't a range; MIN:MAX in metres, within {travel}")
+    check_outputs(arguments, "picture")
+    grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
+    with progress_bar(len(grid), "mount") as step:
+        swept = sweep(config, grid, place_px, travel_m, step)
+    print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(_as_text(swept)))
+    if arguments.picture is not None:
         drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
-        _write(picture, drawn)
+        write(encoded(drawn, arguments.picture.suffix), arguments.picture, "--picture")
         if not arguments.json:
-            print(f"picture    {picture}")
-    return common.EXIT_DONE
+            print(f"picture    {arguments.picture}")
+    return EXIT_DONE
 
 
-def _check_picture(path: Path) -> None:
-    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f"--picture {path}: is no kind of picture; .png or .jpg")
-    if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
-        raise common.not_writable(path, OSError("is a folder" if path.is_dir() else "no such place"), "--picture")
-
-
-def _write(path: Path, picture: Image) -> None:
-    """Whole or not at all."""
-    from gripmon.model.atomic import write_atomically
-    from gripmon.teach.forecast.picture import encoded
-
+def _numbers(text: str | None, between: str) -> tuple[float, float] | None:
+    """Two numbers; None for another text."""
     try:
-        write_atomically(path, encoded(picture, path.suffix))
-    except OSError as error:
-        raise common.not_writable(path, error, "--picture") from None
-
-
-def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
-    from gripmon.daemon.forecast import rig_of
-    from gripmon.teach.forecast import Grid, Mount, towards
-
-    present, rig = Mount.of(config.cam_T_grip), rig_of(config)
-    low, high, count = _DISTANCES
-    default = f"{low * present.distance_m}:{high * present.distance_m}:{count}"
-    distances_m = _values("--distance", _or(arguments.distance, default), _NEAREST_M, _FARTHEST_M, "m")
-    tilts = _values("--tilt", _or(arguments.tilt, _TILTS_DEG), 0.0, 180.0, "degrees")
-    sides_rad = _turns("--side", arguments.side, present.side_rad)
-    rolls_rad = _turns("--roll", arguments.roll, present.roll_rad)
-    cameras = _cameras(config.camera, arguments)
-    at_px = _spot(config, arguments.at)
-    try:
-        directions = tuple(towards(camera, _same_place(at_px, config.camera, camera)) for camera in cameras)
-    except ValueError as error:
-        raise InputError(f"--at: {error}") from None
-    grid = Grid(
-        distances_m,
-        tuple(math.radians(v) for v in tilts),
-        sides_rad,
-        rolls_rad,
-        tuple(rig._replace(camera=camera) for camera in cameras),
-        directions,
-    )
-    if len(grid) > _MOST_MOUNTS:
-        raise InputError(f"--sweep: {len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis")
-    return grid, at_px
-
-
-def _travel(config: Config, text: str | None) -> tuple[float, float] | None:
-    """The part of the jaw's travel that counts; a fault ends the command with exit code 2."""
-    gripper = config.gripper
-    if text is None:
-        return None
-    right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
-    if not gripper.jaw_max_m > gripper.jaw_min_m:
-        raise InputError("--jaw: the gripper's jaw doesn't move; leave it out")
-    try:
-        low_m, high_m = (float(part) for part in text.split(":"))
+        first, second = (float(part) for part in (text or "").split(between))
     except ValueError:
-        raise InputError(f"--jaw {text}: is no range; {right}") from None
-    if not gripper.jaw_min_m <= low_m < high_m <= gripper.jaw_max_m:
-        raise InputError(f"--jaw {text}: is not in the jaw's travel; {right}")
-    return low_m, high_m
+        return None
+    return first, second
 
 
-def _or(text: str | None, default: str) -> str:
-    return default if text is None else text
-
-
-def _turns(option: str, text: str | None, present_rad: float) -> tuple[float, ...]:
-    if text is None:
-        return (present_rad,)
-    return tuple(math.radians(v) for v in _values(option, text, -360.0, 360.0, "degrees"))
-
-
-def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
-    from gripmon.teach.forecast import with_focal
-
-    if arguments.lens is not None:
-        return [_calibrated(Path(name)) for name in arguments.lens]
-    option, text = ("--focal", arguments.focal) if arguments.fov is None else ("--fov", arguments.fov)
-    if text is None:
-        return [camera]
-    if option == "--fov":
-        angles = _values(option, text, 1.0, 170.0, "degrees")
-        focals_px = [0.5 * camera.width_px / math.tan(0.5 * math.radians(angle)) for angle in angles]
-    else:
-        focals_px = list(_values(option, text, 1.0, 1e6, "px"))
-    try:
-        return [with_focal(camera, focal_px) for focal_px in focals_px]
-    except ValueError as error:
-        raise InputError(f"{option} {text}: {error}") from None
-
-
-def _calibrated(path: Path) -> Camera:
-    """The camera in a file; a fault ends the command with exit code 2."""
-    from gripmon.daemon.config import ConfigError
-    from gripmon.daemon.config.calibrated import read_camera
-    from gripmon.model.camera import make_camera
-
-    try:
-        return make_camera(read_camera(path).camera)
-    except (ConfigError, ValueError) as error:
-        raise InputError(f"--lens {error}") from None
-
-
-def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tuple[float, float]:
-    """A point of one camera's image in that of another one, which may have more pixels, or fewer."""
-    (u, v), across, down = at_px, other.width_px / camera.width_px, other.height_px / camera.height_px
-    return (u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5
-
-
-def _spot(config: Config, text: str | None) -> tuple[float, float]:
-    """Where the TCP is to show: as now, or as said."""
-    camera = config.camera
-    right = f"two numbers inside {camera.width_px} x {camera.height_px} px, such as --at {camera.width_px // 2},"
-    right += f"{camera.height_px // 2}"
-    if text is None:
-        (u, v), where = camera.project(config.cam_T_grip[None, :3, 3])[0].tolist(), "the TCP shows now at"
-    else:
-        try:
-            u, v = (float(part) for part in text.split(","))
-        except ValueError:
-            raise InputError(f"--at {text}: is no point of the image; {right}") from None
-        where = "lies at"
-    if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
-        raise InputError(f"--at: {where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}")
-    return u, v
-
-
-def _values(option: str, text: str, lowest: float, highest: float, unit: str) -> tuple[float, ...]:
+def _range(name: str, text: str) -> tuple[float, ...]:
     """The values of a RANGE; a fault ends the command with exit code 2."""
+    lowest, highest, unit = _BOUNDS[name]
     right = f"FIRST:LAST:COUNT or values with commas, {lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
     try:
         if ":" in text:
@@ -244,9 +96,116 @@ def _values(option: str, text: str, lowest: float, highest: float, unit: str) ->
         else:
             values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"{option} {text}: is no range; {right}") from None
+        raise InputError(f"--{name} {text}: isn't a range; {right}") from None
     wrong = [v for v in values if not lowest <= v <= highest]
     if wrong or len(values) > _MOST_VALUES:
         what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
-        raise InputError(f"{option} {text}: {what}; {right}")
+        raise InputError(f"--{name} {text}: {what}; {right}")
     return tuple(sorted(set(values)))
+
+
+_SHOWN, _REASONS_SHOWN = 8, 4
+_COLUMNS = (
+    ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
+    ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 8),
+    ("bound", "mm", 8), ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
+)  # fmt: skip
+
+
+def _as_text(swept: Sweep) -> list[str]:
+    """A table for a person: mm, degrees."""
+    config, grid, at_px, present, ranked = swept.config, swept.grid, swept.at_px, swept.present, swept.ranked
+    working = sum(trial.works for trial in ranked)
+    warn_mm = 1e3 * config.settings.monitor.policy.warn_m
+    lines = [
+        f"{config.path}: {len(ranked)} mounts tried, {working} would work",
+        f"TCP        at ({at_px[0]:.1f}, {at_px[1]:.1f}) px in all of them",
+        *_looked_at(config, present),
+        " " * 10 + "".join(title.rjust(width) for title, _, width in _COLUMNS),
+        " " * 10 + "".join(unit.rjust(width) for _, unit, width in _COLUMNS),
+    ]
+    lines += [
+        f"{'best' if k == 0 and trial.works else '':<10}{_row(grid.rigs[trial.lens].camera, trial)}"
+        for k, trial in enumerate(ranked[:_SHOWN])
+    ]
+    place = sum(trial.rank < present.rank for trial in ranked)
+    lines.append(f"{'present':<10}{_row(config.camera, present)}")
+    better = f"{place} of those tried are" if place else "none of those tried is"
+    lines.append(f"           {better} better than the present one")
+    lines += [f"           present: {reason}" for reason in present.reasons]
+    lines += _failing(ranked)
+    lines += [
+        "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
+        "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
+        "           worst opening; bound: on its error at the worst opening, which alert_limit_m is held against;",
+        "           notices: the smallest step that is noticed along every axis; in: frames until",
+        f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
+        "           until too little is in view.  Not known here: focus, light, what is in the camera's way, and what",
+        "           hides the fingers without being in the gripper file.",
+    ]
+    if not config.gripper.faces:
+        lines += [
+            "no faces   The gripper file has none, as an inferred one: every edge counts as seen from everywhere, also",
+            "           where the finger itself hides it. Trust mounts near the present one only.",
+        ]
+    if ranked[0].works:
+        lines += _to_copy(ranked[0])
+    return lines
+
+
+def _looked_at(config: Config, present: Trial) -> list[str]:
+    """Which openings count, and how taught edges do."""
+    lines = []
+    low_mm, high_mm = 1e3 * present.openings_m[0], 1e3 * present.openings_m[-1]
+    if high_mm > low_mm:
+        usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
+        lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
+    if config.taught is not None:
+        lines.append("taught     as seen from the present mount; taught again at another one it gets more exact there")
+    return lines
+
+
+def _row(camera: Camera, trial: Trial) -> str:
+    mount, covariance = trial.mount, trial.covariance
+    angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
+    cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
+    cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
+    if covariance is not None:
+        cells += [_number(math.sqrt(v), 1e3, 3) for v in covariance.diagonal()[:3].tolist()]
+        bound_m = None if trial.promise is None else trial.promise.protection.position_m
+        cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(bound_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
+        cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
+        cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
+    row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))
+    return row if trial.works else f"{row}  NO: {trial.reasons[0]}"
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    if value is None:
+        return "-"
+    scaled = factor * value
+    return f"{scaled:.{digits if abs(scaled) < 10.0 or digits < 2 else 1}f}"
+
+
+def _failing(ranked: list[Trial]) -> list[str]:
+    """The commonest first reasons."""
+    counts: dict[str, int] = {}
+    for trial in ranked:
+        if trial.kind is not None:
+            counts[trial.kind] = counts.get(trial.kind, 0) + 1
+    commonest = sorted(counts.items(), key=lambda item: -item[1])[:_REASONS_SHOWN]
+    return [
+        f"{'others' if k == 0 else '':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(commonest)
+    ]
+
+
+def _to_copy(best: Trial) -> list[str]:
+    from gripmon.model.geometry import to_record
+
+    transform = to_record(best.cam_T_grip)
+    return [
+        "best as    reference:",
+        "             cam_T_grip:",
+        f"               translation_m: [{', '.join(f'{v:.6f}' for v in transform.translation_m)}]",
+        f"               rotation_xyzw: [{', '.join(f'{v:.6f}' for v in transform.rotation_xyzw)}]",
+    ]

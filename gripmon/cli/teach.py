@@ -1,20 +1,33 @@
-"""``gripmon teach``: what the gripper's edges look like, from images at the reference calibration."""
+"""``gripmon teach``: what the gripper's edges look like, from images at the reference or from corners put by hand."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
-import shlex
+import sys
+import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gripmon.cli import common
-from gripmon.model.errors import InputError
+from gripmon.cli.common import (
+    Command,
+    check_outputs,
+    command_line,
+    make_directory,
+    positive_number,
+    refuse_without,
+    whole_number,
+    write,
+)
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.teach.edges import Taught
+    from gripmon.teach.edges.bench import Found
+    from gripmon.teach.page import Desk, RoughDesk, Saved
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
@@ -33,6 +46,35 @@ With neither --gripper nor --config the page writes rough.yaml, for gripmon cali
 Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
 in use, each before another background, some with the jaws opened otherwise."""
 
+_OPTIONS = """
+[IMAGE...]          image file at the reference calibration
+--config CONFIG     configuration (YAML); its source section is not used
+--out FILE          file to write (default: what the configuration names under taught, else taught.yaml beside it);
+                    with --page or --corners the folder to write to (default: the configuration's, else this one)
+--jaw-opening M     jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's
+                    nominal if that is absent, else from a timestamps.csv beside each image
+--picture FILE.png  also draw the first image with what was taught, offsets enlarged
+--force             replace the file if there is one
+--into-config       also write the line that names it into the configuration
+"""
+
+_BY_HAND = """
+--page              teach on a local web page
+--corners FILE      without a page: rough corners, `corners: {name: [u, v], …}`
+--live DEVICE       with --page: a camera instead of images, as in source.device
+--live-wait S       give up when this camera has shown nothing for so long (s); default: never, the page says what is
+                    wrong
+--camera FILE       without --config: the camera's calibration
+--gripper FILE      without --config: the gripper file
+--reference FILE    without --config: calibration of hand and eye, if there is
+--jaw-source        in the configuration written: where jaw openings come from; zenoh: the robot says them (default:
+                    frames with a timestamps.csv that has them, else fixed)
+--robot NAME        the robot's name in the configuration written
+--camera-name NAME  the camera's name in it
+--port N            port of the page (default: any free one)
+--no-browser        print the page's address, but open no browser
+"""
+
 _EXAMPLES = """\
   gripmon teach first/*.png --config mine/arm1.yaml
   gripmon teach now.png --config mine/arm1.yaml --jaw-opening 0.034 --picture taught.png
@@ -49,150 +91,53 @@ a new robot, without any configuration: put corners on the fingertips, on a page
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
 from, and why: nothing is written then"""
 
-
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands, "teach", run, "learn how the gripper's edges look at the reference", _DESCRIPTION, _EXAMPLES
-    )
-    parser.add_argument("images", nargs="*", metavar="IMAGE", help="image file at the reference calibration")
-    parser.add_argument("--config", metavar="CONFIG", help="configuration (YAML); its source section is not used")
-    parser.add_argument(
-        "--out",
-        metavar="FILE",
-        help="file to write (default: what the configuration names under taught, else taught.yaml beside it); with "
-        "--page or --corners the folder to write to (default: the configuration's, else this one)",
-    )
-    parser.add_argument(
-        "--jaw-opening",
-        type=common.positive_number,
-        metavar="M",
-        help="jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's "
-        "nominal if that is absent, else from a timestamps.csv beside each image",
-    )
-    parser.add_argument(
-        "--picture", metavar="FILE.png", help="also draw the first image with what was taught, offsets enlarged"
-    )
-    parser.add_argument("--force", action="store_true", help="replace the file if there is one")
-    parser.add_argument(
-        "--into-config", action="store_true", help="also write the line that names it into the configuration"
-    )
-    _add_corner_options(parser)
-
-
-def _add_corner_options(parser: argparse.ArgumentParser) -> None:
-    """Those of teaching from corners that a person puts on the fingertips."""
-    page = parser.add_argument_group("corners by hand")
-    page.add_argument("--page", action="store_true", help="teach on a local web page")
-    page.add_argument("--corners", metavar="FILE", help="without a page: rough corners, `corners: {name: [u, v], …}`")
-    page.add_argument("--live", metavar="DEVICE", help="with --page: a camera instead of images, as in source.device")
-    page.add_argument(
-        "--live-wait", type=common.positive_number, metavar="S",
-        help="give up when this camera has shown nothing for so long (s); default: never, the page says what is wrong",
-    )  # fmt: skip
-    page.add_argument("--camera", metavar="FILE", help="without --config: the camera's calibration")
-    page.add_argument("--gripper", metavar="FILE", help="without --config: the gripper file")
-    page.add_argument("--reference", metavar="FILE", help="without --config: calibration of hand and eye, if there is")
-    page.add_argument(
-        "--jaw-source",
-        choices=("fixed", "frames", "zenoh"),
-        help="in the configuration written: where jaw openings come from; zenoh: the robot says them (default: "
-        "frames with a timestamps.csv that has them, else fixed)",
-    )
-    page.add_argument("--robot", type=_key, metavar="NAME", help="the robot's name in the configuration written")
-    page.add_argument("--camera-name", type=_key, metavar="NAME", help="the camera's name in it")
-    page.add_argument("--port", type=_port, default=0, metavar="N", help="port of the page (default: any free one)")
-    page.add_argument("--no-browser", action="store_true", help="print the page's address, but open no browser")
+_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source")
+_NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
+_LOOK_S = 0.2
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def _key(text: str) -> str:
     """A name that may stand in a key on the network."""
     if not text or re.fullmatch(r"[^/*$#?@\s][^/*$#?\s]*", text) is None:
-        raise argparse.ArgumentTypeError(f"'{text}' is no name; no blank, none of / * $ # ?, no @ in front")
+        raise argparse.ArgumentTypeError(f"'{text}' isn't a name; no blank, none of / * $ # ?, no @ in front")
     return text
 
 
-def _port(text: str) -> int:
-    if not (text.isdecimal() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"'{text}' is no port; a whole number, 0 (any free one) to 65535")
-    return int(text)
-
-
-def run(arguments: argparse.Namespace) -> int:
+@Command(
+    "teach", "learn how the gripper's edges look at the reference", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    {"corners by hand": (None, _BY_HAND)},
+    jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
+    jaw_source={"choices": ("fixed", "frames", "zenoh")},
+    port={"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (any free one) to 65535"), "default": 0},
+)  # fmt: skip
+def teach(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach``."""
     if arguments.page or arguments.corners is not None or arguments.live is not None:
-        from gripmon.cli import teach_corners
-
-        return teach_corners.run(arguments, command(arguments))
-    _check_usage(arguments)
+        _teach_by_hand(arguments)
+        return
+    if not arguments.image:
+        raise InputError("teach: no image; image files, or --page --live DEVICE")
+    if arguments.config is None:
+        raise InputError("teach: --config is missing; a configuration, or --page with --camera and --gripper")
+    refuse_without(arguments, _NEED_CORNERS, "goes with --page or --corners")
     from gripmon.daemon.config import load_config
     from gripmon.daemon.teaching import name_taught
     from gripmon.teach.api import teach
 
-    config = load_config(Path(arguments.config), check_source=False, with_taught=False)
-    out = _out(arguments, config)
-    taught = teach(config, arguments.images, jaw_opening_m=arguments.jaw_opening, command=command(arguments))
-    _write(out, taught.text().encode(), "--out")
+    config, command = load_config(arguments.config, check_source=False, with_taught=False), command_line(arguments)
+    out = arguments.out = arguments.out or config.taught_path or config.directory / "taught.yaml"
+    if arguments.into_config and config.taught_path is not None and config.taught_path.resolve() != out.resolve():
+        wrong = f"{config.path} names {config.taught_path} already; without it, or without --out"
+        raise InputError(f"--into-config: {wrong}")
+    check_outputs(arguments, "out", "picture")
+    taught = teach(config, arguments.image, jaw_opening_m=arguments.jaw_opening, command=command)
+    write(taught.text().encode(), out)
     if arguments.into_config:
         config = name_taught(config, out)
     print(_summary(config, taught.taught, out))
     if arguments.picture is not None:
-        picture = Path(arguments.picture)
-        _write(picture, taught.picture(picture.suffix), "--picture")
-    return common.EXIT_DONE
-
-
-def command(arguments: argparse.Namespace) -> str:
-    """The command line, as files name it that it writes."""
-    words = ["gripmon", "teach", *(["--page"] if arguments.page else []), *arguments.images]
-    for name in ("live", "corners", "config", "camera", "gripper", "reference", "out", "jaw_opening", "jaw_source"):
-        value = getattr(arguments, name)
-        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
-    return shlex.join(words)
-
-
-def _check_usage(arguments: argparse.Namespace) -> None:
-    """Without corners by hand images and a configuration are needed; nothing else makes sense."""
-
-    def refuse(text: str) -> None:
-        raise InputError(f"teach: {text}")
-
-    if not arguments.images:
-        refuse("no image; image files, or --page --live DEVICE")
-    if arguments.config is None:
-        refuse("--config is missing; a configuration, or --page with --camera and --gripper")
-    for option in ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source"):
-        if getattr(arguments, option) is not None:
-            refuse(f"--{option.replace('_', '-')} goes with --page or --corners")
-
-
-def _out(arguments: argparse.Namespace, config: Config) -> Path:
-    """Where to write; refused before any work if that can't be."""
-    named = config.taught_path or config.directory / "taught.yaml"
-    out = named if arguments.out is None else Path(arguments.out)
-    for path, option in ((out, "--out"), (arguments.picture and Path(arguments.picture), "--picture")):
-        if path:
-            common.make_directory(path.parent, option)
-            if path.is_dir():
-                raise InputError(f"{option} {path}: is a folder; a file")
-    if arguments.into_config and config.taught_path is not None and config.taught_path.resolve() != out.resolve():
-        raise InputError(
-            f"--into-config: {config.path} names {config.taught_path} already; without it, or without --out"
-        )
-    if out.exists() and not arguments.force:
-        raise InputError(f"--out {out}: is there already; another file, or --force to replace it")
-    if arguments.picture is not None and Path(arguments.picture).suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f"--picture {arguments.picture}: has no known ending; .png or .jpg")
-    return out
-
-
-def _write(path: Path, data: bytes, option: str) -> None:
-    from gripmon.model.atomic import write_atomically
-
-    try:
-        write_atomically(path, data)
-    except OSError as error:
-        raise common.not_writable(path, error, option) from None
+        write(taught.picture(arguments.picture.suffix), arguments.picture, "--picture")
 
 
 def _summary(config: Config, taught: Taught, out: Path) -> str:
@@ -217,3 +162,131 @@ def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
     place = f"{1e6 * offset_m:+8.1f} um ({px_per_m * offset_m:+6.2f} px)   {1e6 * sigma_m:6.1f} um"
     kind = "crease" if edge.crease else "outline"
     return f"{name:<{width}}  {place}  {100.0 * edge.seen:5.0f} %  {edge.brighter:<5} {kind}"
+
+
+def _teach_by_hand(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon teach --page`` and ``--corners``."""
+    if wrong := _misuse(arguments):
+        raise InputError(f"teach: {wrong}")
+    from gripmon.daemon.teaching import page_desk, read_inputs, rough_desk, teach_from_file
+
+    images = arguments.image
+    if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
+        if len(images) > 1:
+            right = "one image, to put rough corners in, or --gripper FILE"
+            raise InputError(f"teach: {len(images)} images, and no gripper; {right}")
+        folder = arguments.out or Path()
+        desk = rough_desk(images[0], arguments.camera, folder)
+        make_directory(folder)
+        try:
+            _serve(arguments, desk)
+        finally:
+            if desk.saved is not None:
+                _say(desk.saved)
+        return
+    files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
+    inputs = read_inputs(
+        images, command=command_line(arguments), **files, live=arguments.live, jaw_opening_m=arguments.jaw_opening,
+        jaw_source=arguments.jaw_source, robot=arguments.robot, camera_name=arguments.camera_name,
+    )  # fmt: skip
+    make_directory(inputs.folder)
+    if arguments.page:
+        _serve(arguments, page_desk(inputs))
+        return
+    found, save = teach_from_file(inputs, arguments.corners)
+    print("\n".join(_table(found)))
+    saved = save(arguments.force)
+    if saved.exists:
+        raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
+    _say(saved)
+
+
+def _misuse(arguments: argparse.Namespace) -> str:
+    """Which options contradict each other, and what would be right."""
+    images, page, config, live = arguments.image, arguments.page, arguments.config, arguments.live
+    if page and arguments.corners is not None:
+        return "--page and --corners are two ways of the same; one of them"
+    if live is not None and (images or not page):
+        return "--live goes with --page, without images; image files otherwise"
+    if arguments.live_wait is not None and live is None:
+        return "--live-wait: goes with --live"
+    if not images and live is None:
+        return "no image; image files, or --page --live DEVICE"
+    if arguments.corners is not None and len(images) > 1:
+        return f"{len(images)} images; with --corners one, the image that they were put in"
+    if arguments.into_config:
+        return "--into-config: with --page and --corners the configuration gets its line anyway; leave it out"
+    if arguments.picture is not None:
+        return "--picture goes with --config alone; look at the page"
+    if config is not None and arguments.jaw_source is not None:
+        return "--jaw-source: --config says where jaw openings come from; leave it out"
+    if config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
+        return "--config has camera, gripper and reference already; either that, or --camera and --gripper"
+    return ""
+
+
+def _say(saved: Saved) -> None:
+    lines = [f"note: {note}" for note in saved.notes]
+    lines += [f"written: {path} ({what})" for path, what in saved.written.items()]
+    lines += [] if saved.next is None else [f"next: {saved.next}"]
+    print("\n".join(lines), flush=True)
+
+
+def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> None:
+    """Until the person is done."""
+    from gripmon.teach.page import PageServer
+
+    try:
+        server = PageServer(desk, arguments.port)
+    except OSError as error:
+        desk.close()
+        wrong = f"can't be listened on ({error.strerror}); another one, or none"
+        raise InputError(f"--port {arguments.port}: {wrong}") from None
+    try:
+        print(f"teach on this page: {server.url}", flush=True)
+        print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
+        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
+        if not arguments.no_browser and displayed:
+            webbrowser.open(server.url)
+        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
+            dark_s, why = desk.dark()
+            if arguments.live_wait is not None and dark_s > arguments.live_wait:
+                raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
+    finally:
+        server.close()
+        desk.close()
+
+
+def _table(found: Found) -> list[str]:
+    """What was seen, for a person."""
+    snapped = found.snapped
+    width = max(len(corner.name) for corner in snapped.corners)
+    lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]
+    for corner in snapped.corners:
+        agree = "" if corner.inliers is None else f"{100.0 * corner.inliers:4.0f} %"
+        if corner.uv_px is None or corner.sigma_px is None:
+            lines.append(f"{corner.name:<{width}}  not measured: {corner.reason}")
+            continue
+        u, v = corner.uv_px.tolist()
+        lines.append(f"{corner.name:<{width}}  ({u:7.2f}, {v:7.2f})  {corner.sigma_px:7.3f}  {agree}")
+    if found.reference is not None and found.pose is not None:
+        sigmas = ", ".join(f"{1e3 * found.reference.covariance[k] ** 0.5:.3f}" for k in (0, 7, 14))
+        by = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
+        lines.append(f"reference by {by}, TCP to {sigmas} mm: less exact than with a plate (gripmon calibrate plane)")
+        if found.pose.rival:
+            rival = "another pose explains these corners as well; a corner outside of their plane would tell"
+            lines.append(f"note: {rival}")
+    expected = found.prospects
+    if expected is not None:
+        lines.append(f"expected of a frame   {_axes(expected.sigma)}")
+        lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
+        lines.append(f"promise               {expected.promise.text()}")
+    return lines
+
+
+def _axes(values: object) -> str:
+    import numpy as np
+
+    x, y, z, a, b, c = np.asarray(values, dtype=float).tolist()
+    turns = ", ".join(f"{math.degrees(v):.3f}" for v in (a, b, c))
+    return f"TCP x {1e3 * x:.3f}, y {1e3 * y:.3f}, z {1e3 * z:.3f} mm, turns {turns}°"

@@ -7,15 +7,14 @@ import logging
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, fleet_table, joining
-from gripmon.cli.alert_log import AlertLog
+from gripmon.cli import fleet_table
+from gripmon.cli.common import NETWORK_OPTIONS, Command, check_file, network_errors, network_of, positive_number
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
-    from gripmon.client import Fleet, MonitorStatus
+    from gripmon.client import AlertLog, Fleet, MonitorStatus
 
 _DESCRIPTION = """\
 A live table of all monitors on the network, the worst first: those that are gone, silent or have no
@@ -32,6 +31,17 @@ monitor's state, verdict, reference or alerts change; with --json one line of JS
 With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
 when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once."""
 
+_OPTIONS = f"""
+{NETWORK_OPTIONS.format("a monitor's").strip()}
+--alerts      print the alerts instead of the table
+--out FILE    with --alerts: append them to this file, JSON lines
+--transforms  listen to every frame's transform for rate and age
+--once        print the table once, after --seconds, and end
+--json        JSON lines instead of text
+--period S    between two tables (s); default: 1
+--seconds S   end after so long (s); with --once 3 by default
+"""
+
 _EXAMPLES = """\
   gripmon watch
   gripmon watch --once --connect tcp/10.0.0.5:7447
@@ -43,86 +53,58 @@ exit codes: 0 done (--once, --seconds); 2 wrong usage; 3 with --once: no monitor
 _ALERT_PERIOD_S = 0.2
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = common.add_command(
-        commands,
-        "watch",
-        watch,
-        "a live table of all monitors, or their alerts",
-        _DESCRIPTION,
-        _EXAMPLES,
-    )
-    joining.add_options(parser, "a monitor's")
-    parser.add_argument("--alerts", action="store_true", help="print the alerts instead of the table")
-    parser.add_argument("--out", metavar="FILE", help="with --alerts: append them to this file, JSON lines")
-    parser.add_argument("--transforms", action="store_true", help="listen to every frame's transform for rate and age")
-    parser.add_argument("--once", action="store_true", help="print the table once, after --seconds, and end")
-    parser.add_argument("--json", action="store_true", help="JSON lines instead of text")
-    parser.add_argument(
-        "--period", type=common.positive_number, default=1.0, metavar="S", help="between two tables (s); default: 1"
-    )
-    parser.add_argument(
-        "--seconds", type=common.positive_number, metavar="S", help="end after so long (s); with --once 3 by default"
-    )
-
-
-def watch(arguments: argparse.Namespace) -> int:
+@Command(
+    "watch", "a live table of all monitors, or their alerts", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    period={"type": positive_number, "default": 1.0}, seconds=positive_number,
+)  # fmt: skip
+def watch(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon watch``."""
-    _check(arguments)
+    joined = network_of(arguments)
+    if arguments.out and not arguments.alerts:
+        raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
+    if arguments.alerts and (arguments.once or arguments.transforms):
+        raise InputError("watch: --alerts prints alerts alone; leave out --once and --transforms")
     logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # a connection that is missing stands in the table
+    from gripmon.client import Fleet
+
     log = _open_log(arguments) if arguments.alerts else None
-    with _open_fleet(arguments, log) as fleet:
+    heard: dict[str, Any] = {} if log is None else {"on_alert": log.alert, "on_presence": log.presence}
+    with network_errors(arguments):
+        opened = Fleet(**joined, transforms=arguments.transforms, **heard)
+    with opened as fleet:
         seconds = 3.0 if arguments.once and arguments.seconds is None else arguments.seconds
         end_s = None if seconds is None else time.monotonic() + seconds
         if log is not None:
-            _repeat(log.write, _ALERT_PERIOD_S, end_s)
+            _repeat(lambda: _print_alerts(log, arguments), _ALERT_PERIOD_S, end_s)
         elif arguments.once:
             time.sleep(seconds or 0.0)
-            return _show_once(fleet, arguments)
+            _show_once(fleet, arguments)
         elif arguments.json:
             _repeat(lambda: _print_json(fleet), arguments.period, end_s)
         elif sys.stdout.isatty():
             _live(fleet, arguments.period, end_s)
         else:
             _repeat(_Changes(fleet).show, arguments.period, end_s)
-    return common.EXIT_DONE
-
-
-def _check(arguments: argparse.Namespace) -> None:
-    wrong = joining.misuse(arguments)
-    if arguments.out and not arguments.alerts:
-        wrong = "--out is for alerts; add --alerts, or redirect the output of --json"
-    elif arguments.alerts and (arguments.once or arguments.transforms):
-        wrong = "--alerts prints alerts alone; leave out --once and --transforms"
-    if wrong:
-        raise InputError(f"watch: {wrong}")
 
 
 def _open_log(arguments: argparse.Namespace) -> AlertLog:
-    path = Path(arguments.out) if arguments.out else None
+    from gripmon.client import AlertLog
+
+    path = arguments.out
     if path is not None:
-        common.check_file(path)
+        check_file(path)
     try:
-        return AlertLog(path, as_json=arguments.json)
+        return AlertLog(path)
     except OSError as error:
         raise InputError(f"--out {path}: can't be read ({error.strerror}); a file of your own") from None
 
 
-def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
-    from gripmon.client import Fleet
-    from gripmon.io.wire import PublishError
-
-    try:
-        return Fleet(
-            connect=arguments.connect or (joining.DEFAULT_ENDPOINT,),
-            zenoh_config_file=arguments.zenoh_config,
-            transforms=arguments.transforms,
-            on_alert=None if log is None else log.alert,
-            on_presence=None if log is None else log.presence,
-        )
-    except PublishError as error:
-        raise joining.failure("watch", error) from None
+def _print_alerts(log: AlertLog, arguments: argparse.Namespace) -> None:
+    events, failure = log.write()
+    for event in events:
+        print(event.line.decode() if arguments.json else fleet_table.event_line(event), flush=True)
+    if failure:
+        print(f"watch: --out {arguments.out}: {failure}; trying again", file=sys.stderr, flush=True)
 
 
 def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> None:
@@ -146,7 +128,7 @@ def _fault(fleet: Fleet) -> str:
     return "; ".join(filter(None, (fleet.fault(), unreadable)))
 
 
-def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> int:
+def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> None:
     statuses = _sorted(fleet)
     if arguments.json:
         _print_json(fleet)
@@ -157,19 +139,18 @@ def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> int:
         if arguments.zenoh_config:  # a router's rules drop without a word what they don't allow
             doubt = f"is {arguments.zenoh_config} for the right router, and may its certificate read there?"
         raise NoResultError(f"watch: no monitor is on the network; {fleet.fault() or doubt}")
-    return common.EXIT_DONE
 
 
 def _print_json(fleet: Fleet) -> None:
     import msgspec
 
-    told = {
+    values = {
         "stamp_ns": time.time_ns(),
         "fault": fleet.fault(),
         "unreadable": fleet.unreadable,
         "monitors": [fleet_table.as_data(status) for status in _sorted(fleet)],
     }
-    print(msgspec.json.encode(told).decode(), flush=True)
+    print(msgspec.json.encode(values).decode(), flush=True)
 
 
 def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
@@ -177,14 +158,13 @@ def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
     from rich.live import Live
 
     console = Console()
+
+    def draw() -> None:
+        height, width = console.size.height, console.size.width
+        live.update(fleet_table.table(_sorted(fleet), _fault(fleet), height, width), refresh=True)
+
     with Live(console=console, auto_refresh=False, screen=True) as live:
-        _repeat(
-            lambda: live.update(
-                fleet_table.table(_sorted(fleet), _fault(fleet), console.size.height, console.size.width), refresh=True
-            ),
-            period_s,
-            end_s,
-        )
+        _repeat(draw, period_s, end_s)
 
 
 class _Changes:
@@ -192,7 +172,7 @@ class _Changes:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._said: dict[object, object] = {}
+        self._printed: dict[object, object] = {}
         self._fault = ""
 
     def show(self) -> None:
@@ -208,6 +188,6 @@ class _Changes:
                 tuple((alert.alert_id, alert.severity, alert.acknowledged) for alert in status.alerts),
             )
             who = (status.name, status.monitor_id if status.several else "")
-            if self._said.get(who) != what:
-                self._said[who] = what
+            if self._printed.get(who) != what:
+                self._printed[who] = what
                 print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.line(status)}", flush=True)

@@ -16,6 +16,7 @@ to start, and nothing needs help when a monitor or a router ends and comes again
 
 from __future__ import annotations
 
+from gripmon.client.alert_log import AlertLog, Event
 from gripmon.client.fleet import Fleet
 from gripmon.client.names import MonitorName
 from gripmon.client.reader import Ambiguous, Client, NotCarriedOut
@@ -24,9 +25,11 @@ from gripmon.client.status import Condition, MonitorStatus, trouble
 from gripmon.client.transforms import TransformClient
 
 __all__ = [
+    "AlertLog",
     "Ambiguous",
     "Client",
     "Condition",
+    "Event",
     "Fleet",
     "MonitorName",
     "MonitorStatus",

@@ -25,10 +25,10 @@ def check_table(out: Path) -> None:
     try:
         read_table(path)
     except SourceError as error:
-        raise InputError(f"--out {out}: {error}") from None
+        raise InputError(f"{out}: {error}", "out") from None
     header = path.read_text(encoding="utf-8-sig").partition("\n")[0]
     if tuple(cell.strip() for cell in header.split(",")) != COLUMNS:
-        raise InputError(f"--out {out}: {path} has no column {COLUMNS[-1]}; another folder")
+        raise InputError(f"{out}: {path} has no column {COLUMNS[-1]}; another folder", "out")
 
 
 def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
@@ -49,7 +49,7 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
         for path, data in files.items():
             write_atomically(path, data)
     except OSError as error:
-        raise InputError(f"--out {path}: can't be written ({error.strerror or error}); a file") from None
+        raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "out") from None
     return list(files)
 
 

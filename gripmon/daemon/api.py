@@ -1,16 +1,31 @@
-"""What programs and notebooks begin with: a monitor and a source of frames, without network and without files."""
+"""What programs and notebooks begin with: a monitor and a source of frames, without network and without files.
+
+What ``check`` and ``run`` need of a configured source stands here, too.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sized
 from pathlib import Path
+from typing import NamedTuple
 
 from gripmon import monitor
-from gripmon.daemon.camera_source import open_source as open_configured
-from gripmon.daemon.config import Config
-from gripmon.io.sources import OpenedSource, SourceSettings, settings_for_path
+from gripmon.daemon.config import Config, ConfigError, SecondConfig
+from gripmon.io.sources import (
+    FolderSettings,
+    FullScale,
+    OpenedSource,
+    Source,
+    SourceError,
+    SourceSettings,
+    VideoSettings,
+    settings_for_path,
+)
 from gripmon.io.sources import open_source as start
+from gripmon.io.wire import Keys, Link
 from gripmon.judge.references import Keep
+from gripmon.model.errors import NoResultError
 from gripmon.model.records import Frame, FrameRecord, MonitorState
 
 
@@ -56,3 +71,62 @@ def open_source(source: str | Path | SourceSettings | Config, fps: float | None 
     if isinstance(source, str | Path):
         source = settings_for_path(Path(source), fps)
     return OpenedSource(start(source))
+
+
+class RecordedInput(NamedTuple):
+    """What was found in a folder or a video: a few words, and what is odd about its beginning (None: nothing)."""
+
+    detail: str
+    odd: str | None
+
+
+def open_configured(config: Config | SecondConfig, link: Link | None = None) -> Source:
+    """Start the configured source, on the network through ``link``.  Raises :class:`ConfigError` if it can't start."""
+    settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
+    scene = None if isinstance(config, SecondConfig) else config.scene
+    keys = Keys(settings.robot, settings.camera_name)
+    try:
+        source = start(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
+    except SourceError as error:
+        raise ConfigError(config.path, "", f"source.{error}") from None
+    bit_depth = 16 if isinstance(config, SecondConfig) else config.settings.monitor.bit_depth
+    return source if bit_depth == 16 else FullScale(source, bit_depth)
+
+
+def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
+    """Look at the beginning of recorded frames; None for a source of another kind.
+
+    Raises :class:`ConfigError` for frames that don't fit the camera, and :class:`NoResultError` if none can be read.
+    """
+    if not isinstance(config.settings.source, FolderSettings | VideoSettings):
+        return None
+    source = open_configured(config)
+    try:
+        frame, unreadable = _first_readable(config, source)
+    finally:
+        source.close()
+    assert frame.image is not None
+    height_px, width_px = frame.image.shape[:2]
+    camera = config.camera
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        key = "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"
+        wrong = f"{camera.width_px} x {camera.height_px} px; {frame.name} is {width_px} x {height_px}"
+        raise ConfigError(config.path, key, wrong, "the calibration that belongs to these images")
+    count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
+    detail = f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
+    if not unreadable:
+        return RecordedInput(detail, None)
+    first, *more = unreadable
+    others = f", nor can the next {len(more)}" if more else ""
+    return RecordedInput(detail, f"its first frame can't be read ({first}){others}")
+
+
+def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:
+    """The first frame with an image, and why those before it have none."""
+    unreadable: list[str] = []
+    while isinstance(frame := source.read(), Frame):
+        if frame.image is not None:
+            return frame, unreadable
+        unreadable.append(f"{frame.name}: {frame.fault}")
+    why = unreadable[0] if unreadable else "it holds none"
+    raise NoResultError(f"{config.path}: source.path: no frame of it can be read ({why}); readable images")

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from gripmon.calibrate.documents import CameraCalibration
+from gripmon.calibrate.interchange import cameras
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
-from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import read_camera, read_hand_eye
-from gripmon.daemon.config.typed import SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import as_yaml, read_settings, read_yaml
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
 from gripmon.model.camera import LensSettings, make_camera
@@ -25,8 +27,8 @@ from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import image_paths
-from gripmon.model.provenance import Provenance
-from gripmon.model.records import FrameRecord
+from gripmon.model.provenance import Provenance, provenance_of
+from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, TargetError, checked, parse_target
 from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
 from gripmon.teach.onboarding import RoughCorners, outlines_of
@@ -130,13 +132,13 @@ def _state(path: Path, data: bytes) -> Calibrated:
     except ValueError as error:
         raise InputError(f"{path}: {error}; {_RIGHT}") from None
     reference = kept.state.references[-1]
-    said = f"the reference in force of {kept.owner.robot}/{kept.owner.camera}: {reference.reference_id}"
+    which = f"the reference in force of {kept.owner.robot}/{kept.owner.camera}: {reference.reference_id}"
     return Calibrated(
         str(path),
         "a monitor's state",
         cam_T_grip=reference.cam_T_grip,
         covariance=reference.covariance,
-        pose_notes=(f"{said}, revision {reference.revision}, {reference.origin}", *_uncertainty(reference.covariance)),
+        pose_notes=(f"{which}, revision {reference.revision}, {reference.origin}", *_uncertainty(reference.covariance)),
     )
 
 
@@ -150,7 +152,7 @@ def _estimates(path: Path, data: bytes) -> Calibrated:
         try:
             record = decoder.decode(lines[number - 1])
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: line {number}: is no estimate ({error}); {_RIGHT}") from None
+            raise InputError(f"{path}: line {number}: isn't an estimate ({error}); {_RIGHT}") from None
         if record.verdict == "valid" and record.cam_T_grip is not None and record.covariance is not None:
             return Calibrated(
                 str(path),
@@ -189,13 +191,13 @@ def read_given_camera(path: Path) -> GivenCamera:
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
     """Rough corners of a gripper, or (None) of one that isn't known.  :class:`~gripmon.model.errors.InputError`."""
+    rough = read_settings(path, RoughCorners).corners
     try:
-        rough = to_settings(read_yaml(path), RoughCorners).corners
         if gripper is None:
             outlines_of(rough)
         else:
             check_rough(gripper, rough)
-    except (SettingsError, CalibrationError) as error:
+    except CalibrationError as error:
         raise InputError(f"{path}: {error}") from None
     return rough
 
@@ -247,10 +249,89 @@ def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> Non
     write_atomically(path, as_yaml(msgspec.to_builtins(document)).encode())
 
 
+def import_camera(
+    path: Path, kind: str | None, options: cameras.ReadOptions, command: str
+) -> tuple[str, CameraCalibration]:
+    """The format of another program's file (None: recognised by its content), and the camera that it holds.
+    ``command`` goes into the provenance.  :class:`~gripmon.model.errors.InputError`.
+    """
+    data = read_bytes(path)
+    kind = kind or cameras.format_of(data, str(path))
+    return kind, CameraCalibration(
+        camera=cameras.read_camera(data, str(path), kind, options),
+        parameters=(),
+        covariance=(),
+        warnings=(f"imported from {kind}: how certain it is isn't known",),
+        provenance=provenance_of(command, [path]),
+    )
+
+
+def export_notes(source: Calibrated, command: str, *, with_pose: bool) -> tuple[str, ...]:
+    """What a file for another program says of where it comes from; ``with_pose``: also about the transform."""
+    made = provenance_of(command, [Path(source.name)])
+    written = f"written {made.time} by gripmon {made.gripmon}: {made.command}"
+    origin = f"from {source.name}, SHA-256 {made.inputs[0].sha256}"
+    return written, origin, *source.notes, *(source.pose_notes if with_pose else ())
+
+
+@dataclass(frozen=True)
+class PlaneInputs:
+    """What :func:`gripmon.calibrate_plane` takes beside images and target; ``notes``: what was assumed; ``files``:
+    those that were read.
+    """
+
+    camera: GivenCamera
+    gripper: Gripper | None
+    corners: list[dict[str, tuple[float, float]]]
+    jaw_opening_m: float | None
+    cam_T_grip: Array | None
+    notes: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def plane_inputs(
+    camera: Path | None,
+    gripper: Path | None,
+    config: Path | None,
+    corners: Sequence[Path],
+    jaw_opening_m: float | None,
+    *,
+    infer: bool,
+) -> PlaneInputs:
+    """Read what files name; a configuration stands in for camera, gripper, jaw opening and rough calibration that are
+    not named.  ``infer``: the gripper isn't known.  :class:`~gripmon.model.errors.InputError`.
+    """
+    files = [path for path in (camera, config, gripper, *corners) if path is not None]
+    loaded = None if config is None else load_config(config, check_source=False, with_taught=False)
+    if loaded is not None:
+        files += [loaded.gripper_path, *loaded.calibrated.paths.values()]
+        camera = camera or loaded.calibrated.paths.get("camera")
+    known = None if loaded is None or infer else loaded.gripper
+    if gripper is not None:
+        known = read_gripper(gripper)
+    notes: tuple[str, ...] = ()
+    if jaw_opening_m is None and known is not None and loaded is not None and known.has_jaw:
+        jaw_opening_m = loaded.jaw_opening_m
+        notes = (f"jaw opening taken as {jaw_opening_m:g} m; --jaw-opening M if it was another",)
+    given = None if camera is None else read_given_camera(camera)
+    if given is None:
+        assert loaded is not None, "the caller asks for a camera"
+        given = GivenCamera(loaded.settings.camera)
+    return PlaneInputs(
+        given,
+        known,
+        [read_rough_corners(path, known) for path in corners],
+        None if infer else jaw_opening_m,
+        None if loaded is None or infer else loaded.cam_T_grip,
+        notes,
+        tuple(files),
+    )
+
+
 def measure_again(
     first: Calibrated,
     images: Sequence[str],
-    config_file: str | None,
+    config_file: Path | None,
     target: Target | None = None,
     *,
     jaw_opening_m: float | None = None,
@@ -278,13 +359,13 @@ def measure_again(
     return Calibrated(str(paths[0]), "images", lens, cam_T_grip=to_record(cam_T_grip), covariance=flat), doubts
 
 
-def _same_config(first: Calibrated, file: str | None) -> Config:
+def _same_config(first: Calibrated, file: Path | None) -> Config:
     """The configuration, which has to be of the same camera and gripper."""
     if file is None:
-        raise InputError("--config: is missing; with images, the configuration with gripper and monitor")
+        raise InputError("is missing; with images, the configuration with gripper and monitor", "config")
     if first.cam_T_grip is None:
         raise InputError(f"{first.name}: is {first.kind}; with images, a hand/eye calibration")
-    config = load_config(Path(file), check_source=False)
+    config = load_config(file, check_source=False)
     if first.lens is not None and first.lens != config.settings.camera:
         raise InputError(f"{first.name}: camera: isn't the one of {file}; the same camera calibration in both")
     if first.gripper is not None and first.gripper.sha256 != gripper_digest(config.gripper):
@@ -296,11 +377,10 @@ def _opening(first: Calibrated, config: Config, given_m: float | None) -> float 
     gripper = config.gripper
     if not gripper.has_jaw:
         if given_m is not None:
-            raise InputError("--jaw-opening: the gripper has no jaw; leave it out")
+            raise InputError("the gripper has no jaw; leave it out", "jaw_opening_m")
         return None
     opening_m = next(m for m in (given_m, first.jaw_opening_m, config.jaw_opening_m) if m is not None)
     if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
-        raise InputError(
-            f"--jaw-opening: {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
-        )
+        right = f"the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        raise InputError(f"{opening_m:g} m; {right}", "jaw_opening_m")
     return opening_m

@@ -70,7 +70,7 @@ class EstimatesFile:
         _log.error("%s", self.failure)
         file, self._file = self._file, None
         if file is not None:
-            with contextlib.suppress(OSError):  # the same fault once more; said above
+            with contextlib.suppress(OSError):  # the same fault once more; logged above
                 file.close()
 
 

@@ -1,10 +1,21 @@
-"""What ``gripmon check`` says first: one line for each thing that matters, OK, WARN or FAIL."""
+"""What ``gripmon check`` finds: one line for each thing that matters, OK, WARN or FAIL; and what lies outside of the
+monitor: the network, the source, the recording, metrics.
+"""
 
 from __future__ import annotations
 
 import math
+import socket
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
+from urllib.parse import urlsplit
 
+import msgspec
+
+from gripmon.daemon.api import look_ahead
+from gripmon.daemon.config import Config, SecondConfig, check_network, is_second, load_config, load_second
+from gripmon.daemon.forecast import forecast
 from gripmon.daemon.forecast_values import (
     CameraValues,
     Forecast,
@@ -16,12 +27,17 @@ from gripmon.daemon.forecast_values import (
     RecalibrationForecast,
     ReferenceValues,
 )
-from gripmon.daemon.surroundings import SourceReport, Surroundings
+from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
+from gripmon.io.sources.live import shown_name
+from gripmon.io.wire import Keys
+from gripmon.laser.report import expectation
 
 Level = Literal["OK", "WARN", "FAIL"]
 
 _USUAL_SPREAD = 2.0
-"""By how much the bound of one frame in twenty is larger than the foreseen one (no unit; docs/integrity.md)."""
+"""By how much the bound of one frame in twenty is larger than the predicted one (no unit; docs/integrity.md)."""
+_PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
+_CONNECT_S = 2.0
 
 
 class Finding(NamedTuple):
@@ -32,23 +48,135 @@ class Finding(NamedTuple):
     text: str
 
 
-def findings(forecast: Forecast, around: Surroundings) -> list[Finding]:
-    """What to know of a wrist camera's configuration before it runs."""
-    found = [
-        _source(around.source),
+class Joined(msgspec.Struct, frozen=True):
+    """How the monitor would join the network; ``file``: the one of Zenoh's that says so."""
+
+    mode: str
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    file: str | None
+
+
+class SourceReport(msgspec.Struct, frozen=True):
+    """Whether frames can come from the source now (``reachable`` None: only starting it would show); ``odd``: what is
+    strange about it.
+    """
+
+    kind: str
+    reachable: bool | None
+    detail: str
+    odd: str | None = None
+
+
+class Surroundings(msgspec.Struct, frozen=True):
+    """Where messages, recording and metrics go, and where frames come from; None: nowhere."""
+
+    keys: str | None
+    recording: str | None
+    metrics: str | None
+    zenoh: Joined | None
+    source: SourceReport
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A configuration that was checked: what its calibration lets expect, of a wrist camera a ``forecast``, of a second
+    camera plain values (m, rad, px, ns), and what lies outside.
+    """
+
+    forecast: Forecast | None
+    second: dict[str, Any] | None
+    around: Surroundings
+
+    def values(self) -> dict[str, Any]:
+        """All of it as plain values for JSON."""
+        expected = self.second if self.second is not None else msgspec.to_builtins(self.forecast)
+        return {**expected, **msgspec.to_builtins(self.around)}
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What to know of the configuration before it runs."""
+        about = _of_wrist(self.forecast) if self.forecast is not None else _of_second(self.second or {})
+        found = [_source(self.around.source), *about, _network(self.around.keys)]
+        return [each for each in found if each is not None]
+
+
+def check_file(path: Path) -> Checked:
+    """Check a configuration file, a wrist camera's or a second camera's.  Raises :class:`ConfigError`, and
+    :class:`NoResultError` where a laser calibration or recorded frames can't be used.
+    """
+    if not is_second(path):
+        config = load_config(path)
+        return Checked(forecast(config), None, _look_around(config))
+    second = load_second(path)
+    around, watch = _look_around(second), second.settings.laser.watch
+    expected = expectation(str(second.calibration_path), second.calibration, watch)
+    return Checked(None, {**_second_values(second), "foreseen": expected}, around)
+
+
+def _look_around(config: Config | SecondConfig) -> Surroundings:
+    """Look at what the configuration names; nothing is joined or started but a connection to a camera's address.
+
+    Raises :class:`ConfigError` for what can't be joined or doesn't fit, and :class:`NoResultError` if no recorded frame
+    can be read.
+    """
+    settings, metrics = config.settings, config.settings.metrics
+    joining, joined = check_network(config), None
+    if joining is not None:
+        file = None if joining.file is None else str(joining.file)
+        joined = Joined(joining.mode, joining.listen, joining.connect, file)
+    return Surroundings(
+        keys=f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
+        recording=settings.recording.directory if settings.recording.enabled else None,
+        metrics=f"http://{metrics.address}:{metrics.port}/metrics" if metrics.enabled else None,
+        zenoh=joined,
+        source=_source_report(config),
+    )
+
+
+def _source_report(config: Config | SecondConfig) -> SourceReport:
+    source = config.settings.source
+    kind = str(type(source).__struct_config__.tag)
+    if (recorded := look_ahead(config)) is not None:
+        return SourceReport(kind, True, recorded.detail, recorded.odd)
+    if isinstance(source, LiveSettings):
+        return SourceReport(kind, *_live_reachable(source))
+    if isinstance(source, NetworkSettings):
+        key = network_key(source, Keys(config.settings.robot, config.settings.camera_name)["image"])
+        return SourceReport(kind, None, f"frames on {key}; only running it shows whether any arrive")
+    return SourceReport(kind, True, "made by this program")
+
+
+def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
+    device = source.device
+    if isinstance(device, int) or device.isdecimal():
+        device = f"/dev/video{device}"
+    if device.startswith("/dev/"):
+        exists = Path(device).exists()
+        return exists, device if exists else f"{device} is not there now; run keeps trying"
+    address = urlsplit(device)
+    if address.scheme in _PORTS and address.hostname:
+        where = (address.hostname, address.port or _PORTS[address.scheme])
+        try:
+            with socket.create_connection(where, timeout=_CONNECT_S):
+                return True, f"{where[0]}:{where[1]} answers"
+        except OSError as error:
+            return False, f"{where[0]}:{where[1]} does not answer ({error.strerror or error}); run keeps trying"
+    return None, f"{shown_name(device)}; only running it shows whether it delivers"
+
+
+def _of_wrist(forecast: Forecast) -> list[Finding | None]:
+    return [
         _camera(forecast.camera),
         _mount(forecast.reference),
         _view(forecast.in_view, forecast.gripper),
         _promise(forecast),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
-        _network(around.keys),
     ]
-    return [each for each in found if each is not None]
 
 
-def second_findings(report: dict[str, Any], around: Surroundings) -> list[Finding]:
-    """Those about a second camera."""
+def _of_second(report: dict[str, Any]) -> list[Finding]:
     calibration, watch, pulses = report["calibration"], report["watch"], report["pulses"]
     spots = f"{calibration['used']} of {calibration['spots']} spots, RMS {calibration['rms_px']:.2f} px"
     size = f"{calibration['width_px']} x {calibration['height_px']} px"
@@ -56,11 +184,9 @@ def second_findings(report: dict[str, Any], around: Surroundings) -> list[Findin
     table = pulses["table"]
     heard = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
     return [
-        _source(around.source),
         Finding("OK", "calibration", f"{size}, {spots}"),
         Finding("OK", "watch", limits),
         Finding("OK", "pulses", heard),
-        _network(around.keys),
     ]
 
 
@@ -167,7 +293,7 @@ def _span(low_mm: float, high_mm: float) -> str:
 
 def _recalibration(values: RecalibrationForecast) -> Finding:
     if not values.possible:
-        text = f"the reference can't be measured anew from the corners in view: {values.reason}"
+        text = f"the reference can't be measured again from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
     return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
 
@@ -182,3 +308,43 @@ def _millimetres(value_m: float) -> str:
 
 def _degrees(value_rad: float) -> str:
     return f"{math.degrees(value_rad):.2g}°"
+
+
+def _second_values(config: SecondConfig) -> dict[str, Any]:
+    """Plain values for JSON: metres, radians, px, ns."""
+    settings, calibration = config.settings, config.calibration
+    camera, residuals, watch = config.camera, calibration.residuals, config.settings.laser.watch
+    pulses = config.pulses
+    return {
+        "config": str(config.path),
+        "robot": settings.robot,
+        "camera_name": settings.camera_name,
+        "calibration": {
+            "file": str(config.calibration_path),
+            "time": calibration.provenance.time,
+            "id": config.pulsed_watch().reference_id,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "spots": residuals.spots,
+            "used": residuals.used,
+            "rms_px": residuals.rms_px,
+            "distance_m": calibration.plane.distance_cam_m,
+            "translation_m": list(calibration.base_T_cam.translation_m),
+            "rotation_xyzw": list(calibration.base_T_cam.rotation_xyzw),
+            "sigmas": dict(calibration.sigmas),
+        },
+        "watch": {
+            "false_alarms_per_1000_pulses": watch.false_alarms_per_1000_pulses,
+            "arm_noise_m": watch.arm_noise_m,
+            "arm_noise_rad": watch.arm_noise_rad,
+            "warn_m": watch.warn_m,
+            "limit_m": watch.limit_m,
+        },
+        "pulses": {
+            "key": None if settings.laser.pulses else f"gripmon/{settings.robot}/{settings.camera_name}/pulse",
+            "table": None if settings.laser.pulses is None else str(config.directory / settings.laser.pulses),
+            "count": len(pulses) if settings.laser.pulses else None,
+            "first_ns": pulses[0].stamp_ns if pulses else None,
+            "last_ns": pulses[-1].until_ns if pulses else None,
+        },
+    }

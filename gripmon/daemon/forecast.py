@@ -68,7 +68,7 @@ _STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is given
 def forecast(config: Config) -> Forecast:
     """What a monitor of this configuration may expect; without network and without its source.
 
-    A view that shows too little is no error: ``in_view.reason`` says what is missing, and what needs more is None.
+    A view that shows too little isn't an error: ``in_view.reason`` says what is missing, and what needs more is None.
     """
     settings, gripper, found = config.settings, config.gripper, promise_of(config)
     policy = settings.monitor.policy

@@ -82,7 +82,7 @@ class TaughtValues(msgspec.Struct, frozen=True):
 
 
 class JawValues(msgspec.Struct, frozen=True):
-    """Where the opening comes from, and the one that all is foreseen at (m)."""
+    """Where the opening comes from, and the one that all is predicted at (m)."""
 
     source: str
     opening_m: float | None
@@ -122,7 +122,7 @@ class JawAccuracy(msgspec.Struct, frozen=True):
     pose_per_jaw_m: PoseValues
     like: str
     correlation: float
-    growth: Annotated[float, Meta(description="so many times less certain is the pose without the opening")]
+    growth: Annotated[float, Meta(description="how many times less certain the pose is without the opening")]
 
 
 class DriftForecast(msgspec.Struct, frozen=True):

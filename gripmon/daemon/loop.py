@@ -12,11 +12,12 @@ import msgspec
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
-from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import Loop, in_short
+from gripmon.daemon.supervised import Loop
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish import Publisher
 from gripmon.io.sources import Source
+from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Alert,
     Command,

@@ -5,11 +5,25 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
 
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_network
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
-from gripmon.io.publish import NullPublisher, Presence, Publisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+from gripmon.io.publish import (
+    NullPublisher,
+    Presence,
+    Publisher,
+    Publishers,
+    SpotPublisher,
+    SpotPublishers,
+    ZenohCommands,
+    ZenohJaw,
+    ZenohPublisher,
+    ZenohPulses,
+    ZenohSpotPublisher,
+)
 from gripmon.io.publish.jaw import opening_of_joints
 from gripmon.io.publish.presence import in_words
 from gripmon.io.ros2 import (
@@ -38,36 +52,61 @@ class NameTakenError(NoResultError):
     exit_code = 4
 
 
+_P = TypeVar("_P", Publisher, SpotPublisher)
+
+
 @dataclasses.dataclass(frozen=True)
-class Network:
-    """The session (None: nothing is published), the publisher, where the jaw opening comes from (None: with the
-    frames), where commands come from, and what the state message says of all this.
+class Network(Generic[_P]):
+    """The session (None: nothing is published), the publisher, where the jaw opening (None: with the frames) and a
+    laser's pulses come from, where commands come from, and what the state message says of all this.
     """
 
     link: Link | None
-    publisher: Publisher
-    jaw: JawFeed | None
-    commands: ZenohCommands | None
-    reports: Reports
+    publisher: _P
+    jaw: JawFeed | None = None
+    pulses: ZenohPulses | None = None
+    commands: ZenohCommands | None = None
+    reports: Reports = dataclasses.field(default_factory=Reports)
 
 
-def open_network(config: Config, *, take_over: bool = False) -> Network:
+def open_network(config: Config, *, take_over: bool = False) -> Network[Publisher]:
     """Open all of it.  Raises :class:`ConfigError` where it can't be opened as configured, and :class:`NameTakenError`
     where the robot's and camera's name is another monitor's, unless it is to ``take_over``.
     """
+    jaw = _FixedJaw(config.jaw_opening_m) if config.settings.jaw.source == "fixed" else None
+    network = _joined(config, lambda link, who: _on_link(config, link, jaw, who), take_over=take_over)
+    return _with_metrics(config, network or Network(None, NullPublisher(), jaw), Publishers)
+
+
+def open_second_network(config: SecondConfig, *, take_over: bool = False) -> Network[SpotPublisher]:
+    """The same for a second camera."""
+    network = _joined(config, lambda link, who: _second_on_link(config, link, who), take_over=take_over)
+    return _with_metrics(config, network or Network(None, NullPublisher()), SpotPublishers)
+
+
+def _joined(
+    config: Config | SecondConfig, begin: Callable[[Link, Presence], Network[_P]], *, take_over: bool
+) -> Network[_P] | None:
+    """What ``begin`` makes of a session of which no other monitor has the name; None if nothing is published."""
     check_network(config)
-    settings, link = config.settings, _open_link(config)
-    jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
-    if link is None:
-        return Network(None, NullPublisher(), jaw, None, Reports())
+    settings = config.settings
+    if not settings.publish.enabled:
+        return None
+    publish = network_of(settings.publish, config.settings.ros2) if isinstance(config, Config) else settings.publish
+    if publish != settings.publish:
+        _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(publish.connect))
+    try:
+        link = Link(publish, config.directory)
+    except PublishError as error:
+        raise ConfigError(config.path, "", str(error)) from None
     with contextlib.ExitStack() as failed:
         failed.callback(link.close)  # a process must not end while its session is being opened
-        network = _on_link(config, link, jaw, alone(link, settings.robot, settings.camera_name, take_over=take_over))
+        network = begin(link, _alone(link, settings.robot, settings.camera_name, take_over=take_over))
         failed.pop_all()
     return network
 
 
-def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
+def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
     """Who this start of the monitor is; raises :class:`NameTakenError` where another monitor has the name, keeps it."""
     presence = Presence(link, Keys(robot, camera))
     _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
@@ -78,7 +117,7 @@ def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
     return presence
 
 
-def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
+def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network[Publisher]:
     settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
@@ -92,50 +131,46 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
     reports = Reports(
         faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
     )
-    return Network(link, publishers, jaw, commands, reports)
+    return Network(link, publishers, jaw, None, commands, reports)
 
 
-def with_metrics(config: Config, publisher: Publisher) -> Publisher:
-    """The publisher, and beside it the server for Prometheus where the configuration wants one."""
-    metrics = metrics_server(config)
-    return publisher if metrics is None else Publishers(publisher, {"metrics": metrics})
+def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Network[SpotPublisher]:
+    settings = config.settings
+    publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name, presence)
+    pulses = ZenohPulses(link, publisher.keys["pulse"]) if settings.laser.pulses is None else None
+    commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
+    heard = [each for each in (pulses, commands) if each is not None]
+    faults = [link.fault] if pulses is None else [link.fault, pulses.fault]
+    reports = Reports(faults, malformed=lambda: sum(each.malformed for each in heard), others=presence.others)
+    return Network(link, publisher, None, pulses, commands, reports)
 
 
-def metrics_server(config: Config | SecondConfig) -> MetricsServer | None:
-    """The server for Prometheus where there is to be one.  Raises :class:`ConfigError` where it can't listen."""
+def _with_metrics(
+    config: Config | SecondConfig, network: Network[_P], together: Callable[[_P, dict[str, Any]], _P]
+) -> Network[_P]:
+    """With the server for Prometheus beside the publisher where the configuration wants one.  Raises
+    :class:`ConfigError` where it can't listen.
+    """
     settings = config.settings
     if not settings.metrics.enabled:
-        return None
+        return network
     try:
         metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
     except MetricsError as error:
+        network.publisher.close()
         raise ConfigError(config.path, "", str(error)) from None
     _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return metrics
+    return dataclasses.replace(network, publisher=together(network.publisher, {"metrics": metrics}))
 
 
 def with_source(reports: Reports, source: Source) -> Reports:
     """The reports, and what a camera on the network says beside them."""
     if not isinstance(source, NetworkCamera):
         return reports
+    malformed = reports.malformed
     return dataclasses.replace(
-        reports,
-        faults=(*reports.faults, source.fault),
-        malformed=lambda: reports.malformed() + source.malformed,
+        reports, faults=(*reports.faults, source.fault), malformed=lambda: malformed() + source.malformed
     )
-
-
-def _open_link(config: Config) -> Link | None:
-    """The session; None if nothing is published."""
-    if not config.settings.publish.enabled:
-        return None
-    settings = network_of(config.settings.publish, config.settings.ros2)
-    if settings != config.settings.publish:
-        _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(settings.connect))
-    try:
-        return Link(settings, config.directory)
-    except PublishError as error:
-        raise ConfigError(config.path, "", str(error)) from None
 
 
 def _ros2_node(config: Config, link: Link) -> Publisher | None:

@@ -1,24 +1,32 @@
-"""A recording as the input of a replay: with what the monitor ran then, or with another configuration."""
+"""A recorded run as the input of a replay, and the one file that a replay records into."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
+import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
+from gripmon.analyse.replay_differences import Differences
 from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.read import recording_files
 from gripmon.record.read.replayed import RecordedFrames, SeveralRunsError, UnusableError
+from gripmon.record.write import NullRecorder, Recorder, open_recorder
 from gripmon.record.write.compared import ComparedRecorder
 from gripmon.record.write.repair import keep_whole
 from gripmon.record.write.wire import make_scene
+
+RECORDING_PATIENCE_S = 30.0
+"""Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""
 
 
 class RecordedRun:
@@ -26,35 +34,55 @@ class RecordedRun:
     the configured reference).  ``notes``: what is missing, one line each.
     """
 
-    def __init__(self, paths: list[Path], config: Config | None, opened: contextlib.ExitStack) -> None:
+    def __init__(self, paths: Sequence[Path], config: Config | None, opened: contextlib.ExitStack) -> None:
         """``config`` None: the recorded configuration.  What is opened is closed with ``opened``.
 
-        Raises :class:`~gripmon.model.errors.InputError`, :class:`~gripmon.model.errors.NoResultError`.
+        Raises :class:`InputError`, :class:`NoResultError`.
         """
         try:
-            self.source: RecordedFrames = RecordedFrames(recording_files(paths))
+            self.source: RecordedFrames = RecordedFrames(recording_files(list(paths)))
         except SeveralRunsError as error:
-            raise InputError(f"replay: {error}") from None
+            raise InputError(str(error)) from None
         except UnusableError as error:
-            raise NoResultError(f"replay: {error}") from None
+            raise NoResultError(str(error)) from None
         self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self.recorded_config = self._recorded_config(opened)
         begin = config or self.recorded_config
         if begin is None:
-            raise InputError(f"{self.name}: holds no configuration; the one to replay with, by --config")
+            raise InputError(f"{self.name}: holds no configuration; the one to replay with", "config")
         self.notes: list[str] = []
+        self._differences, self._unbounded = Differences(), 0
         self.config, self.state = self._begin(begin)
         self._note_what_is_missing()
 
-    @contextlib.contextmanager
+    def compare(self, record: FrameRecord) -> None:
+        """Count what is decided now, about the frame that the source gave last, against what was then."""
+        then = self.source.record
+        assert then is not None, "every replayed frame has a record"
+        unbounded = then.protection is None and record.protection is not None
+        self._unbounded += unbounded
+        self._differences.add(then, as_recorded_before_bounds(record) if unbounded else record)
+
+    def summary(self) -> str:
+        """What differs from the recording."""
+        lost, damaged = self.source.passed_over, self.source.images_damaged
+        unread = f"; {lost} more could no longer be read" if lost else ""
+        unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
+        if self._unbounded:
+            unread += f"; {self._unbounded} frames were recorded by a version without protection levels"
+        recorded = self.recorded_config
+        from_jpeg = recorded is not None and recorded.settings.recording.image_format == "jpeg"
+        return f"{self._differences.text(from_jpeg)}{unread}"
+
+    @contextmanager
     def compared_in(self, path: Path) -> Iterator[ComparedRecorder]:
         """A recorder into one file that shows what was recorded and what is replayed, overlaid.
 
-        OSError where ``path`` can't be written, :class:`~gripmon.model.errors.NoResultError` where writing fails later.
+        Raises :class:`InputError` where ``path`` can't be written, :class:`NoResultError` where writing fails later.
         """
         config, reference = self.config, self.config.reference
         if path.resolve() in {source.resolve() for source in self.source.paths}:
-            raise InputError(f"--recording {path}: is what is replayed; another file")
+            raise InputError(f"{path}: is what is replayed; another file", "recording")
         if self.state is not None:
             reference = self.state.references[-1]
         part = path.with_name(f".{path.name}.part")
@@ -63,7 +91,10 @@ class RecordedRun:
             settings.recording, str(path.parent), path.stem, settings.robot, settings.camera_name, config.camera,
             config.gripper, reference, configuration=to_recorded(config, self.state),
         )  # fmt: skip
-        recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
+        try:
+            recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
+        except OSError as error:
+            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
         try:
             yield recorder
         finally:
@@ -80,7 +111,7 @@ class RecordedRun:
         except ConfigError as error:
             text = str(error).replace(f"{folder}/", "")
             wrong = f"its configuration can't be used ({text})"
-            raise InputError(f"{self.name}: {wrong}; one of this version, by --config") from None
+            raise InputError(f"{self.name}: {wrong}; one of this version", "config") from None
 
     def _begin(self, config: Config) -> tuple[Config, MonitorState | None]:
         """Where the monitor starts from: the state then, if that was about this calibration."""
@@ -90,7 +121,7 @@ class RecordedRun:
         ours = recorded is not None and recorded.state_owner.calibration == config.state_owner.calibration
         if first is None or recorded is None or not ours:
             if recorded is not None:
-                self.notes.append("--config has another calibration: it begins with that one's reference")
+                self.notes.append("the configuration has another calibration: it begins with that one's reference")
             return config, None
         began_with = recorded.reference if state is None else state.references[-1]
         if state is None and first.origin == began_with.origin:
@@ -131,3 +162,65 @@ def _limits(config: Config | None) -> Limits | None:
     of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
     alert_limits = policy.alert_limit_m, policy.alert_limit_rad
     return Limits(*of_policy, nothing, None, None, None, nothing, nothing, *alert_limits)
+
+
+@contextmanager
+def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
+    """A recorder into exactly one file, finished when the context ends; the null recorder without a path.
+
+    Raises :class:`InputError` where the file can't be made, :class:`NoResultError` at the end where writing failed:
+    what was there before stays then.
+    """
+    if path is None:
+        yield NullRecorder()
+        return
+    # One file, whatever its length.
+    settings = msgspec.structs.replace(
+        config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
+    )
+    with contextlib.ExitStack() as opened:
+        try:
+            scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
+        except OSError as error:
+            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
+        recorder = open_recorder(
+            settings,
+            robot=config.settings.robot,
+            camera_name=config.settings.camera_name,
+            camera=config.camera,
+            gripper=config.gripper,
+            reference=config.reference,
+            directory=Path(scratch),
+            name=path.stem,
+            patience_s=RECORDING_PATIENCE_S,
+            configuration=to_recorded(config),
+        )
+        opened.enter_context(_silent_recording())
+        try:
+            yield recorder
+        finally:
+            recorder.close(timeout_s=60.0)
+            # A disk that failed for a moment has left a whole file of the frames after it.
+            missing = _missing(recorder)
+            keep_whole(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
+
+
+def _missing(recorder: Recorder) -> str | None:
+    """What is not in a recording that is to hold all; None if nothing is missing."""
+    if recorder.dropped:
+        return f"{recorder.dropped} frames are missing"
+    return f"{recorder.images_dropped} images are missing" if recorder.images_dropped else None
+
+
+@contextmanager
+def _silent_recording() -> Iterator[None]:
+    """What a daemon logs of its recording while it goes on, a replay reports in one line when it is over."""
+    logger = logging.getLogger("gripmon.record.write")
+    propagates, silent = logger.propagate, logging.NullHandler()
+    logger.addHandler(silent)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.propagate = propagates
+        logger.removeHandler(silent)

@@ -1,30 +1,42 @@
-"""Frames that can wait, through the monitor as the daemon drives it."""
+"""Frames that can wait, through the monitor as the daemon drives it: images, a video, or what was recorded."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence, Sized
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
 from gripmon.daemon.api import Monitor, open_source
-from gripmon.daemon.config import Config
-from gripmon.io.sources import Source
+from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_pulses, load_second
+from gripmon.daemon.forecast import limits_warning
+from gripmon.daemon.recorded_run import RecordedRun, one_recording
+from gripmon.io.sources import Source, SourceError, settings_for_path
+from gripmon.io.sources import open_source as start
+from gripmon.io.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+from gripmon.model.errors import InputError, in_short
 from gripmon.model.records import (
     Command,
     Frame,
     FrameRecord,
     MonitorState,
+    Origin,
     RecordedCommand,
+    SpotRecord,
     unmeasured_record,
 )
+from gripmon.record.read import recordings_below
 from gripmon.record.write import NullRecorder, Recorder
 
 _log = logging.getLogger(__name__)
+_LATENCY_BIN = 0.02  # natural logarithm
 
 
 class Past(NamedTuple):
@@ -67,7 +79,7 @@ def replay(
     while (frame := source.read()) is not None:
         assert isinstance(frame, Frame), "only a live source waits"
         while waiting and waiting[0].seq < frame.seq:
-            recorder.command(_told(monitor, waiting.popleft()))
+            recorder.command(_repeated(monitor, waiting.popleft()))
         if not ignored and monitor.ignores_opening(frame):
             ignored = True
             warn("the frames bring jaw openings, but jaw.source is fixed: they are not used")
@@ -75,8 +87,8 @@ def replay(
         start_ns = time.perf_counter_ns()
         try:
             record = monitor.process(frame)
-        except Exception as error:  # noqa: BLE001  said in the record and in the summary
-            record = unmeasured_record(frame, monitor.reference, f"internal error: {_in_short(error)}")
+        except Exception as error:  # noqa: BLE001  reported in the record and in the summary
+            record = unmeasured_record(frame, monitor.reference, f"internal error: {in_short(error)}")
         record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
         if monitor.reference.revision != revision:
             revision = monitor.reference.revision
@@ -85,16 +97,209 @@ def replay(
         yield record
 
 
-def _told(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
+def _repeated(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
     """Give the monitor a command as it was given then, at the same time; what became of it now."""
     try:
         answer = monitor.command(Command(then.name, then.argument), then.stamp_ns)
     except Exception as error:  # noqa: BLE001  as the daemon does
-        return msgspec.structs.replace(then, done=False, text=f"internal error: {_in_short(error)}")
+        return msgspec.structs.replace(then, done=False, text=f"internal error: {in_short(error)}")
     return msgspec.structs.replace(then, done=answer.done, text=answer.text)
 
 
-def _in_short(error: Exception) -> str:
-    """As the daemon says it."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+class Counts:
+    """What became of the frames, in memory that does not grow with them."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.usable = 0
+        self._verdicts: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()  # why nothing was measured, by what comes before the colon
+        self._first_failure = ""
+        self._latencies: Counter[int] = Counter()  # logarithmic bins
+
+    def add(self, record: FrameRecord) -> None:
+        """One frame more."""
+        self.frames += 1
+        self.usable += record.source is not Origin.HELD
+        self._verdicts[record.verdict] += 1
+        if record.reason and not record.measured:
+            kind = record.reason.partition(":")[0]
+            self._reasons[kind] += 1
+            if kind == "internal error":
+                self._first_failure = self._first_failure or record.reason
+        self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
+
+    def summary(self) -> str:
+        """One line."""
+        if not self.frames:
+            return "no frames: nothing in the input can be read as an image"
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
+        text = f"{self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
+        if self._first_failure:
+            text += f"; {self._reasons['internal error']} failed ({self._first_failure})"
+        if not self.usable:
+            reason = max(self._reasons, key=self._reasons.__getitem__, default="no measurement")
+            text += f"; no frame could be used ({reason})"
+        return text
+
+    def _median_ms(self) -> float:
+        """To one percent."""
+        below = 0
+        for index in sorted(self._latencies):
+            below += self._latencies[index]
+            if 2 * below > self.frames:
+                return 1e-6 * math.exp(index * _LATENCY_BIN)
+        return math.nan
+
+
+class FrameReplay:
+    """A wrist camera's replay: :meth:`records` once, then :meth:`summary`."""
+
+    def __init__(
+        self, source: Source, config: Config, recorded: RecordedRun | None, warn: Callable[[str], None]
+    ) -> None:
+        self._source, self._config, self._recorded, self._warn = source, config, recorded, warn
+        self._recorder: Recorder = NullRecorder()
+        self._counts = Counts()
+        self.length = len(source) if isinstance(source, Sized) else None
+
+    @contextmanager
+    def recorded_in(self, path: Path | None) -> Iterator[None]:
+        """Also a recording (None: none): of recorded frames one that shows both runs."""
+        both = None if self._recorded is None or path is None else self._recorded.compared_in(path)
+        with both or one_recording(path, self._config) as self._recorder:
+            yield
+
+    def records(self, step: Callable[[], None]) -> Iterator[FrameRecord]:
+        """One for each frame; ``step`` is called after it."""
+        recorded = self._recorded
+        past = NOTHING_BEFORE if recorded is None else Past(recorded.state, recorded.source.commands)
+        for record in replay(self._source, self._config, self._recorder, past, self._warn):
+            yield record
+            self._counts.add(record)
+            if recorded is not None:
+                recorded.compare(record)
+            step()
+
+    def summary(self) -> list[str]:
+        """What became of the frames, and what differs from a recording."""
+        return [self._counts.summary(), *([] if self._recorded is None else [self._recorded.summary()])]
+
+    @property
+    def usable(self) -> bool:
+        """Whether any frame was."""
+        return self._counts.usable > 0
+
+
+class PulseReplay:
+    """A second camera's, of its table's pulses."""
+
+    def __init__(self, source: Source, config: SecondConfig) -> None:
+        self._source, self._config = source, config
+        self._count = self._used = 0
+        self._faults: Counter[str] = Counter()
+        self.length = len(source) if isinstance(source, Sized) else None
+
+    def recorded_in(self, path: Path | None) -> AbstractContextManager[None]:
+        """A second camera's replay makes none."""
+        if path is not None:
+            right = "gripmon run with source: {kind: folder} and --out records"
+            raise InputError(f"is for wrist cameras; {right}", "recording")
+        return nullcontext()
+
+    def records(self, step: Callable[[], None]) -> Iterator[SpotRecord]:
+        """One for each pulse; ``step`` is called after each frame."""
+        for record in self._config.pulsed_watch().replayed(self._frames(step), self._config.pulses):
+            yield record
+            self._count, self._used = self._count + 1, self._used + record.used
+            if record.fault is not None:
+                self._faults[record.fault] += 1
+
+    def summary(self) -> list[str]:
+        """What became of the pulses."""
+        why = ", ".join(f"{number} {fault}" for fault, number in self._faults.most_common())
+        return [f"{self._count} pulses: {self._used} used{f'; {why}' if why else ''}"]
+
+    @property
+    def usable(self) -> bool:
+        """Whether any pulse was."""
+        return self._used > 0
+
+    def _frames(self, step: Callable[[], None]) -> Iterator[Frame]:
+        while (item := self._source.read()) is not None:
+            step()
+            if isinstance(item, Frame):
+                yield item
+
+
+@contextmanager
+def open_replay(
+    paths: Sequence[Path],
+    config_path: Path | None,
+    fps: float | None = None,
+    warn: Callable[[str], None] = _log.warning,
+) -> Iterator[FrameReplay | PulseReplay]:
+    """A folder of images, a video, or recordings of one run, to be replayed with a configuration (None: the recorded
+    one); ``fps`` as for :func:`gripmon.open_source`.  ``warn`` gets a line for each thing that is odd.
+
+    Raises :class:`InputError` and :class:`NoResultError`.
+    """
+    first = paths[0]
+    _refuse_empty_folders(paths)
+    recorded = _are_recordings(paths)
+    with contextlib.ExitStack() as opened:
+        if config_path is not None and is_second(config_path):
+            second = load_second(config_path, check_source=False)
+            if second.settings.laser.pulses is None:
+                raise ConfigError(config_path, "laser.pulses", "is missing", "a table of the recorded pulses")
+            if recorded or len(paths) > 1:
+                right = "one folder of images, or one video"
+                raise InputError(f"{first}: no input for a second camera's configuration; {right}")
+            second = load_pulses(second)
+            source = _open_input(first, fps)
+            opened.callback(source.close)
+            yield PulseReplay(source, second)
+            return
+        given = None if config_path is None else load_config(config_path, check_source=False)
+        run = RecordedRun(paths, given, opened) if recorded else None
+        config = given if run is None else run.config
+        if config is None:
+            raise InputError(f"{first} isn't a recording, which alone brings its own configuration; name one", "config")
+        source = _open_input(first, fps) if run is None else run.source
+        opened.callback(source.close)
+        for note in [] if run is None else run.notes:
+            warn(note)
+        if (text := limits_warning(config)) is not None:
+            warn(text)
+        yield FrameReplay(source, config, run, warn)
+
+
+def _are_recordings(paths: Sequence[Path]) -> bool:
+    """Whether these are recordings, rather than images or a video; only recordings may be several."""
+    other = next((p for p in paths if not (recordings_below(p) if p.is_dir() else p.suffix.lower() == ".rrd")), None)
+    if other is not None and len(paths) > 1:
+        raise InputError(f"{other}: isn't an .rrd file; one input, or several .rrd files of one run")
+    return other is None
+
+
+def _refuse_empty_folders(paths: Sequence[Path]) -> None:
+    """Before anything else is asked for, which would not help."""
+    for path in paths:
+        if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():
+            continue
+        try:
+            images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir())
+        except OSError as error:
+            raise InputError(f"{path}: can't be read ({error.strerror})") from None
+        if not images:
+            right = ".rrd files, or images such as *.png, *.jpg, *.tif, *.pgm"
+            raise InputError(f"{path}: no recordings and no images in it; {right}")
+
+
+def _open_input(path: Path, fps: float | None) -> Source:
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder; a folder of images, a video or an .rrd")
+    try:
+        return start(settings_for_path(path, fps))
+    except SourceError as error:
+        raise InputError(f"{path}: {error}") from None

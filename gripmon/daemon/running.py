@@ -21,8 +21,8 @@ from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFeed, Reports
 from gripmon.daemon.second import SecondCamera
-from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
 from gripmon.laser.pulses.told import Told

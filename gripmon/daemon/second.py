@@ -11,16 +11,16 @@ import msgspec
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.neighbours import CommandFeed, PulseFeed, Reports
-from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import EXIT_FAILED, Loop, in_short
-from gripmon.daemon.watch import Judged
+from gripmon.daemon.supervised import Loop
+from gripmon.daemon.watch import DaemonSettings, Judged
 from gripmon.io.publish import SpotPublisher
 from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import Outcome, PulsedWatch
+from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -37,7 +37,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.model.stopping import EXIT_DONE, StopRequest
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.record.write import SpotRecorder
 
 _log = logging.getLogger(__name__)

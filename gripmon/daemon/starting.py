@@ -5,38 +5,68 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 
-from gripmon.daemon.api import Monitor
-from gripmon.daemon.camera_source import open_source
-from gripmon.daemon.config import Config, ConfigError
-from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.api import Monitor, look_ahead, open_configured
+from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_second
+from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.network import open_network, with_metrics, with_source
-from gripmon.daemon.running import log_to_stderr, run
+from gripmon.daemon.network import open_network, open_second_network, with_source
+from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
+from gripmon.daemon.running import log_to_stderr, run, run_second
 from gripmon.judge.statefile import StateFile, StateFileError
-from gripmon.model.errors import InputError
+from gripmon.model.atomic import writable_folder
+from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
 from gripmon.model.stopping import StopRequest
-from gripmon.record.write import Recorder, ViewSettings, open_recorder
+from gripmon.record.write import ViewSettings, open_recorder, open_spot_recorder
+from gripmon.record.write.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
 
 _log = logging.getLogger(__name__)
 
-RECORDING_PATIENCE_S = 30.0
-"""Images that can wait outrun any camera: they wait so long for the recording, none is dropped (s)."""
+_SERVER_STARTS_S = 60.0
+_LOOK_EVERY_S = 0.1
 
 
-class LiveView(Protocol):
-    """What shows the stream that the recording serves, until ``opened`` is closed."""
+def run_file(
+    path: Path,
+    *,
+    out: Path | None,
+    stop: StopRequest,
+    duration_s: float | None = None,
+    verbose: bool = False,
+    fresh_state: bool = False,
+    view: str | None = None,
+    take_over: bool = False,
+) -> int:
+    """Run the daemon on a configuration file, a wrist camera's or a second camera's; returns the exit code.
 
-    settings: ViewSettings
-
-    def open(self, opened: contextlib.ExitStack) -> None: ...
+    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``:
+    "auto", "web", "native" or "server"; the rest as in :func:`run_monitor`.
+    """
+    config = load_second(path) if is_second(path) else load_config(path)
+    second = isinstance(config, SecondConfig)
+    if second and fresh_state:
+        raise InputError(f"is for wrist cameras, {path} is a second camera's; leave it out", "fresh_state")
+    look_ahead(config)
+    if out is not None:
+        lines = writable_folder(out) / ("spots.jsonl" if second else "estimates.jsonl")
+        try:
+            lines.open("ab").close()
+        except OSError as error:
+            raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
+    if isinstance(config, SecondConfig):
+        return _run_second(config, out, stop, duration_s, view, verbose=verbose, take_over=take_over)
+    return run_monitor(
+        config, out=out, stop=stop, duration_s=duration_s, verbose=verbose, keep_state=True, fresh_state=fresh_state,
+        view=view, take_over=take_over,
+    )  # fmt: skip
 
 
 def run_monitor(
@@ -49,10 +79,9 @@ def run_monitor(
     recording_name: str | None = None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
     on_network: Callable[[], None] = lambda: None,
-    warns: bool = False,
     keep_state: bool = False,
     fresh_state: bool = False,
-    view: LiveView | None = None,
+    view: str | None = None,
     take_over: bool = False,
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
@@ -60,19 +89,19 @@ def run_monitor(
     ``out`` is a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
     :func:`gripmon.model.stopping.signals_exit`, in which a program with a terminal calls this.  ``truth_tcp_m``, which
     a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it goes into the
-    recording.  ``on_network`` is called when the publisher is open, before the camera is.  ``warns``: it is logged when
-    the view can't keep the alert limits.  ``keep_state``: what survives a restart is read from the configuration's
-    state file, unless ``fresh_state``, and kept there.  ``view`` shows it live; ``take_over``: see
+    recording.  ``on_network`` is called when the publisher is open, before the camera is.  ``keep_state``: what
+    survives a restart is read from the configuration's state file, unless ``fresh_state``, and kept there; and it is
+    logged when the view can't keep the alert limits.  ``view`` shows it live; ``take_over``: see
     :func:`gripmon.daemon.network.open_network`.
 
     Raises :class:`InputError` for what can't be opened as configured or written to ``out``.
     """
     settings = config.settings
-    estimates = None if out is None else out / "estimates.jsonl"
     cv2.setNumThreads(1)
     log_to_stderr(verbose=verbose)
-    if warns and (text := limits_warning(config)) is not None:
+    if keep_state and (text := limits_warning(config)) is not None:
         _log.warning("%s", text)
+    live = None if view is None else LiveView(settings.view, view, config.path)
     with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None
         if kept is not None:
@@ -85,33 +114,98 @@ def run_monitor(
             _log.warning("%s", monitor.look_refused)
         network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
-        publisher = with_metrics(config, network.publisher)
-        opened.callback(publisher.close)
         on_network()
-        source = open_source(config, network.link)
+        source = open_configured(config, network.link)
         opened.callback(source.close)
-        patience_s = 0.0 if source.live else RECORDING_PATIENCE_S
-        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, view, patience_s)
+        with _recording_errors(config, out):
+            recorder = open_recorder(
+                settings.recording,
+                robot=settings.robot,
+                camera_name=settings.camera_name,
+                camera=config.camera,
+                gripper=config.gripper,
+                reference=monitor.reference,
+                directory=out,
+                name=recording_name,
+                truth_tcp_m=truth_tcp_m,
+                patience_s=0.0 if source.live else RECORDING_PATIENCE_S,
+                configuration=to_recorded(config, state),
+                view=None if live is None else live.settings,
+            )
         opened.callback(recorder.close)
-        if view is not None:
-            view.open(viewed)
+        if live is not None:
+            live.open(viewed)
         opened.pop_all()  # from here on the daemon closes them
+        reports = with_source(network.reports, source)
         return run(
             monitor,
             source,
-            publisher,
+            network.publisher,
             recorder,
             settings.daemon,
             robot=settings.robot,
             camera=settings.camera_name,
-            estimates=estimates,
+            estimates=None if out is None else out / "estimates.jsonl",
             jaw=network.jaw,
             keeper=keeper,
             commands=network.commands,
-            reports=dataclasses.replace(
-                with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m
-            ),
+            reports=dataclasses.replace(reports, alert_limit_m=settings.monitor.policy.alert_limit_m),
             notices=_notices(kept),
+            duration_s=duration_s,
+            stop=stop,
+        )
+
+
+def _run_second(
+    config: SecondConfig,
+    out: Path | None,
+    stop: StopRequest,
+    duration_s: float | None,
+    view: str | None,
+    *,
+    verbose: bool,
+    take_over: bool,
+) -> int:
+    """The same for a second camera, which keeps no state."""
+    settings = config.settings
+    cv2.setNumThreads(1)
+    log_to_stderr(verbose=verbose)
+    live = None if view is None else LiveView(settings.view, view, config.path)
+    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
+        pulsed = config.pulsed_watch()
+        network = open_second_network(config, take_over=take_over)
+        opened.callback(network.publisher.close)
+        source = open_configured(config, network.link)
+        opened.callback(source.close)
+        with _recording_errors(config, out):
+            recorder = open_spot_recorder(
+                settings.recording,
+                robot=settings.robot,
+                camera_name=settings.camera_name,
+                calibration=config.calibration,
+                directory=out,
+                patience_s=0.0 if source.live else RECORDING_PATIENCE_S,
+                configuration=second_to_recorded(config),
+                view=None if live is None else live.settings,
+            )
+        opened.callback(recorder.close)
+        if live is not None:
+            live.open(viewed)
+        opened.pop_all()  # from here on the daemon closes them
+        return run_second(
+            pulsed,
+            source,
+            network.publisher,
+            recorder,
+            settings.daemon,
+            robot=settings.robot,
+            camera=settings.camera_name,
+            lines=None if out is None else out / "spots.jsonl",
+            table=config.pulses,
+            feed=network.pulses,
+            no_spot_alert_after_s=settings.laser.no_spot_alert_after_s,
+            commands=network.commands,
+            reports=with_source(network.reports, source),
             duration_s=duration_s,
             stop=stop,
         )
@@ -138,38 +232,57 @@ def _notices(kept: StateFile | None) -> list[Alert]:
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
 
 
-def _open_recorder(
-    config: Config,
-    monitor: Monitor,
-    state: MonitorState | None,
-    out: Path | None,
-    name: str | None,
-    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
-    view: LiveView | None,
-    patience_s: float,
-) -> Recorder:
-    settings = config.settings
+@contextlib.contextmanager
+def _recording_errors(config: Config | SecondConfig, out: Path | None) -> Iterator[None]:
+    """A recording that can't be made as configured."""
     try:
-        configuration = to_recorded(config, state)
-    except OSError as error:
-        raise ConfigError(config.path, "", f"{error.filename}: can't be read any more ({error.strerror})") from None
-    try:
-        return open_recorder(
-            settings.recording,
-            robot=settings.robot,
-            camera_name=settings.camera_name,
-            camera=config.camera,
-            gripper=config.gripper,
-            reference=monitor.reference,
-            directory=out,
-            name=name,
-            truth_tcp_m=truth_tcp_m,
-            patience_s=patience_s,
-            configuration=configuration,
-            view=None if view is None else view.settings,
-        )
+        yield
     except OSError as error:
         if out is not None:
             raise InputError(f"{out}: can't be written ({error.strerror or error}); another folder") from None
-        wrong = f"{settings.recording.directory} can't be made ({error.strerror})"
+        wrong = f"{config.settings.recording.directory} can't be made ({error.strerror})"
         raise ConfigError(config.path, "recording.directory", wrong, "a folder that may be written") from None
+
+
+class LiveView:
+    """A viewer on the stream that the recording serves."""
+
+    def __init__(self, settings: ViewSettings, kind: str, config_path: Path) -> None:
+        """Raises :class:`InputError` where it can't be shown."""
+        self.settings = settings
+        self._native = kind == "native" or (kind == "auto" and has_display())
+        self._web = kind == "web" or (kind == "auto" and not has_display())
+        if kind == "native" and not has_display():
+            raise InputError("native: there is no display; web", "view")
+        ports = [("port", settings.port)] + [("web_port", settings.web_port)] * self._web
+        for key, port in ports:
+            if not is_free(port):
+                raise ConfigError(config_path, f"view.{key}", f"{port} is in use on 127.0.0.1", "another port")
+
+    def open(self, opened: contextlib.ExitStack) -> None:
+        """Start the viewer, which shows the stream as soon as there is one; a page ends with ``opened``."""
+        url = self.settings.stream_url
+        if self._web:
+            try:
+                page = WebPage(self.settings.web_port, [url])
+            except ViewerError as error:
+                raise NoResultError(f"--view web: {error}") from None
+            opened.callback(page.close)
+            _log.info("live view: %s", page.url)
+        _log.info("live view: rerun viewers connect to %s", url)
+        if self._native:
+            threading.Thread(target=self._open_window, name="viewer", daemon=True).start()
+
+    def _open_window(self) -> None:
+        """A viewer that finds no server gives up: it is started when there is one.  The window is the user's: it stays
+        until it is closed.
+        """
+        end_s = time.monotonic() + _SERVER_STARTS_S
+        while is_free(self.settings.port):
+            if time.monotonic() > end_s:
+                return
+            time.sleep(_LOOK_EVERY_S)
+        try:
+            NativeViewer([self.settings.stream_url], tied=False)
+        except ViewerError as error:
+            _log.error("no window for the live view: %s", error)

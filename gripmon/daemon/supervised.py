@@ -14,12 +14,12 @@ import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
-from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.watch import Watch
+from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.io.publish import StatePublisher
 from gripmon.io.publish.presence import in_words
 from gripmon.io.sources import Source, Waiting
+from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -40,14 +40,13 @@ from gripmon.model.records import (
     Verdict,
     accepting,
 )
-from gripmon.model.stopping import EXIT_DONE, StopRequest
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.record.write import EventRecorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-EXIT_FAILED = 3
 _RESTS_FOR = 3.0
 """After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
 
@@ -354,9 +353,3 @@ class Loop(ABC):
             _log.error("no usable frame came")
             return EXIT_FAILED
         return EXIT_DONE
-
-
-def in_short(error: Exception) -> str:
-    """One line for a person."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__

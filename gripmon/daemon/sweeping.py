@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from gripmon.daemon.config import Config
+from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.forecast import rig_of
-from gripmon.model.camera import Camera
+from gripmon.model.camera import Camera, make_camera
+from gripmon.model.errors import InputError
 from gripmon.model.geometry import to_record
-from gripmon.teach.forecast import Grid, Mount, Trial, field_of_view_rad, tried, try_mount, weakest_direction
+from gripmon.teach.forecast import (
+    Grid,
+    Mount,
+    Trial,
+    field_of_view_rad,
+    towards,
+    tried,
+    try_mount,
+    weakest_direction,
+    with_focal,
+)
+
+_MOST_MOUNTS = 20000
+_DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), (0.0, 75.0, 6)  # first, last, count: times the present one, degrees
 
 
 @dataclass(frozen=True)
@@ -30,6 +46,82 @@ class Sweep:
         return sorted(self.trials, key=lambda trial: trial.rank)
 
 
+def make_grid(
+    config: Config,
+    ranges: Mapping[str, Sequence[float]],
+    lenses: Sequence[Path] = (),
+    at_px: tuple[float, float] | None = None,
+) -> tuple[Grid, tuple[float, float]]:
+    """All combinations of ``ranges``: ``distance`` (m), ``tilt``, ``side``, ``roll`` (degrees), see :class:`Mount`, and
+    ``focal`` (px) or ``fov`` (degrees over the image's width); in place of the last two ``lenses``, files of calibrated
+    cameras.  What isn't there stays as it is, but for distance and tilt.  ``at_px``: where the TCP shows in the present
+    camera's image, which is given back, too; None: as now.
+
+    Raises :class:`InputError` for lenses that can't be, a place outside of the image, and too many mounts.
+    """
+    present, rig = Mount.of(config.cam_T_grip), rig_of(config)
+    distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
+    turns = {"tilt": ranges.get("tilt") or _spaced(*_TILTS_DEG)}
+    turns |= {name: ranges[name] for name in ("side", "roll") if name in ranges}
+    rad = {name: tuple(math.radians(value) for value in values) for name, values in turns.items()}
+    cameras = [_calibrated(path) for path in lenses] or _cameras(config.camera, ranges)
+    place = _place(config, at_px)
+    try:
+        directions = tuple(towards(camera, _same_place(place, config.camera, camera)) for camera in cameras)
+    except ValueError as error:
+        raise InputError(str(error), "at_px") from None
+    grid = Grid(
+        tuple(distances_m),
+        rad["tilt"],
+        rad.get("side", (present.side_rad,)),
+        rad.get("roll", (present.roll_rad,)),
+        tuple(rig._replace(camera=camera) for camera in cameras),
+        directions,
+    )
+    if len(grid) > _MOST_MOUNTS:
+        raise InputError(f"{len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", "sweep")
+    return grid, place
+
+
+def _spaced(first: float, last: float, count: int) -> list[float]:
+    return [first + (last - first) * k / (count - 1) for k in range(count)]
+
+
+def _cameras(camera: Camera, ranges: Mapping[str, Sequence[float]]) -> list[Camera]:
+    name = "focal" if "focal" in ranges else "fov"
+    focals_px = ranges.get(name, ())
+    if name == "fov":
+        focals_px = [0.5 * camera.width_px / math.tan(0.5 * math.radians(angle)) for angle in focals_px]
+    try:
+        return [with_focal(camera, focal_px) for focal_px in focals_px] or [camera]
+    except ValueError as error:
+        raise InputError(str(error), name) from None
+
+
+def _calibrated(path: Path) -> Camera:
+    try:
+        return make_camera(read_camera(path).camera)
+    except ValueError as error:
+        raise InputError(str(error), "lens") from None
+
+
+def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tuple[float, float]:
+    """A point of one camera's image in that of another one, which may have more pixels, or fewer."""
+    (u, v), across, down = at_px, other.width_px / camera.width_px, other.height_px / camera.height_px
+    return (u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5
+
+
+def _place(config: Config, at_px: tuple[float, float] | None) -> tuple[float, float]:
+    """Where the TCP is to show: as now, or as given."""
+    camera = config.camera
+    where = "lies at" if at_px is not None else "the TCP shows now at"
+    u, v = at_px if at_px is not None else camera.project(config.cam_T_grip[None, :3, 3])[0].tolist()
+    if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
+        right = f"two numbers inside {camera.width_px} x {camera.height_px} px"
+        raise InputError(f"{where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}", "at_px")
+    return u, v
+
+
 def sweep(
     config: Config,
     grid: Grid,
@@ -37,7 +129,16 @@ def sweep(
     travel_m: tuple[float, float] | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> Sweep:
-    """Try every mount of the grid, at the openings of ``travel_m`` (None: all); ``step`` is called after each."""
+    """Try every mount of the grid, at the openings of ``travel_m`` (None: all); ``step`` is called after each.  Raises
+    :class:`InputError` for openings that the jaw hasn't.
+    """
+    gripper = config.gripper
+    if travel_m is not None:
+        if not gripper.jaw_max_m > gripper.jaw_min_m:
+            raise InputError("the gripper's jaw doesn't move; leave it out", "jaw")
+        if not gripper.jaw_min_m <= travel_m[0] < travel_m[1] <= gripper.jaw_max_m:
+            right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
+            raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g}: is not in the jaw's travel; {right}", "jaw")
     opening_m, trials = config.jaw_opening_m, []
     mount, cam_T_grip = Mount.of(config.cam_T_grip), config.cam_T_grip
     present = try_mount(rig_of(config), mount, -1, cam_T_grip, opening_m, travel_m)

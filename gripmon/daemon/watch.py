@@ -1,14 +1,14 @@
-"""What there is to say besides the frames' own records: counts, silence, internal errors."""
+"""What there is to report besides the frames' own records: counts, silence, internal errors, dropped frames."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import deque
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from gripmon.daemon.drops import Drops
-from gripmon.daemon.settings import DaemonSettings
+import msgspec
+
 from gripmon.judge.policy import AlertBook
 from gripmon.model.records import (
     Alert,
@@ -27,13 +27,50 @@ from gripmon.model.records import (
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _UPDATE_S = 10.0
-"""Pause between two reasons of what fails: a disk that is gone and then full is news, figures that change are none."""
+"""Pause between two reasons of what fails: a disk that is gone and then full is news; figures that change are not."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 _OTHERS, _DROPS = "others", "drops"
 
+OVER_S = 10.0
+"""Dropped frames are counted over this time: the first seconds after a start are slow and don't matter."""
+
+_LOOK_EVERY_S = 1.0
+
+
+class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When the loop says that something is wrong, and when it gives up."""
+
+    state_period_s: Annotated[float, msgspec.Meta(gt=0.0, description="pause between unchanged state messages (s)")] = (
+        1.0
+    )
+    stale_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="no frame for this long: state stale, to half a second (s)")
+    ] = 0.5
+    no_camera_alert_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="no frame for this long: an alert (s)")
+    ] = 3.0
+    dropped_alert_share: Annotated[
+        float,
+        msgspec.Meta(gt=0.0, le=1.0, description="more of the frames of 10 s dropped, for want of time: an alert"),
+    ] = 0.2
+    give_up_after_errors: Annotated[
+        int, msgspec.Meta(ge=1, description="internal errors in N frames in a row: stop, exit code 3")
+    ] = 50
+    estimates_budget_bytes: Annotated[
+        int,
+        msgspec.Meta(
+            ge=0,
+            description="estimates.jsonl (spots.jsonl) of run --out with all that were set aside beside it: a tenth of "
+            "this is a file, and beyond it the oldest are deleted; 0: one file without end (bytes)",
+        ),
+    ] = 10_000_000_000
+    stop_within_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="from a signal to the end, the recording completed (s)")
+    ] = 1.8
+
 
 class Judged(NamedTuple):
-    """What is kept of a frame.  ``usable``: it told something; ``refused``: it could not be looked at; ``reason``: what
+    """What is kept of a frame.  ``usable``: it was measured; ``refused``: it could not be looked at; ``reason``: what
     is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
 
@@ -111,14 +148,14 @@ class Watch:
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
         if undelivered:
             silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
-            told = self._fails(_OUTPUT, silent, now_s, stamp_ns)
+            alerts = self._fails(_OUTPUT, silent, now_s, stamp_ns)
         else:
-            told = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
+            alerts = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
         if not failure:
-            return [*told, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
+            return [*alerts, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
-        return [*told, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
+        return [*alerts, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or thins, as it says itself; the monitor goes on."""
@@ -135,20 +172,20 @@ class Watch:
 
     def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
         """So many frames have come since the start while another one was worked on."""
-        if not (said := self._drops.look(self.frames, count, now_s)):
+        if not (text := self._drops.look(self.frames, count, now_s)):
             return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
-        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, said)
+        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, text)
         return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
 
-    def others(self, said: str, now_s: float, stamp_ns: int) -> list[Alert]:
-        """Other monitors of this name: ``said`` of them, empty while there are none."""
-        if not said:
+    def others(self, text: str, now_s: float, stamp_ns: int) -> list[Alert]:
+        """Other monitors of this name: ``text`` about them, empty while there are none."""
+        if not text:
             return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
-        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, said)
+        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, text)
         return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
 
     def stopped(self) -> None:
-        """The end: whoever keeps the last state message must not go on trusting the last transform."""
+        """The end: a reader that keeps the last state message must not go on trusting the last transform."""
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
@@ -168,7 +205,7 @@ class Watch:
 
     @property
     def _holds(self) -> bool:
-        """Is what was said of the last frame still said?"""
+        """Does the last frame's state still hold?"""
         return self._judged is not None and (self.state, self.verdict) == (self._judged.state, self._judged.verdict)
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
@@ -192,7 +229,7 @@ class Watch:
         return (len(times_s) - 1) / (times_s[-1] - times_s[0])
 
     def _keep_message(self, text: str) -> None:
-        """A reason's figures may change with every frame; it is said again only when its kind changes."""
+        """A reason's figures may change with every frame; it is reported again only when its kind changes."""
         if _kind(text) != _kind(self.message):
             self.message = text
 
@@ -225,3 +262,38 @@ def _of_record(record: FrameRecord) -> Judged:
 def is_refused(record: FrameRecord) -> bool:
     """Could the frame not be measured at all?  Then every corner says so."""
     return bool(record.corners) and record.corners[0].reason is CornerFault.FRAME_REFUSED
+
+
+class Drops:
+    """Counts over the last seconds; all times are monotonic seconds."""
+
+    def __init__(self, allowed_share: float) -> None:
+        """``allowed_share`` of the camera's frames may be dropped; beyond that it is reported, until they are half."""
+        self._allowed = allowed_share
+        self._counts: deque[tuple[float, int, int]] = deque()  # time, frames handled, frames dropped
+        self._said = ""
+
+    def look(self, handled: int, dropped: int, now_s: float) -> str:
+        """What is wrong and what to change, of the counts since the start; empty if all is well."""
+        counts = self._counts
+        if counts and now_s - counts[-1][0] < _LOOK_EVERY_S:
+            return self._said
+        counts.append((now_s, handled, dropped))
+        while len(counts) > 1 and now_s - counts[1][0] >= OVER_S:
+            counts.popleft()
+        since_s, handled_before, dropped_before = counts[0]
+        elapsed_s = now_s - since_s
+        few, lost = handled - handled_before, dropped - dropped_before
+        if elapsed_s >= OVER_S:
+            share = lost / max(1, few + lost)
+            allowed = self._allowed / 2.0 if self._said else self._allowed
+            self._said = _in_words(few / elapsed_s, (few + lost) / elapsed_s, share) if share > allowed else ""
+        return self._said
+
+
+def _in_words(handled_per_s: float, came_per_s: float, share: float) -> str:
+    remedy = "lower the camera's rate (source.fps, or its driver's) to that, give smaller images, or free the processor"
+    return (
+        f"{100.0 * share:.0f} % of the frames were dropped in {OVER_S:g} s: {came_per_s:.3g} a second came, the "
+        f"monitor had time for {handled_per_s:.3g}; {remedy} of other work"
+    )

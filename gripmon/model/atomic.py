@@ -10,6 +10,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from gripmon.model.errors import InputError
+
+
+def writable_folder(path: Path, argument: str = "out") -> Path:
+    """The folder, made where it is missing.  :class:`InputError` about this argument where it can't be written to."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: can't be made ({error.strerror}); a directory to write to", argument) from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: may not be written to; a directory of your own", argument)
+    return path
+
 
 def write_atomically(path: Path, data: bytes) -> None:
     """A whole file at once, see :func:`opened_atomically`."""

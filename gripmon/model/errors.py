@@ -8,12 +8,27 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """What was given is wrong: a file, a table, a value.  The command line ends with this exit code."""
+    """What was given is wrong: a file, a table, a value.  The command line ends with this exit code.
+
+    ``argument``: the function's argument that is wrong, where the text doesn't name it; the command line puts the
+    option of that name in front.
+    """
 
     exit_code = 2
+    argument = ""
+
+    def __init__(self, text: str, argument: str = "") -> None:
+        super().__init__(f"{argument}: {text}" if argument else text)
+        self.wrong, self.argument = text, argument or self.argument
 
 
 class NoResultError(RuntimeError):
     """The input is sound, and yet there is no result: no usable frame, a calibration that is refused."""
 
     exit_code = 3
+
+
+def in_short(error: Exception) -> str:
+    """Any exception in one line for a person."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

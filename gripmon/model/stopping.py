@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-EXIT_DONE, EXIT_INTERRUPTED = 0, 130
+EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED = 0, 3, 130
 
 _Handler = Callable[[int, FrameType | None], None]
 

@@ -20,6 +20,8 @@ _WIDEST = 2.0
 class TargetError(InputError):
     """A target that can't be; ``str()`` is one line: what is wrong; what would be right."""
 
+    argument = "target"
+
 
 class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="chequerboard"):
     """Squares in two colours; ``columns`` and ``rows`` count the *inner* corners, as OpenCV and ROS do."""

@@ -15,8 +15,8 @@ NOWHERE = np.zeros((0, 4, 4))
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper that
-    was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
+    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper
+    that was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for
     some times one after the other, then in one of several frames.

@@ -105,6 +105,23 @@ class HandEyeOnPlate:
             provenance=provenance,
         )
 
+    def values(self) -> dict[str, Any]:
+        """The result as plain values: m, rad, px."""
+        fit, transform = self.fit, to_record(self.cam_T_grip)
+        out: dict[str, Any] = {
+            "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
+            "covariance": fit.covariance.ravel().tolist(),
+            "rms_m": fit.rms_m,
+            "rms_px": fit.rms_px,
+            "consistency_p": fit.consistency_p,
+            "warnings": fit.warnings,
+            "images": [_image_values(look) for look in self.looks],
+        }
+        if self.inferred:
+            out["sides_m"] = (2.0 * fit.corners_m[3, :2]).tolist()
+            out["sides_sigma_m"] = (fit.lengths_covariance.diagonal()[:2] ** 0.5).tolist()
+        return out
+
     def calibrated(self, name: str = "images") -> Calibrated:
         """What :func:`gripmon.calibrate.api.verify` compares."""
         flat = tuple(self.covariance.ravel().tolist())
@@ -114,6 +131,28 @@ class HandEyeOnPlate:
     def picture(self) -> Image:
         """The first image with its residuals, enlarged; BGR."""
         return draw(self.shown, self.method.camera.lens, self.looks[0].coincidence)
+
+
+def _image_values(look: Look) -> dict[str, Any]:
+    image = look.coincidence
+    sigma_px = (image.corners.covariance_px.diagonal() ** 0.5).reshape(-1, 2)
+    rows = zip(image.corners.names, image.corners.uv_px, sigma_px, image.residuals_m, strict=True)
+    return {
+        "image": image.sighting.name,
+        "plate_points": int(image.plate.used[0].sum()),
+        "plate_points_left_out": int((~image.plate.used[0]).sum()),
+        "plate_rms_px": image.plate.rms_px,
+        "corners": {
+            name: {"uv_px": uv.tolist(), "sigma_px": sigma.tolist(), "residual_m": residual.tolist()}
+            for name, uv, sigma, residual in rows
+        },
+        "missing": look.missing,
+        "residuals_p": image.p_value,
+        "tilt_rad": None if image.tilt_rad is None else image.tilt_rad.tolist(),
+        "gap_m": image.gap_m,
+        "tilt_gap_sigma": None if image.apart_sigma is None else image.apart_sigma.tolist(),
+        "tilt_gap_p": image.apart_p,
+    }
 
 
 def calibrate_plane(
@@ -172,14 +211,13 @@ def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamer
 def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
     if not gripper.has_jaw:
         if opening_m is not None:
-            raise InputError(f"--jaw-opening: {gripper.name} has no jaw; leave it out")
+            raise InputError(f"{gripper.name} has no jaw; leave it out", "jaw_opening_m")
         return None
     if opening_m is None:
         return gripper.jaw_nominal_m
     if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
-        raise InputError(
-            f"--jaw-opening {opening_m:g}: the gripper's is {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
-        )
+        span = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        raise InputError(f"{opening_m:g}: the gripper's is {span}", "jaw_opening_m")
     return opening_m
 
 
@@ -203,7 +241,7 @@ def _for_each(corners: Rough | Sequence[Rough] | None, images: int) -> Sequence[
     if corners is None or isinstance(corners, Mapping):
         return [corners] * images
     if len(corners) not in (1, images):
-        raise InputError(f"rough corners {len(corners)} times for {images} images; once for all, or for each")
+        raise InputError(f"{len(corners)} for {images} images; one for all, or one for each", "corners")
     return list(corners) * (images if len(corners) == 1 else 1)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 
-from gripmon.daemon import DaemonSettings, run
+from gripmon.daemon.running import run
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.model.records import (
     AlertKind,
     Cause,

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.daemon import DaemonSettings, log_to_stderr, run
+from gripmon.daemon.running import log_to_stderr, run
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.stopping import signals_exit

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.daemon import DaemonSettings, log_to_stderr, run
+from gripmon.daemon.running import log_to_stderr, run
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import FrameRecord
 from gripmon.model.stopping import signals_exit

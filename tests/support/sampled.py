@@ -11,8 +11,9 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
-from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Votes
+from gripmon.track.edges.consensus import Consensus, ConsensusSettings
 from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Votes
 from gripmon.track.edges.uncertainty import Uncertainty
 from support.meters import box_gripper, difference
 from support.simulated import PAPER_LENS, nominal_cam_T_grip

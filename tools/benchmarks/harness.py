@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.scene import FPS, Ring
-from gripmon import daemon
 from gripmon.daemon.config import Config
+from gripmon.daemon.running import run
 from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
@@ -143,7 +143,7 @@ def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
 def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder: Recorder | None = None) -> None:
     """The daemon's loop, as ``gripmon run`` runs it, until the source ends.  Closes the recorder, not the publisher."""
     settings = config.settings
-    daemon.run(
+    run(
         Monitor(config.camera, config.gripper, settings.monitor, config.reference),
         source,
         _TimedPublisher(publisher, source),

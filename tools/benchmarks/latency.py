@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from benchmarks import options
 
 _DESCRIPTION = """\
-Times the daemon's own loop (gripmon.daemon.run with a Zenoh publisher and a subscriber in another process) on
+Times the daemon's own loop (gripmon.daemon.running.run with a Zenoh publisher and a subscriber in another process) on
 cluttered simulator frames that were rendered beforehand, for two image sizes: latency, share of each stage,
 frames per second on one core, memory, and the cost of recording; and beside it, in the same run, interleaved
 and on one thread, AprilTags on the fingertips of the same images (cv2.aruco with sub-pixel corners, solvePnP).

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import inspect as mi
 
-from gripmon.daemon.config.second import SecondSettings
-from gripmon.daemon.config.settings import Settings
+from gripmon.daemon.config.settings import SecondSettings, Settings
 
 UNITS = {
     "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s",

@@ -1,6 +1,6 @@
 """A configuration file -> checked, typed settings with the camera, the gripper and the reference that they describe.
 
-Everything that can be wrong is found here, before anything starts, and said in one line: :class:`ConfigError`.
+Everything that can be wrong is found here, before anything starts, and reported in one line: :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -16,27 +16,21 @@ from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.daemon.config.checks import (
     View,
     covariance_of,
+    jaw_fault,
+    joined,
     monitor_fault,
+    network_fault,
+    order_fault,
     predict_view,
     reference_transform,
+    source_fault,
     view_fault,
+    with_alert_limit,
 )
-from gripmon.daemon.config.deprecated import with_alert_limit
-from gripmon.daemon.config.errors import ConfigError
-from gripmon.daemon.config.inputs import jaw_fault, network_fault, source_fault
-from gripmon.daemon.config.order import order_fault
-from gripmon.daemon.config.second import (
-    SECTION,
-    SecondConfig,
-    check_second_network,
-    is_second,
-    load_pulses,
-    load_second,
-)
-from gripmon.daemon.config.session import joined_or_fault
+from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
-from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_settings, read_yaml
 from gripmon.io.ros2 import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -58,7 +52,6 @@ __all__ = [
     "Settings",
     "builtin_config",
     "check_network",
-    "check_second_network",
     "is_second",
     "load_config",
     "load_pulses",
@@ -97,7 +90,7 @@ class Config:
         settings = self.settings
         if settings.state.file != AUTO:
             return None if settings.state.file is None else self.directory / settings.state.file
-        # What is replayed or simulated begins anew each time, and so does the camera's motion.
+        # What is replayed or simulated begins afresh each time, and so does the camera's motion.
         live = isinstance(settings.source, LiveSettings | NetworkSettings)
         return default_path(settings.robot, settings.camera_name) if live else None
 
@@ -141,8 +134,8 @@ def load_config(
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
     ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
-    ``with_taught=False`` leaves out the taught model, for those who teach anew; ``say_deprecated=False`` logs no
-    warning of settings that have been replaced, for files that nobody can edit.
+    ``with_taught=False`` leaves out the taught model, for those who teach it again; ``say_deprecated=False`` logs no
+    warning of settings that have been replaced, for files that can't be edited.
     """
     path = Path(path)
     values = read_yaml(path)
@@ -150,14 +143,11 @@ def load_config(
         right = "a wrist camera's configuration; gripmon run, check and replay take both"
         raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
     values, calibrated = with_sections(path, values)
+    settings = read_settings(path, Settings, values)
     try:
-        settings = to_settings(values, Settings)
+        settings = with_alert_limit(path, values, settings, say=say_deprecated)
     except SettingsError as error:
-        raise _error(path, error.fault) from None
-    converted = with_alert_limit(path, values, settings, say=say_deprecated)
-    if isinstance(converted, Fault):
-        raise _error(path, converted)
-    settings = converted
+        raise ConfigError.of(path, error.fault) from None
     camera = _camera(path, settings, calibrated)
     gripper_path = path.parent / settings.gripper
     gripper = _gripper(path, gripper_path)
@@ -176,20 +166,20 @@ def load_config(
         if isinstance(settings.source, SimulatedSettings) and settings.source.scenario.endswith((".yaml", ".yml")):
             load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
-        raise _error(path, fault)
+        raise ConfigError.of(path, fault)
     return replace(config, taught=_taught(config)) if with_taught else config
 
 
-def check_network(config: Config) -> Joining | None:
+def check_network(config: Config | SecondConfig) -> Joining | None:
     """How the network would be joined; None if nothing is published.
 
     It finds what only matters to those who join it: files of Zenoh's, endpoints, packages for ROS 2.  Raises
     :class:`ConfigError`.
     """
-    found = joined_or_fault(config.settings, config.camera, config.directory)
-    if isinstance(found, Fault):
-        raise _error(config.path, found)
-    return found
+    try:
+        return joined(config.settings, config.camera, config.directory)
+    except SettingsError as error:
+        raise ConfigError.of(config.path, error.fault) from None
 
 
 def builtin_config(name: str) -> Path:
@@ -201,10 +191,6 @@ def builtin_config(name: str) -> Path:
     raise FileNotFoundError(f"{name} is not among the installed configuration files")
 
 
-def _error(path: Path, fault: Fault) -> ConfigError:
-    return ConfigError(path, fault.key, fault.wrong, fault.right)
-
-
 def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Camera:
     try:
         return make_camera(settings.camera)
@@ -214,9 +200,8 @@ def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Cam
 
 def _gripper(path: Path, gripper_path: Path) -> Gripper:
     if not gripper_path.is_file():
-        raise ConfigError(
-            path, "gripper", f"there is no file {gripper_path}", "a gripper file, its path relative to this file"
-        )
+        right = "a gripper file, its path relative to this file"
+        raise ConfigError(path, "gripper", f"there is no file {gripper_path}", right)
     return read_gripper(gripper_path)
 
 
@@ -235,7 +220,7 @@ def read_gripper(gripper_path: Path) -> Gripper:
                     to_settings(finger.motion, motion, f"fingers.{name}.motion")
         return Gripper(model)
     except SettingsError as error:
-        raise _error(gripper_path, error.fault) from None
+        raise ConfigError.of(gripper_path, error.fault) from None
     except GripperError as error:
         raise ConfigError(gripper_path, "", str(error)) from None
 
@@ -244,13 +229,12 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
     file = calibrated.paths.get("reference", path)
     fault = None if calibrated.hand_eye is None else calibrated_mismatch(calibrated.hand_eye, settings.camera, gripper)
     if fault is not None:
-        raise _error(file, fault)
-    cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
-    for found in (cam_T_grip, covariance):
-        if isinstance(found, Fault):
-            key = found.key if file is path else found.key.removeprefix("reference.")
-            raise _error(file, found._replace(key=key))
-    assert not isinstance(cam_T_grip, Fault) and not isinstance(covariance, Fault)
+        raise ConfigError.of(file, fault)
+    try:
+        cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
+    except SettingsError as error:
+        key = error.fault.key if file is path else error.fault.key.removeprefix("reference.")
+        raise ConfigError.of(file, error.fault._replace(key=key)) from None
     transform = to_record(cam_T_grip)
     name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
     return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)
@@ -264,10 +248,7 @@ def _taught(config: Config) -> TaughtModel | None:
     if not path.is_file():
         right = "a file of gripmon teach, its path relative to this file"
         raise ConfigError(config.path, "taught", f"there is no file {path}", right)
-    try:
-        model = to_settings(read_yaml(path), TaughtModel)
-    except SettingsError as error:
-        raise _error(path, error.fault) from None
+    model = read_settings(path, TaughtModel)
     edges = config.settings.monitor.corners.edges
     fault = mismatch(model, config.camera, config.gripper, config.cam_T_grip, edges)
     if fault is not None:
@@ -284,7 +265,4 @@ def load_scenario(path: Path) -> Scenario:
     """A simulator scenario from a YAML file.  Raises :class:`ConfigError`."""
     from gripmon.simulate import Scenario
 
-    try:
-        return to_settings(read_yaml(path), Scenario)
-    except SettingsError as error:
-        raise _error(path, error.fault) from None
+    return read_settings(path, Scenario)

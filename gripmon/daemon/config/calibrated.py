@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
-from gripmon.daemon.config.errors import ConfigError
-from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.config.typed import ConfigError, Fault
+from gripmon.daemon.config.yaml_file import read_document
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
 from gripmon.track.edges.taught import gripper_digest
 
-_T = TypeVar("_T")
 _WHAT = {
     "camera": "a file of gripmon calibrate intrinsics",
     "reference": "a file of gripmon calibrate plane",
@@ -46,7 +44,7 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
 
 def read_camera(path: Path) -> CameraCalibration:
     """A calibrated camera.  Raises :class:`ConfigError`."""
-    calibration = _read(path, CameraCalibration)
+    calibration = read_document(path, CameraCalibration)
     count = len(calibration.parameters)
     if len(calibration.covariance) != count * count:
         wrong = f"has {len(calibration.covariance)} values for {count} parameters"
@@ -56,7 +54,7 @@ def read_camera(path: Path) -> CameraCalibration:
 
 def read_hand_eye(path: Path) -> HandEyeCalibration:
     """A hand/eye calibration.  Raises :class:`ConfigError`."""
-    return _read(path, HandEyeCalibration)
+    return read_document(path, HandEyeCalibration)
 
 
 def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Gripper) -> Fault | None:
@@ -78,30 +76,6 @@ def _as_read(value: msgspec.Struct) -> Any:
 def _file(path: Path, key: str, name: str) -> Path:
     there = path.parent / name
     if not there.is_file():
-        raise ConfigError(
-            path, key, f"there is no file {there}", f"{_WHAT[key]}, its path relative to this file, or a section"
-        )
+        right = f"{_WHAT[key]}, its path relative to this file, or a section"
+        raise ConfigError(path, key, f"there is no file {there}", right)
     return there
-
-
-def _read(path: Path, kind: type[_T]) -> _T:
-    values = read_yaml(path)
-    tag = kind.__struct_config__.tag  # type: ignore[attr-defined]
-    if values.get("schema") != tag:
-        raise ConfigError(path, "schema", *wrong_schema(values, str(tag)))
-    try:
-        return to_settings(values, kind)
-    except SettingsError as error:
-        raise ConfigError(path, error.fault.key, error.fault.wrong, error.fault.right) from None
-
-
-_LOOKS_LIKE = {"points": "a gripper file", "gripper": "a configuration", "corners": "a file with corners"}
-
-
-def wrong_schema(values: dict[str, Any], tag: str) -> tuple[str, str]:
-    """What is wrong with a file that isn't of the wanted kind, and what would be right."""
-    schema = values.get("schema")
-    if schema is not None:
-        return f"is {schema!r}", tag
-    looks = next((f"; this looks like {what}" for key, what in _LOOKS_LIKE.items() if key in values), "")
-    return f"is missing{looks}", f"a file with schema: {tag}"

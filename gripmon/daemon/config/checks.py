@@ -1,20 +1,42 @@
-"""Checks that need more than one key: does this camera, calibrated like this, see this gripper?"""
+"""Checks that need more than one key, or more than the file: camera and gripper, pairs, sources, the network."""
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.daemon.config.settings import ReferenceSettings
-from gripmon.daemon.config.typed import Fault
+from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, SecondSettings, Settings
+from gripmon.daemon.config.typed import Fault, SettingsError
+from gripmon.io.metrics import package_fault
+from gripmon.io.ros2 import JOINT_STATE, Ros2Missing, RosNameError, network_of, subscription_key
+from gripmon.io.ros2.types import typestore
+from gripmon.io.sources import (
+    FolderSettings,
+    LiveSettings,
+    NetworkSettings,
+    SourceError,
+    SourceSettings,
+    VideoSettings,
+    network_key,
+)
+from gripmon.io.sources.live import backend_number
+from gripmon.io.sources.network import PayloadDecoder
+from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.monitor import MonitorSettings
+
+_log = logging.getLogger(__name__)
 
 NEAREST_M = 0.005
 FARTHEST_M = 5.0
@@ -40,51 +62,46 @@ class View:
     edges_visible: NDArray[np.bool_]
 
 
-def reference_transform(settings: ReferenceSettings) -> Array | Fault:
-    """``cam_T_grip`` (4, 4) of a reference, or what is wrong with it by itself."""
+def reference_transform(settings: ReferenceSettings) -> Array:
+    """``cam_T_grip`` (4, 4) of a reference; :class:`SettingsError` for one that is wrong by itself."""
     x, y, z, w = settings.cam_T_grip.rotation_xyzw
     length = math.sqrt(x * x + y * y + z * z + w * w)
-    key = "reference.cam_T_grip.rotation_xyzw"
     if abs(length - 1.0) > _UNIT_TOLERANCE:
-        return Fault(
-            key, f"has length {length:.4g}", "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
-        )
+        right = "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
+        raise SettingsError(Fault("reference.cam_T_grip.rotation_xyzw", f"has length {length:.4g}", right))
     translation_m = np.array(settings.cam_T_grip.translation_m)
-    key = "reference.cam_T_grip.translation_m"
-    distance_m = float(np.linalg.norm(translation_m))
+    distance_m, depth_m = float(np.linalg.norm(translation_m)), float(translation_m[2])
+    wrong, right = "", "metres, e.g. [0.0, 0.0, 0.12]"
     if distance_m > FARTHEST_M:
-        return Fault(
-            key,
-            f"puts the TCP {distance_m:g} m from the camera",
-            f"metres, e.g. [0.0, 0.0, 0.12] ({_as_millimetres(distance_m)})",
-        )
-    if translation_m[2] <= 0.0:
-        return Fault(key, f"puts the TCP behind the camera (z = {translation_m[2]:g} m)", _IN_FRONT)
-    if translation_m[2] < NEAREST_M:
-        return Fault(
-            key, f"puts the TCP {1e3 * translation_m[2]:g} mm before the camera", "metres, e.g. [0.0, 0.0, 0.12]"
-        )
+        unit = f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
+        wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({unit})"
+    elif depth_m <= 0.0:
+        wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
+    elif depth_m < NEAREST_M:
+        wrong = f"puts the TCP {1e3 * depth_m:g} mm before the camera"
+    if wrong:
+        raise SettingsError(Fault("reference.cam_T_grip.translation_m", wrong, right))
     return make_transform(rotation_from_xyzw((x, y, z, w)), translation_m)
 
 
-def covariance_of(settings: ReferenceSettings) -> tuple[float, ...] | Fault:
-    """The reference's covariance, row by row, or what is wrong with it."""
+def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
+    """The reference's covariance, row by row; :class:`SettingsError` for one that can't be."""
     if settings.covariance is None:
         variances = [settings.position_sigma_m**2] * 3 + [settings.rotation_sigma_rad**2] * 3
         return tuple(np.diag(variances).ravel().tolist())
     matrix = np.array(settings.covariance).reshape(6, 6)
-    scale = np.sqrt(np.abs(np.diag(matrix)))
-    key, right = (
-        "reference.covariance",
-        "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)",
-    )
+    scale, wrong = np.sqrt(np.abs(np.diag(matrix))), ""
     if not (scale > 0.0).all():
-        return Fault(key, "has a variance of zero", right)
-    normalised = matrix / np.outer(scale, scale)
-    if np.abs(normalised - normalised.T).max() > 1e-6:
-        return Fault(key, "is not symmetric", right)
-    if np.linalg.eigvalsh(normalised).min() <= 0.0:
-        return Fault(key, "is not positive definite", right)
+        wrong = "has a variance of zero"
+    else:
+        normalised = matrix / np.outer(scale, scale)
+        if np.abs(normalised - normalised.T).max() > 1e-6:
+            wrong = "is not symmetric"
+        elif np.linalg.eigvalsh(normalised).min() <= 0.0:
+            wrong = "is not positive definite"
+    if wrong:
+        right = "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)"
+        raise SettingsError(Fault("reference.covariance", wrong, right))
     return settings.covariance
 
 
@@ -145,5 +162,185 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
     return None
 
 
-def _as_millimetres(distance_m: float) -> str:
-    return f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
+class _Pair(NamedTuple):
+    """``lower`` and ``upper`` are keys of one section; ``why`` the first may be at most as large as the second."""
+
+    section: str
+    lower: str
+    upper: str
+    why: str
+
+
+_WARNS_FIRST = "a drift is a warning before it is an error"
+_GROWS = "the pauses grow from the one to the other"
+_PAIRS = (
+    _Pair("monitor.policy", "warn_m", "limit_m", _WARNS_FIRST),
+    _Pair("monitor.policy", "warn_rad", "limit_rad", _WARNS_FIRST),
+    _Pair("monitor.recalibration", "frames", "most_frames", "the fewest frames that are averaged and the most"),
+    _Pair("monitor.recalibration", "sure_sigma_m", "largest_sigma_m", "an operator is asked before it is refused"),
+    _Pair("publish", "retry_first_s", "retry_longest_s", _GROWS),
+)
+_OF_A_CAMERA = (_Pair("source", "retry_first_s", "retry_longest_s", _GROWS),)
+
+
+def order_fault(settings: Settings) -> Fault | None:
+    """The first pair that is in the wrong order."""
+    for pair in _PAIRS + _OF_A_CAMERA * isinstance(settings.source, LiveSettings):
+        section = functools.reduce(getattr, pair.section.split("."), settings)
+        lower, upper = getattr(section, pair.lower), getattr(section, pair.upper)
+        if lower > upper:
+            right = f"at most {pair.upper}, or a larger {pair.upper}: {pair.why}"
+            return Fault(f"{pair.section}.{pair.lower}", f"{lower:g} is above {pair.upper}, {upper:g}", right)
+    return None
+
+
+_NETWORK_JAWS = ("zenoh", "ros2_joint_state")
+
+
+def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
+    """What is wrong with the section ``jaw``, by itself and beside the others."""
+    jaw = settings.jaw
+    if jaw.source != "fixed" and not gripper.has_jaw:
+        return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
+    if jaw.source == "frames" and (kind := _without_jaw(settings.source)) is not None:
+        return Fault("jaw.source", f"is frames, but {kind} brings no jaw opening", "fixed or zenoh")
+    if jaw.source in _NETWORK_JAWS and not settings.publish.enabled:
+        right = "publish.enabled: true, or jaw.source: fixed"
+        return Fault("jaw.source", f"is {jaw.source}, but publish.enabled is false", right)
+    return _opening_fault(jaw, gripper) or _joint_fault(jaw)
+
+
+def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | None:
+    """Why a camera on the network can't be heard."""
+    if not isinstance(source, NetworkSettings):
+        return None
+    if not publish.enabled:
+        return Fault("source.kind", "is zenoh, but publish.enabled is false", "publish.enabled: true")
+    try:
+        network_key(source, "")
+    except SourceError as error:
+        return _split(f"source.{error}")
+    return None
+
+
+def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
+    """A source of files that aren't there, or a camera that can't be any; paths count from ``directory``."""
+    if isinstance(source, FolderSettings) and not (directory / source.path).is_dir():
+        wrong = f"there is no folder {directory / source.path}"
+        return Fault("source.path", wrong, "a folder with images, relative to this file")
+    if isinstance(source, VideoSettings) and not (directory / source.path).is_file():
+        wrong = f"there is no file {directory / source.path}"
+        return Fault("source.path", wrong, "a video file, relative to this file")
+    if isinstance(source, LiveSettings):
+        try:
+            backend_number(source)
+        except SourceError as error:
+            return _split(f"source.{error}")
+    return None
+
+
+def _without_jaw(source: SourceSettings) -> str | None:
+    """What brings frames without a jaw opening, in words; None if they may have one."""
+    if isinstance(source, LiveSettings):
+        return "a camera"
+    if isinstance(source, VideoSettings):
+        return "a video"
+    if isinstance(source, NetworkSettings) and source.format.startswith("ros2_"):
+        return "an image of ROS 2"
+    return None
+
+
+def _opening_fault(jaw: JawSettings, gripper: Gripper) -> Fault | None:
+    if jaw.opening_m is None:
+        return None
+    if jaw.source != "fixed":
+        wrong = f"has no effect with jaw.source {jaw.source}"
+        return Fault("jaw.opening_m", wrong, "jaw.source: fixed, or no opening_m")
+    if not gripper.has_jaw:
+        return Fault("jaw.opening_m", "the gripper file has no jaw", "no opening_m")
+    if not gripper.jaw_min_m <= jaw.opening_m <= gripper.jaw_max_m:
+        span = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        return Fault("jaw.opening_m", f"{jaw.opening_m:g} m is outside the gripper's range", span)
+    return None
+
+
+def _joint_fault(jaw: JawSettings) -> Fault | None:
+    """``topic`` and ``opening`` belong to joint states, and joint states need both."""
+    needed = jaw.source == "ros2_joint_state"
+    for key, value, right in (
+        ("topic", jaw.topic, "the full name of a topic, /joint_states"),
+        ("opening", jaw.opening, "a section: joints (their names), scale, offset_m"),
+    ):
+        if needed and value is None:
+            return Fault(f"jaw.{key}", "is missing", right)
+        if not needed and value is not None:
+            wrong = f"has no effect with jaw.source {jaw.source}"
+            return Fault(f"jaw.{key}", wrong, f"jaw.source: ros2_joint_state, or no {key}")
+    if jaw.topic is None:
+        return None
+    try:
+        subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
+    except RosNameError as error:
+        wrong, _, right = str(error).partition("; ")
+        return Fault("jaw.topic", wrong, right)
+    return None
+
+
+def joined(settings: Settings | SecondSettings, camera: Camera, directory: Path) -> Joining | None:
+    """How the network would be joined; None if it won't be.  :class:`SettingsError` where it can't be."""
+    if (missing := package_fault(settings.metrics)) is not None:
+        raise SettingsError(Fault(*missing))
+    if not settings.publish.enabled:
+        return None
+    wrist, source, key = settings if isinstance(settings, Settings) else None, settings.source, ""
+    try:
+        found = joining(settings.publish if wrist is None else network_of(wrist.publish, wrist.ros2), directory)
+        if wrist is not None and wrist.jaw.source == "ros2_joint_state":
+            key = "jaw.source: "
+        elif wrist is not None and wrist.ros2.enabled:
+            key = "ros2.enabled: "
+        if key:
+            typestore()
+        if isinstance(source, NetworkSettings):
+            key = "source."
+            PayloadDecoder(source.format, (camera.width_px, camera.height_px))
+    except (PublishError, Ros2Missing, SourceError) as error:
+        raise SettingsError(_split(f"{key}{error}")) from None
+    return found
+
+
+def _split(text: str) -> Fault:
+    """Of a line ``key: what is wrong; what would be right``."""
+    key, _, rest = text.partition(": ")
+    wrong, _, right = rest.partition("; ")
+    return Fault(key, wrong, right)
+
+
+_OLD, _NEW = "suspect_sigma_m", "alert_limit_m"
+_SECTION = "monitor.policy"
+_LARGEST_LIMIT_M = 1.0
+
+
+def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings:
+    """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: a warning names both.
+
+    ``values`` is what the file holds: with both of them it isn't clear which is meant.
+    """
+    policy = settings.monitor.policy
+    if policy.suspect_sigma_m is None:
+        return settings
+    limit_m = round(policy.position_limit_m, 6)
+    if _NEW in values["monitor"]["policy"]:
+        wrong = f"stands beside {_NEW}, which replaces it"
+        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW} alone"))
+    if not 0.0 < limit_m <= _LARGEST_LIMIT_M:
+        wrong = f"{policy.suspect_sigma_m:g} stands for {_NEW}: {limit_m:g}, which is not within 0 and 1"
+        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task bears (m)"))
+    if say:
+        _log.warning(
+            "%s: %s.%s: %g is deprecated; write %s: %g, which it stands for",
+            path, _SECTION, _OLD, policy.suspect_sigma_m, _NEW, limit_m,
+        )  # fmt: skip
+    policy = msgspec.structs.replace(policy, alert_limit_m=limit_m, suspect_sigma_m=None)
+    monitor = msgspec.structs.replace(settings.monitor, policy=policy)
+    return msgspec.structs.replace(settings, monitor=monitor)

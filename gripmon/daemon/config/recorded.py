@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from gripmon.daemon.config import Config, SecondConfig, load_config
-from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.records import MonitorState, RecordedConfiguration, RecordedFile
 
@@ -26,25 +26,25 @@ _NO_SOURCE = {"kind": "folder", "path": "images-of-this-recording"}
 def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedConfiguration:
     """The configuration with the files that it names, by plain names; ``start`` is what the monitor begins with.
 
-    Raises OSError for a file that is there no more.
+    Raises :class:`ConfigError` for a file that is there no more.
     """
     named = {"gripper": config.gripper_path, **config.calibrated.paths}
-    if config.taught is not None:
-        named["taught"] = _taught_path(config)
+    if config.taught is not None and config.taught_path is not None:
+        named["taught"] = config.taught_path
     values: dict[str, Any] = msgspec.to_builtins(config.settings)
     values = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
     values["source"] = _NO_SOURCE
     files: dict[str, RecordedFile] = {}
     for role, path in named.items():
         name = path.name if path.name not in (config.path.name, *files) else f"{role}-{path.name}"
-        files[name] = RecordedFile.of(path.read_bytes())
+        files[name] = _file(config.path, path)
         values[role] = name
     files[config.path.name] = RecordedFile.of(as_yaml(values).encode())
     return RecordedConfiguration(config.path.name, files, start)
 
 
 def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
-    """The same of a second camera, with its laser calibration.  Raises OSError for a file that is there no more."""
+    """The same of a second camera, with its laser calibration."""
     values: dict[str, Any] = msgspec.to_builtins(config.settings)
     values = {key: value for key, value in values.items() if key not in _LEFT_OUT}
     name = config.calibration_path.name
@@ -53,7 +53,7 @@ def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
     values["laser"] = {key: value for key, value in values["laser"].items() if value is not None}
     values["laser"] |= {"calibration": name, "pulses": "pulses-of-this-recording.csv"}
     files = {
-        name: RecordedFile.of(config.calibration_path.read_bytes()),
+        name: _file(config.path, config.calibration_path),
         config.path.name: RecordedFile.of(as_yaml(values).encode()),
     }
     return RecordedConfiguration(config.path.name, files)
@@ -77,7 +77,8 @@ def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:
     return load_config(folder / recorded.main, check_source=False, say_deprecated=False)
 
 
-def _taught_path(config: Config) -> Path:
-    path = config.taught_path
-    assert path is not None, "there is a taught model"
-    return path
+def _file(config_path: Path, path: Path) -> RecordedFile:
+    try:
+        return RecordedFile.of(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(config_path, "", f"{path}: can't be read any more ({error.strerror})") from None

@@ -4,76 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-import msgspec
-from msgspec import Meta
+from typing import Any
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.daemon.config.calibrated import wrong_schema
-from gripmon.daemon.config.errors import ConfigError
-from gripmon.daemon.config.inputs import network_fault, source_fault
-from gripmon.daemon.config.session import second_joined_or_fault
-from gripmon.daemon.config.settings import Name
-from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.daemon.settings import DaemonSettings
-from gripmon.io.metrics import MetricsSettings
-from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
+from gripmon.daemon.config.checks import network_fault, source_fault
+from gripmon.daemon.config.settings import SecondSettings
+from gripmon.daemon.config.typed import ConfigError, Fault
+from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
+from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, VideoSettings
 from gripmon.io.sources.pulses import read_pulses
-from gripmon.io.wire import Joining, PublishSettings
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.laser.watch import SpotWatchSettings
 from gripmon.model.camera import Camera, make_camera
-from gripmon.record.write import RecordingSettings, ViewSettings
 
 SECTION = "laser"
 _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")
-
-
-class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is watched, and how."""
-
-    calibration: Annotated[
-        str, Meta(min_length=1, description="file of gripmon calibrate laser, its path relative to this file")
-    ]
-    pulses: (
-        Annotated[
-            str,
-            Meta(
-                min_length=1,
-                description="table of the pulses (CSV), relative to this file, for a folder or a video; others come "
-                "over the network",
-            ),
-        ]
-        | None
-    ) = None
-    no_spot_alert_after_s: (
-        Annotated[
-            float,
-            Meta(gt=0.0, description="an alert when no spot could be judged for so long; leave out: never (s)"),
-        ]
-        | None
-    ) = None
-    frames: PulseSettings = PulseSettings()
-    watch: SpotWatchSettings = SpotWatchSettings()
-
-
-class SecondSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole configuration file of a second camera."""
-
-    robot: Name
-    camera_name: Name
-    laser: LaserSettings
-    source: SourceSettings
-    publish: PublishSettings = PublishSettings()
-    recording: RecordingSettings = RecordingSettings()
-    view: ViewSettings = ViewSettings()
-    metrics: MetricsSettings = MetricsSettings()
-    daemon: DaemonSettings = DaemonSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +47,7 @@ class SecondConfig:
 
 
 def is_second(path: Path) -> bool:
-    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that is no YAML."""
+    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that isn't YAML."""
     return SECTION in read_yaml(path)
 
 
@@ -110,17 +58,14 @@ def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
     """
     values = read_yaml(path)
     _refuse_wrist(path, values)
-    try:
-        settings = to_settings(values, SecondSettings)
-    except SettingsError as error:
-        raise _error(path, error.fault) from None
+    settings = read_settings(path, SecondSettings, values)
     calibration_path = path.parent / settings.laser.calibration
     calibration = read_laser(path, calibration_path)
     fault = _fault_between(settings) or network_fault(settings.source, settings.publish)
     if fault is None and check_source:
         fault = source_fault(settings.source, path.parent)
     if fault is not None:
-        raise _error(path, fault)
+        raise ConfigError.of(path, fault)
     config = SecondConfig(path, settings, calibration_path, calibration, make_camera(calibration.camera))
     return load_pulses(config) if check_source else config
 
@@ -131,32 +76,17 @@ def load_pulses(config: SecondConfig) -> SecondConfig:
     return config if name is None else replace(config, pulses=_pulses(config.path, name))
 
 
-def check_second_network(config: SecondConfig) -> Joining | None:
-    """As :func:`gripmon.daemon.config.check_network`.  Raises :class:`ConfigError`."""
-    settings = config.settings
-    found = second_joined_or_fault(settings.source, settings.publish, settings.metrics, config.camera, config.directory)
-    if isinstance(found, Fault):
-        raise _error(config.path, found)
-    return found
-
-
 def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
     """The laser calibration that a configuration names.  Raises :class:`ConfigError`."""
     if not calibration_path.is_file():
         wrong = f"there is no file {calibration_path}"
         right = "a file of gripmon calibrate laser, its path relative to this file"
         raise ConfigError(path, "laser.calibration", wrong, right)
-    values = read_yaml(calibration_path)
-    tag = str(LaserCalibration.__struct_config__.tag)
-    if values.get("schema") != tag:
-        raise ConfigError(calibration_path, "schema", *wrong_schema(values, tag))
+    calibration = read_document(calibration_path, LaserCalibration)
     try:
-        calibration = to_settings(values, LaserCalibration)
         make_camera(calibration.camera)
         # Everything that its numbers must have in common is checked where they are used.
         PulsedWatch(calibration, SpotWatchSettings(), PulseSettings())
-    except SettingsError as error:
-        raise _error(calibration_path, error.fault) from None
     except (CalibrationError, ValueError) as error:
         raise ConfigError(calibration_path, "", str(error)) from None
     return calibration
@@ -181,7 +111,7 @@ def _refuse_wrist(path: Path, values: dict[str, Any]) -> None:
 
 
 def _fault_between(settings: SecondSettings) -> Fault | None:
-    """Where frames come from, and how the pulses are told: both recorded, or both live."""
+    """Where frames come from, and the pulses: both recorded, or both live."""
     source, pulses = settings.source, settings.laser.pulses
     if isinstance(source, SimulatedSettings):
         return Fault("source.kind", "is simulator, which shows a gripper and no laser", "folder, video, live or zenoh")
@@ -195,7 +125,3 @@ def _fault_between(settings: SecondSettings) -> Fault | None:
         right = "publish.enabled: true, for the pulses come over the network"
         return Fault("publish.enabled", "is false, and the source is a live camera", right)
     return None
-
-
-def _error(path: Path, fault: Fault) -> ConfigError:
-    return ConfigError(path, fault.key, fault.wrong, fault.right)

@@ -7,12 +7,14 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.daemon.settings import DaemonSettings
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
 from gripmon.io.ros2 import JointOpening, Ros2Settings
 from gripmon.io.sources import SourceSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.judge.statefile import StateSettings
+from gripmon.laser.pulses.settings import PulseSettings
+from gripmon.laser.watch import SpotWatchSettings
 from gripmon.model.camera import LensSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.record.write import RecordingSettings, ViewSettings
@@ -110,3 +112,45 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     metrics: MetricsSettings = MetricsSettings()
     daemon: DaemonSettings = DaemonSettings()
     state: StateSettings = StateSettings()
+
+
+class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is watched, and how."""
+
+    calibration: Annotated[
+        str, Meta(min_length=1, description="file of gripmon calibrate laser, its path relative to this file")
+    ]
+    pulses: (
+        Annotated[
+            str,
+            Meta(
+                min_length=1,
+                description="table of the pulses (CSV), relative to this file, for a folder or a video; others come "
+                "over the network",
+            ),
+        ]
+        | None
+    ) = None
+    no_spot_alert_after_s: (
+        Annotated[
+            float,
+            Meta(gt=0.0, description="an alert when no spot could be judged for this time; leave out: never (s)"),
+        ]
+        | None
+    ) = None
+    frames: PulseSettings = PulseSettings()
+    watch: SpotWatchSettings = SpotWatchSettings()
+
+
+class SecondSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole configuration file of a second camera."""
+
+    robot: Name
+    camera_name: Name
+    laser: LaserSettings
+    source: SourceSettings
+    publish: PublishSettings = PublishSettings()
+    recording: RecordingSettings = RecordingSettings()
+    view: ViewSettings = ViewSettings()
+    metrics: MetricsSettings = MetricsSettings()
+    daemon: DaemonSettings = DaemonSettings()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
@@ -34,6 +35,19 @@ class SettingsError(InputError):
     def __init__(self, fault: Fault):
         super().__init__(f"{fault.key}: {fault.wrong}; {fault.right}")
         self.fault = fault
+
+
+class ConfigError(InputError):
+    """A configuration that can't be used; ``str()`` is one line ``file: key: what is wrong; what would be right``."""
+
+    def __init__(self, path: Path | str, key: str, wrong: str, right: str = ""):
+        parts = [str(path), key, f"{wrong}; {right}" if right else wrong]
+        super().__init__(" ".join(": ".join(part for part in parts if part).split()))
+
+    @classmethod
+    def of(cls, path: Path, fault: Fault) -> ConfigError:
+        """With what is wrong at a key of this file."""
+        return cls(path, *fault)
 
 
 def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:
@@ -75,11 +89,8 @@ def _union_fault(value: Any, node: mi.UnionType, key: str, description: str) -> 
         return None
     structs = [t for t in options if isinstance(t, mi.StructType)]
     if structs and (isinstance(value, dict) or len(structs) == len(options)):
-        return (
-            _tagged_fault(value, structs, key)
-            if len(structs) > 1
-            else _struct_fault(value, structs[0], key, description)
-        )
+        several = len(structs) > 1
+        return _tagged_fault(value, structs, key) if several else _struct_fault(value, structs[0], key, description)
     faults = [_find_fault(value, t, key, description) for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]
     if any(fault is None for fault in faults):
         return None
@@ -99,11 +110,8 @@ def _tagged_fault(value: Any, structs: list[mi.StructType], key: str) -> Fault |
         return Fault(_join(key, tag_field), "is missing", _one_of(tags))
     chosen = [s for s in structs if s.tag == value[tag_field]]
     if not chosen:
-        return Fault(
-            _join(key, tag_field),
-            f"is {_show(value[tag_field])}{_did_you_mean(str(value[tag_field]), tags)}",
-            _one_of(tags),
-        )
+        wrong = f"is {_show(value[tag_field])}{_did_you_mean(str(value[tag_field]), tags)}"
+        return Fault(_join(key, tag_field), wrong, _one_of(tags))
     return _struct_fault(value, chosen[0], key, "")
 
 
@@ -167,20 +175,11 @@ def _leaf_fault(value: Any, node: mi.Type, key: str, description: str) -> Fault 
         return None
     if isinstance(value, float) and not math.isfinite(value):
         return Fault(key, f"is {value}", _expected(node, description))
-    if isinstance(node, mi.EnumType):
-        options = [str(member.value) for member in node.cls]
-        return (
-            None
-            if value in options
-            else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
-        )
-    if isinstance(node, mi.LiteralType):
-        options = [str(v) for v in node.values]
-        return (
-            None
-            if value in node.values
-            else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
-        )
+    if isinstance(node, mi.EnumType | mi.LiteralType):
+        values = node.values if isinstance(node, mi.LiteralType) else [member.value for member in node.cls]
+        options = [str(each) for each in values]
+        wrong = f"is {_show(value)}{_did_you_mean(str(value), options)}"
+        return None if value in values else Fault(key, wrong, _one_of(options))
     if _fits_leaf(value, node):
         return None
     return Fault(key, f"is {_show(value)}", _expected(node, description))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import yaml
 
-from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
 
+_T = TypeVar("_T")
 _TAG = "tag:yaml.org,2002:"
 
 
@@ -95,6 +98,29 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return value
 
 
+def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = None) -> _T:
+    """What a YAML file holds (or ``values``, if it was read), as a settings type.  :class:`ConfigError`."""
+    try:
+        return to_settings(read_yaml(path) if values is None else values, kind)
+    except SettingsError as error:
+        raise ConfigError.of(path, error.fault) from None
+
+
+_LOOKS_LIKE = {"points": "a gripper file", "gripper": "a configuration", "corners": "a file with corners"}
+
+
+def read_document(path: Path, kind: type[_T]) -> _T:
+    """The same of a file whose ``schema`` says what it is.  :class:`ConfigError`."""
+    values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
+    schema = values.get("schema")
+    if schema is None:
+        looks = next((f"; this looks like {what}" for key, what in _LOOKS_LIKE.items() if key in values), "")
+        raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
+    if schema != tag:
+        raise ConfigError(path, "schema", f"is {schema!r}", tag)
+    return read_settings(path, kind, values)
+
+
 def _kind(value: object) -> str:
     return "a list" if isinstance(value, list) else f"a single value {value!r}"
 
@@ -110,3 +136,52 @@ def as_yaml(value: dict[str, Any]) -> str:
     """Text from which :func:`read_yaml` reads the same mapping."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
     return text
+
+
+def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
+    """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
+
+    Keys without value are left out.
+    """
+    lines = []
+    tag = type(settings).__struct_config__
+    if tag.tag_field is not None and not off:
+        lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
+    section = msgspec.inspect.type_info(type(settings))
+    assert isinstance(section, msgspec.inspect.StructType)
+    for field in section.fields:
+        value = getattr(settings, field.name)
+        if value is None:
+            continue
+        if isinstance(value, msgspec.Struct):
+            lines.append(_line(indent, field.encode_name, "", "", off))
+            lines.append(lines_of(value, indent + 2, off=off))
+            continue
+        description = _described(field.type)
+        lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
+    return "\n".join(lines)
+
+
+def yaml_value(value: Any) -> str:
+    """A value on one line, as both YAML and JSON read it back."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(yaml_value(item) for item in value)}]"
+
+
+def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:
+    text = f"{'# ' * off}{' ' * indent}{key}:{f' {value}' if value else ''}"
+    return f"{text}  # {description}" if description else text
+
+
+def _described(node: Any) -> str:
+    if isinstance(node, msgspec.inspect.Metadata):
+        own = (node.extra_json_schema or {}).get("description", "")
+        return own or _described(node.type)
+    if isinstance(node, msgspec.inspect.UnionType):
+        return next((text for each in node.types if (text := _described(each))), "")
+    return ""

@@ -2,17 +2,8 @@
 configuration that runs.  It stands here because it knows configurations, which the room ``teach`` does not.
 """
 
-from gripmon.daemon.teaching.inputs import Inputs, Named, live_settings, read_inputs, read_rough, rough_desk
-from gripmon.daemon.teaching.saving import FileSaving
+from gripmon.daemon.teaching.inputs import Inputs, read_inputs, rough_desk
+from gripmon.daemon.teaching.saving import FileSaving, page_desk, teach_from_file
 from gripmon.daemon.teaching.written import name_taught
 
-__all__ = [
-    "FileSaving",
-    "Inputs",
-    "Named",
-    "live_settings",
-    "name_taught",
-    "read_inputs",
-    "read_rough",
-    "rough_desk",
-]
+__all__ = ["FileSaving", "Inputs", "name_taught", "page_desk", "read_inputs", "rough_desk", "teach_from_file"]

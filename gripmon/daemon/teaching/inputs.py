@@ -8,19 +8,19 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 
+from gripmon.daemon.calibrations import read_given_camera
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
-from gripmon.daemon.config.calibrated import mismatch, read_camera, read_hand_eye
+from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
 from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
-from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.config.typed import SettingsError
+from gripmon.daemon.config.yaml_file import read_settings, read_yaml
 from gripmon.io.sources import FolderSettings, LiveSettings
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
@@ -34,26 +34,6 @@ from gripmon.teach.onboarding.outlines import RoughCorners
 from gripmon.teach.page import RoughDesk
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
-
-
-@dataclass(frozen=True)
-class Named:
-    """What a person names: files, and what is to stand in the configuration.  Either ``config``, or ``gripper`` with
-    ``camera`` or ``reference``.  ``command`` goes into the files' provenance; ``live`` is a camera instead of images.
-    """
-
-    command: str
-    images: Sequence[Path]
-    out: Path | None = None
-    config: Path | None = None
-    camera: Path | None = None
-    gripper: Path | None = None
-    reference: Path | None = None
-    live: str | None = None
-    jaw_opening_m: float | None = None
-    jaw_source: str | None = None
-    robot: str | None = None
-    camera_name: str | None = None
 
 
 @dataclass(frozen=True)
@@ -76,46 +56,62 @@ class Inputs:
     jaw_source: str | None = None
 
 
-def read_inputs(named: Named) -> Inputs:
-    """Read and check what is named.  The folder to write to is made where it is missing."""
+def read_inputs(
+    images: Sequence[Path],
+    *,
+    command: str,
+    out: Path | None = None,
+    config: Path | None = None,
+    camera: Path | None = None,
+    gripper: Path | None = None,
+    reference: Path | None = None,
+    live: str | None = None,
+    jaw_opening_m: float | None = None,
+    jaw_source: str | None = None,
+    robot: str | None = None,
+    camera_name: str | None = None,
+) -> Inputs:
+    """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what
+    is to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of
+    images.
+    """
     cv2.setNumThreads(1)
-    config, opening_m = None, named.jaw_opening_m
-    if named.config is not None:
-        config = load_config(named.config, check_source=False, with_taught=False)
-        bench = Bench(config.camera, config.gripper, config.settings.monitor, config.reference)
-        gripper_path = config.gripper_path
-        if opening_m is None and config.settings.jaw.source == "fixed":
-            opening_m = config.jaw_opening_m
+    given = None
+    if config is not None:
+        given = load_config(config, check_source=False, with_taught=False)
+        bench = Bench(given.camera, given.gripper, given.settings.monitor, given.reference)
+        gripper_path = given.gripper_path
+        robot, camera_name = given.settings.robot, given.settings.camera_name
+        if jaw_opening_m is None and given.settings.jaw.source == "fixed":
+            jaw_opening_m = given.jaw_opening_m
     else:
-        gripper, gripper_path = _gripper(named.gripper)
-        camera, error, reference = _calibrations(named, gripper)
-        bench = Bench(camera, gripper, MonitorSettings(), reference, error)
-    if named.jaw_source is not None and not bench.gripper.has_jaw:
-        raise InputError("--jaw-source: the gripper has no jaw; leave it out")
+        model, gripper_path = _gripper(gripper)
+        bench = Bench(*_calibrations(camera, reference, model))
+    if jaw_source is not None and not bench.gripper.has_jaw:
+        raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = bench.settings.bit_depth
-    pictures = tuple(read_picture(path, bench.camera, bench.gripper, depth, opening_m) for path in named.images)
-    folder = named.out or (Path() if config is None else config.directory)
-    calibrations = {"camera": named.camera, "reference": named.reference}
+    pictures = tuple(read_picture(path, bench.camera, bench.gripper, depth, jaw_opening_m) for path in images)
+    source = live_settings(live, bench.camera) if live is not None else FolderSettings(path=str(images[0].parent))
+    calibrations = {"camera": camera, "reference": reference}
     return Inputs(
         bench=bench,
         pictures=pictures,
         gripper_path=gripper_path,
-        folder=folder,
-        source=None if config is not None else _source(named, bench.camera),
-        config=config,
-        robot=config.settings.robot if config is not None else named.robot or ROBOT,
-        camera_name=config.settings.camera_name if config is not None else named.camera_name or CAMERA_NAME,
-        command=named.command,
-        live=named.live,
+        folder=out or (Path() if given is None else given.directory),
+        source=source if given is None else None,
+        config=given,
+        robot=robot or ROBOT,
+        camera_name=camera_name or CAMERA_NAME,
+        command=command,
+        live=live,
         calibrations={key: path for key, path in calibrations.items() if path and "schema" in read_yaml(path)},
-        jaw_source=named.jaw_source,
+        jaw_source=jaw_source,
     )
 
 
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file (px)."""
-    with _faults_of(path):
-        rough = to_settings(read_yaml(path), RoughCorners)
+    rough = read_settings(path, RoughCorners)
     # The file may be the one of calibrate plane --infer, which also names points on edges: they are no corners.
     corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
     fault = rough_fault(corners, gripper)
@@ -151,41 +147,44 @@ def rough_desk(image: Path, camera: Path | None, folder: Path) -> RoughDesk:
 
 def _gripper(path: Path | None) -> tuple[Gripper, Path]:
     if path is None:
-        raise InputError("teach: no gripper; --gripper FILE, one of configs/grippers or your own, or --config")
+        right = "a gripper file, one of configs/grippers or your own, or a configuration"
+        raise InputError(f"is missing; {right}", "gripper")
     if not path.is_file():
-        raise InputError(f"--gripper {path}: there is no such file; a gripper file such as those in configs/grippers")
+        right = "a gripper file such as those in configs/grippers"
+        raise InputError(f"{path}: there is no such file; {right}", "gripper")
     return read_gripper(path), path
 
 
-def _calibrations(named: Named, gripper: Gripper) -> tuple[Camera, CameraError | None, ReferenceRecord | None]:
-    """Camera and reference from their files; a reference's file holds its camera, too."""
-    lens, error = (None, None) if named.camera is None else _read_lens(named.camera)
+def _calibrations(
+    camera_path: Path | None, reference_path: Path | None, gripper: Gripper
+) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, CameraError | None]:
+    """What a bench takes, from files; a reference's file holds its camera, too."""
+    lens, error = (None, None) if camera_path is None else _read_lens(camera_path)
     reference = None
-    if named.reference is not None:
-        lens, reference = _hand_eye(named.reference, lens, gripper)
+    if reference_path is not None:
+        lens, reference = _hand_eye(reference_path, lens, gripper)
     if lens is None:
-        raise InputError("teach: no camera; --camera FILE (of gripmon calibrate intrinsics), or --config")
+        right = "a file of gripmon calibrate intrinsics, or a configuration"
+        raise InputError(f"is missing; {right}", "camera")
     try:
         camera = make_camera(lens)
     except ValueError as fault:
-        raise InputError(f"{named.camera or named.reference}: camera.{fault}") from None
+        raise InputError(f"{camera_path or reference_path}: camera.{fault}") from None
     if reference is not None:
-        _check_view(camera, gripper, reference, f"--reference {named.reference}")
-    return camera, error, reference
+        _check_view(camera, gripper, reference, str(reference_path))
+    return camera, gripper, MonitorSettings(), reference, error
 
 
 def _read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
-    with _faults_of(path):
-        values = read_yaml(path)
-        if "model" in values and "schema" not in values:
-            lens: LensSettings = to_settings(values, LensSettings)  # type: ignore[arg-type]
-            return lens, None
-        made = read_camera(path)
-    if not made.parameters:
-        return made.camera, None
-    count = len(made.parameters)
-    return made.camera, CameraError(made.parameters, np.reshape(made.covariance, (count, count)))
+    values = read_yaml(path)
+    if "model" in values and "schema" not in values:
+        lens: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
+        return lens, None
+    given = read_given_camera(path)
+    if given.covariance is None or not given.parameters:
+        return given.lens, None
+    return given.lens, CameraError(given.parameters, given.covariance)
 
 
 def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
@@ -193,9 +192,9 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
     made = read_hand_eye(path)
     fault = mismatch(made, lens or made.camera, gripper)
     if fault is not None:
-        wrong = fault.wrong.replace("the configuration's camera", "--camera")
-        wrong = wrong.replace("the configuration has", "--gripper is")
-        raise InputError(f"--reference {path}: {fault.key}: {wrong}; {fault.right}")
+        wrong = fault.wrong.replace("the configuration's camera", "the one given")
+        wrong = wrong.replace("the configuration has", "the one given is")
+        raise InputError(f"{path}: {fault.key}: {wrong}; {fault.right}", "reference")
     digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
     name = f"config-{digest}"  # as the configuration that names the file will call it
     return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
@@ -208,31 +207,16 @@ def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, na
         cam_T_grip=TransformSettings(translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw),
         covariance=reference.covariance,
     )
-    pose, covariance = reference_transform(settings), covariance_of(settings)
-    fault = pose if isinstance(pose, Fault) else covariance if isinstance(covariance, Fault) else None
-    if fault is None and not isinstance(pose, Fault):
-        fault = view_fault(predict_view(camera, gripper, pose, None), gripper, camera)
-    if fault is not None:
-        raise InputError(f"{name}: {fault.key.removeprefix('reference.')}: {fault.wrong}; {fault.right}")
-
-
-@contextlib.contextmanager
-def _faults_of(path: Path) -> Iterator[None]:
-    """What is wrong with a file's contents is an :class:`InputError` that names the file."""
     try:
-        yield
+        cam_T_grip, _ = reference_transform(settings), covariance_of(settings)
+        fault = view_fault(predict_view(camera, gripper, cam_T_grip, None), gripper, camera)
     except SettingsError as error:
-        raise InputError(f"{path}: {error}") from None
+        fault = error.fault
+    if fault is not None:
+        raise InputError(f"{name}: {fault.key.removeprefix('reference.')}: {fault.wrong}; {fault.right}", "reference")
 
 
 def live_settings(device: str, camera: Camera) -> LiveSettings:
     """A camera that is asked for images of the calibration's size."""
     where = int(device) if device.isdecimal() else device
     return LiveSettings(device=where, width_px=camera.width_px, height_px=camera.height_px)
-
-
-def _source(named: Named, camera: Camera) -> FolderSettings | LiveSettings:
-    """Where the monitor will find its frames: the live camera, or the images' folder."""
-    if named.live is not None:
-        return live_settings(named.live, camera)
-    return FolderSettings(path=str(named.images[0].parent))

@@ -5,27 +5,32 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import yaml
 
 from gripmon import __version__
 from gripmon.calibrate.detection.pictures import sharpest_blur_px, to_grey
 from gripmon.calibrate.detection.target import BLURRED_PX
 from gripmon.daemon.config import ConfigError, load_config
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-from gripmon.daemon.teaching.inputs import Inputs
-from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml, yaml_value
+from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
+from gripmon.daemon.teaching.written import config_text, with_taught
+from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import ReferenceRecord
 from gripmon.teach.edges import TeachingImage, TeachingRefused
 from gripmon.teach.edges.bench import Found
 from gripmon.teach.edges.files import taught_model, to_yaml
-from gripmon.teach.page import Picture, Saved, SaveOrder, SavingRefused
+from gripmon.teach.edges.snapping import FEWEST_PUT
+from gripmon.teach.page import Desk, Picture, Saved, SaveOrder, SavingRefused
 from gripmon.teach.page.desk import Labels
+from gripmon.teach.page.messages import Put
 from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
@@ -86,7 +91,7 @@ class FileSaving:
             model, notes = self._taught(order, found, reference, pictures, files)
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
-            texts["config"] = self._config(order, found, reference, model is not None)
+            texts["config"] = self._config(order, found, model is not None)
         self._try_out(order, found, texts)
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
@@ -128,7 +133,6 @@ class FileSaving:
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
     ) -> tuple[TaughtModel, list[str]]:
-
         bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
         given = order.put.jaw_opening_m is not None
         pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
@@ -164,23 +168,11 @@ class FileSaving:
             lines[-1] = "corners: {}"
         return "\n".join(lines) + "\n"
 
-    def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
-
+    def _config(self, order: SaveOrder, found: Found, taught: bool) -> str:
         given = self._inputs.config
         if given is not None:
             return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
-        return config_text(
-            self._inputs,
-            robot=order.robot,
-            camera_name=order.camera_name,
-            reference=reference,
-            measured_here=found.pose,
-            taught=TAUGHT if taught else None,
-            gripper=self._relative(self._inputs.gripper_path),
-            jaw_opening_m=found.snapped.jaw_opening_m,
-            jaw_known=order.put.jaw_opening_m is not None,
-            folder=self._relative,
-        )
+        return config_text(self._inputs, order, found, TAUGHT if taught else None, self._relative)
 
     def _relative(self, path: Path, to: Path | None = None) -> str:
         """As a configuration in ``to``, or the folder written to, names it."""
@@ -190,7 +182,6 @@ class FileSaving:
         """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
         if "config" not in texts:
             return
-
         base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
         with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
             trial = Path(name) / CONFIG
@@ -208,8 +199,8 @@ class FileSaving:
                 trial.write_text(as_yaml(values), encoding="utf-8")
                 load_config(trial, check_source=False, with_taught="taught" in texts)
             except (ConfigError, yaml.YAMLError, OSError) as error:
-                told = str(error).replace(f"{name}{os.sep}", "")
-                raise SavingRefused(f"the configuration would not be sound: {told}") from None
+                wrong = str(error).replace(f"{name}{os.sep}", "")
+                raise SavingRefused(f"the configuration would not be sound: {wrong}") from None
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Each whole or not at all; the configuration last, since it names the others."""
@@ -226,3 +217,41 @@ class FileSaving:
                 raise SavingRefused(f"{path}: can't be written ({error.strerror or error}){done}") from None
             written[str(path)] = what
         return written
+
+
+def page_desk(inputs: Inputs) -> Desk:
+    """What the page works on.  Raises :class:`~gripmon.model.errors.InputError` for a camera that can't be."""
+    try:
+        live = None if inputs.live is None else open_source(live_settings(inputs.live, inputs.bench.camera))
+    except SourceError as error:
+        raise InputError(str(error), "live") from None
+    saving = FileSaving(inputs)
+    return Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live)
+
+
+def teach_from_file(inputs: Inputs, path: Path) -> tuple[Found, Callable[[bool], Saved]]:
+    """What the corners in a file give in the one picture, and what writes it: with True over files that are there.
+
+    Raises :class:`~gripmon.model.errors.InputError` for corners that can't be, and
+    :class:`~gripmon.model.errors.NoResultError` where nothing can be taught from them.
+    """
+    rough, bench, picture = read_rough(path, inputs.bench.gripper), inputs.bench, inputs.pictures[0]
+    if bench.reference is None and len(rough) < FEWEST_PUT:
+        raise InputError(
+            f"{path}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, hidden ones too, about where they "
+            "would show; or --reference FILE (of gripmon calibrate plane)"
+        )
+    corners = {name: np.array(at) for name, at in rough.items()}
+    found = bench.look(picture.image, corners, (), picture.jaw_opening_m)
+    if found.snapped.refused is not None:
+        raise NoResultError(f"{picture.name}: {found.snapped.refused}")
+    put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
+
+    def save(replace: bool) -> Saved:
+        order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=replace)
+        try:
+            return FileSaving(inputs).save(order, found, 0, inputs.pictures)
+        except SavingRefused as refused:
+            raise NoResultError(f"teach: {refused}") from None
+
+    return found, save

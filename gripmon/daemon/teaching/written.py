@@ -6,23 +6,24 @@ stand behind a #, as what holds anyway, it can't write.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.config import Config, Settings, load_config
+from gripmon.daemon.config.yaml_file import lines_of, yaml_value
 from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.io.sources import FolderSettings, SourceError
 from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges.bench import Found
 from gripmon.teach.edges.corner_pose import CornerPose
+from gripmon.teach.page import SaveOrder
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
@@ -31,30 +32,20 @@ _AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", 
 
 
 def config_text(
-    inputs: Inputs,
-    *,
-    robot: str,
-    camera_name: str,
-    reference: ReferenceRecord,
-    measured_here: CornerPose | None,
-    taught: str | None,
-    gripper: str,
-    jaw_opening_m: float | None,
-    jaw_known: bool,
-    folder: Callable[[Path], str],
+    inputs: Inputs, order: SaveOrder, found: Found, taught: str | None, folder: Callable[[Path], str]
 ) -> str:
-    """A whole file; ``folder`` names a path as the file does."""
+    """A whole file; ``folder`` names a path as the file does, ``taught`` is the taught model's name (None: none)."""
     source = inputs.source
-    assert source is not None
+    assert source is not None and found.reference is not None
     parts = [
         f"# Written by: {inputs.command} (gripmon {__version__})",
         _UNITS,
-        f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
-        f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
+        f"robot: {yaml_value(order.robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
+        f"camera_name: {yaml_value(order.camera_name)}  # name of the camera in the Zenoh keys",
         "",
         *_camera(inputs, folder),
         "",
-        f"gripper: {yaml_value(gripper)}  # path of the gripper file, relative to this file",
+        f"gripper: {yaml_value(folder(inputs.gripper_path))}  # path of the gripper file, relative to this file",
     ]
     if taught is not None:
         parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
@@ -62,18 +53,15 @@ def config_text(
         there = yaml_value(folder(inputs.calibrations["reference"]))
         parts += ["", f"reference: {there}  # file of gripmon calibrate plane, relative to this file; or a section"]
     else:
-        parts += ["", _reference(reference, measured_here)]
+        parts += ["", _reference(found.reference, found.pose)]
     parts += ["", "source:"]
     if isinstance(source, FolderSettings):
-        parts += [
-            "  kind: folder  # images in a folder",
-            f"  path: {yaml_value(folder(Path(source.path)))}  # relative",
-        ]
-        parts[-1] += " to this file"
+        place = yaml_value(folder(Path(source.path)))
+        parts += ["  kind: folder  # images in a folder", f"  path: {place}  # relative to this file"]
     else:
         parts.append(lines_of(source, 2))
     if inputs.bench.gripper.has_jaw:
-        parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
+        parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
     parts += ["", _defaults()]
     return "\n".join(parts) + "\n"
 
@@ -109,14 +97,14 @@ def name_taught(config: Config, taught: Path) -> Config:
 
 def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
     transform, covariance = reference.cam_T_grip, list(reference.covariance)
-    said = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
+    meaning = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
     lines = ["reference:"]
     if measured_here is not None:
         seen = f"{len(measured_here.corners)} corners of" if measured_here.corners else "the edges in"
         lines.append(f"  # measured from {seen} one image: a plate (gripmon calibrate plane) tells it more exactly")
     lines += [
         f"  id: {yaml_value(reference.reference_id)}  # name of this calibration in messages",
-        f"  cam_T_grip:{said}",
+        f"  cam_T_grip:{meaning}",
         f"    translation_m: {yaml_value(list(transform.translation_m))}  # the TCP in the camera frame: x, y, z (m)",
         f"    rotation_xyzw: {yaml_value(list(transform.rotation_xyzw))}  # unit quaternion x, y, z, w (no unit)",
         "  covariance:  # of its error, 6x6 row by row: TCP's position (m²), then rotation (rad²), camera axes",
@@ -138,8 +126,8 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
         return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
     openings = [picture.jaw_opening_m for picture in inputs.pictures]
     table = [(Path(p.path).parent / TIMESTAMPS_NAME).exists() for p in inputs.pictures if p.path is not None]
-    told = inputs.jaw_source is None and table and all(table)
-    if told and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+    known_by_table = inputs.jaw_source is None and table and all(table)
+    if known_by_table and None not in openings and len(set(table)) == 1 and _in_table(inputs):
         return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
     lines = [
         "jaw:",
@@ -174,52 +162,3 @@ def _defaults() -> str:
         if field.name in _AS_THEY_ARE:
             lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
     return "\n".join(lines)
-
-
-def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
-    """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
-
-    Keys without value are left out.
-    """
-    lines = []
-    tag = type(settings).__struct_config__
-    if tag.tag_field is not None and not off:
-        lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
-    section = msgspec.inspect.type_info(type(settings))
-    assert isinstance(section, msgspec.inspect.StructType)
-    for field in section.fields:
-        value = getattr(settings, field.name)
-        if value is None:
-            continue
-        if isinstance(value, msgspec.Struct):
-            lines.append(_line(indent, field.encode_name, "", "", off))
-            lines.append(lines_of(value, indent + 2, off=off))
-            continue
-        description = _described(field.type)
-        lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
-    return "\n".join(lines)
-
-
-def yaml_value(value: Any) -> str:
-    """A value on one line, as both YAML and JSON read it back."""
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return f"[{', '.join(yaml_value(item) for item in value)}]"
-
-
-def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:
-    text = f"{'# ' * off}{' ' * indent}{key}:{f' {value}' if value else ''}"
-    return f"{text}  # {description}" if description else text
-
-
-def _described(node: Any) -> str:
-    if isinstance(node, msgspec.inspect.Metadata):
-        own = (node.extra_json_schema or {}).get("description", "")
-        return own or _described(node.type)
-    if isinstance(node, msgspec.inspect.UnionType):
-        return next((text for each in node.types if (text := _described(each))), "")
-    return ""

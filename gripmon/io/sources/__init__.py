@@ -43,7 +43,10 @@ __all__ = [
     "network_key",
     "open_source",
     "settings_for_path",
+    "settings_for_text",
 ]
+
+_USUAL_FPS = 25.0
 
 
 def open_source(
@@ -90,3 +93,18 @@ def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | 
     """
     settings = FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))
     return settings if fps is None else msgspec.structs.replace(settings, fps=fps)
+
+
+def settings_for_text(text: str, fps: float | None = None) -> FolderSettings | LiveSettings | VideoSettings:
+    """The same of what may also be a camera: a number, /dev/…, a URL or a GStreamer pipeline.  Raises
+    :class:`SourceError` for what is none of these.
+    """
+    path = Path(text)
+    if path.is_dir():
+        return FolderSettings(path=text, fps=fps or _USUAL_FPS)
+    if path.is_file():
+        return VideoSettings(path=text)
+    if not (text.isdecimal() or text.startswith("/dev/") or "://" in text or "!" in text):
+        right = "a folder of images, a video file, or a camera (0, /dev/video0, a URL, a GStreamer pipeline)"
+        raise SourceError(f"there is no such folder or file; {right}")
+    return LiveSettings(device=int(text) if text.isdecimal() else text, fps=fps)

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 
+from gripmon.model.atomic import write_atomically
+
+_CLIENTS = ("controller", "operator")
+_SHIPPED_ROBOT = "arm1"  # the one in the shipped files
+_LOCAL = ("localhost", "127.0.0.1", "::1")
 _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 
 
@@ -15,6 +22,29 @@ def names_of(robot: str) -> tuple[str, str]:
     if not _ROBOT.fullmatch(robot):
         raise ValueError(f"'{robot}' can't be a robot's name in a certificate; letters, digits, - _ and .")
     return f"monitor-{robot}", f"robot-{robot}"
+
+
+def wanted_names(names: Sequence[str], robots: Sequence[str], hosts: Sequence[str]) -> dict[str, list[str]]:
+    """The common names for which there shall be certificates, each with the hosts at which it is reached: ``names`` or
+    else those of the shipped rules, and two of each robot.  ValueError as :func:`names_of`.
+    """
+    of_robots = [name for robot in robots for name in names_of(robot)]
+    if names:
+        return {name: list(hosts) for name in names} | {name: [] for name in of_robots}
+    others = (*_CLIENTS, *(of_robots or names_of(_SHIPPED_ROBOT)))
+    return {"router": [*_LOCAL, *hosts], **{name: [] for name in others}}
+
+
+def add_robots(path: Path, robots: Sequence[str]) -> bool:
+    """Put the robots' rules into a router's file; False if it has them already.  ValueError as :func:`with_robot`,
+    OSError for a file that can't be read or written.
+    """
+    before = text = path.read_text(encoding="utf-8")
+    for robot in robots:
+        text = with_robot(text, robot)
+    if text != before:
+        write_atomically(path, text.encode())
+    return text != before
 
 
 def with_robot(text: str, robot: str) -> str:

@@ -70,7 +70,7 @@ def read_any(path: Path) -> Image:
 def _opening(path: Path, gripper: Gripper, opening_m: float | None) -> float | None:
     if not gripper.has_jaw:
         if opening_m is not None:
-            raise InputError("--jaw-opening: the gripper has no jaw; leave it out")
+            raise InputError("the gripper has no jaw; leave it out", "jaw_opening_m")
         return None
     if opening_m is None and (path.parent / TIMESTAMPS_NAME).exists():
         try:

@@ -19,9 +19,9 @@ from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
 from gripmon.teach.forecast.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.consensus import Consensus
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Candidates
+from gripmon.track.edges.profiles import Candidates, Votes
 from gripmon.track.edges.uncertainty import Uncertainty, assess
 
 EDGE_POINT_SIGMA_PX = 0.05

@@ -2,13 +2,14 @@
 
 from gripmon.track.edges.consensus import prior_information
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen
-from gripmon.track.edges.evidence import FingerMeter
+from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
 from gripmon.track.edges.sums import edge_sums
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 from gripmon.track.edges.uncertainty import NormalEquations
-from gripmon.track.edges.views import agreeing_fingers, trace_of
+from gripmon.track.edges.views import trace_of
+from gripmon.track.edges.warming import warm_up
 
 __all__ = [
     "JAW_UNREPORTED_SIGMA_M",
@@ -27,4 +28,5 @@ __all__ = [
     "edge_sums",
     "prior_information",
     "trace_of",
+    "warm_up",
 ]

@@ -17,9 +17,23 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
+from gripmon.track.edges import kernel
+from gripmon.track.edges.kernel import (
+    CONVERGED,
+    FARTHEST_PX,
+    FEWEST_AGREEING,
+    FEWEST_EDGES,
+    FEWEST_SPREAD,
+    LARGEST_SPREAD,
+    NARROWING,
+    SMALLEST_SPREAD_PX,
+    SMALLEST_STIFFNESS,
+    TUKEY,
+)
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Candidates
+from gripmon.track.edges.profiles import Votes
 
 
 class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -67,39 +81,13 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it (px of the zoomed image)."""
 
-FARTHEST_PX = 1.0
-"""Robust spread (px) beyond which edge points are not believed to show the gripper's edges."""
-
-FEWEST_EDGES = 3
-"""Edges that must be seen for a fit to be believed at all."""
-
 AGAIN_PX = 0.4
 """Width of the robust weight at a start that is nearly right, px."""
 
-_TUKEY = 4.685
-_LARGEST_SPREAD = 3.0
-_SMALLEST_SPREAD_PX = 0.05
-_SMALLEST_STIFFNESS = 0.2
-_NARROWING = 0.4  # of the width that covers the start's error, from round to round
-_ROUNDS = 6
+NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
+
+ROUNDS = 6
 _ROUNDS_AGAIN = 3
-_CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard deviation; what is still to come is less
-
-
-@dataclass(frozen=True, slots=True)
-class Votes:
-    """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
-    ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
-
-    ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
-    prefer other edges.
-    """
-
-    candidates: Candidates
-    prediction: Prediction
-    weight: Array
-    edge_spread_px: Array
-    cut_off_px: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,24 +135,6 @@ class Consensus:
     share: float
 
 
-def base_weights(
-    candidates: Candidates,
-    prediction: Prediction,
-    polarity: NDArray[np.int8],
-    settings: ConsensusSettings,
-) -> Array:
-    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
-
-    ``polarity`` (e,) belongs to the gripper's edges.
-    """
-    edge = prediction.layout.edge[candidates.sample]
-    weight = 1.0 / (candidates.sigma_px**2 + settings.point_floor_px**2)
-    if polarity.any():
-        wanted = polarity[edge]
-        weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
-    return weight
-
-
 def agree(
     votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
 ) -> Consensus:
@@ -173,25 +143,55 @@ def agree(
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
+    if not COMPILES:
+        return agree_with_numpy(votes, prior, start, settings, width_px)
+    candidates, prediction = votes.candidates, votes.prediction
+    solved, fitted = kernel.fit(
+        candidates.sample,
+        candidates.offset_px,
+        votes.weight,
+        prediction.jacobian,
+        prediction.layout.edge,
+        prediction.ok,
+        votes.edge_spread_px,
+        prior.mean,
+        prior.information,
+        start,
+        settings.start_width_px if width_px is None else width_px,
+        ROUNDS if width_px is None else _ROUNDS_AGAIN,
+        settings.start_width_px,
+        GATE_PX * candidates.zoom,
+        settings.support_sigmas,
+        settings.support_share,
+    )
+    if not solved:
+        raise FloatingPointError(NOT_SOLVED)
+    return Consensus(*fitted)
+
+
+def agree_with_numpy(
+    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
+) -> Consensus:
+    """:func:`agree` where nothing compiles, and what the compiled one is held against."""
     candidates, prediction = votes.candidates, votes.prediction
     width = settings.start_width_px if width_px is None else width_px
     shared = votes.edge_spread_px**2
     xi, spread, spread_px = start, 1.0, FARTHEST_PX
-    near = _near(votes, start, max(width, _TUKEY * FARTHEST_PX))
-    rounds = _ROUNDS if width_px is None else _ROUNDS_AGAIN
+    near = _near(votes, start, max(width, TUKEY * FARTHEST_PX))
+    rounds = ROUNDS if width_px is None else _ROUNDS_AGAIN
     for round_ in range(rounds):
         if round_:
-            width *= _NARROWING
+            width *= NARROWING
             spread, spread_px = _spread(near.residual(xi), near.sigma, settings.start_width_px)
         residual = near.residual(xi)
-        reach = np.minimum(np.hypot(width, (_TUKEY * spread) * near.sigma), max(width, _TUKEY * spread_px))
+        reach = np.minimum(np.hypot(width, (TUKEY * spread) * near.sigma), max(width, TUKEY * spread_px))
         weight = _biweight(residual, reach)
         weight *= near.weight
         # All points of an edge together are worth no more than one with the spread that they share.
         weight /= (1.0 + shared * np.bincount(near.edge, weight, len(shared)))[near.edge]
         step, information = _step(near.jacobian, residual, weight, prior.mean - xi, prior.information)
         xi = xi + step
-        if round_ >= rounds - 3 and float(step @ information @ step) < _CONVERGED:
+        if round_ >= rounds - 3 and float(step @ information @ step) < CONVERGED:
             break
     stiffness = _stiffness(weight, near.residual(xi), reach)
     every = np.zeros(len(candidates.sample))
@@ -295,7 +295,7 @@ def _step(jacobian: Array, residual: Array, weight: Array, to_prior: Array, prio
     normal.flat[:: len(normal) + 1] += prior
     _, step, failed = dposv(normal, weighted @ residual + prior * to_prior)
     if failed:
-        raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
+        raise FloatingPointError(NOT_SOLVED)
     return step, information
 
 
@@ -320,7 +320,7 @@ def _stiffness(weight: Array, residual: Array, reach: Array) -> float:
     base = weight[inside] / np.maximum((1.0 - square) ** 2, 1e-6)
     pull, growth = (1.0 - square) ** 2, (1.0 - square) * (1.0 - 5.0 * square)
     total = float(base @ pull)
-    return max(float(base @ growth) / total, _SMALLEST_STIFFNESS) if total > 0.0 else 1.0
+    return max(float(base @ growth) / total, SMALLEST_STIFFNESS) if total > 0.0 else 1.0
 
 
 def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
@@ -329,13 +329,13 @@ def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
     """
     size = np.abs(residual)
     near = np.flatnonzero(size < np.minimum(width, 4.0 * sigma + 0.3))
-    if len(near) < 12:
+    if len(near) < FEWEST_SPREAD:
         return 1.0, FARTHEST_PX
     size = size[near]
     middle = len(size) // 2
     spread_px = 1.4826 * float(np.partition(size, middle)[middle])
     spread = 1.4826 * float(np.partition(size / sigma[near], middle)[middle])
-    return min(max(spread, 1.0), _LARGEST_SPREAD), min(max(spread_px, _SMALLEST_SPREAD_PX), FARTHEST_PX)
+    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), FARTHEST_PX)
 
 
 def _judge(votes: Votes, fit: Fit, settings: ConsensusSettings) -> Consensus:
@@ -359,7 +359,7 @@ def _judge(votes: Votes, fit: Fit, settings: ConsensusSettings) -> Consensus:
     chance = 1.0 - np.exp(others * (-gate_px / max(reach_px - gate_px, 0.5)) / some)
     needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     share = agreeing / some
-    seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
+    seen = (agreeing >= FEWEST_AGREEING) & (agreeing > needed) & (share >= settings.support_share)
     # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
     pair = prediction.pair
     believed = 0.0

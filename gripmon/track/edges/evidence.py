@@ -7,23 +7,25 @@ moved, one finger bent, jaw elsewhere) are special cases of that.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.compiled import compiled
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
-from gripmon.track.edges.consensus import Consensus, Prior, Votes, agree
+from gripmon.track.edges.consensus import Consensus, Prior, agree
 from gripmon.track.edges.ends import FingerEnds
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
-from gripmon.track.edges.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
+from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.settling import Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
@@ -104,20 +106,14 @@ class FingerMeter(Settler):
 
     def blur_px(self, measurement: Measurement) -> float | None:
         """How blurred the edges of a measured frame are: standard deviation across them, px; None with few of them."""
-        widths_px = measurement.candidates.width_px[measurement.consensus.weight > 0.0]
-        if len(widths_px) < FEWEST_WIDTHS:
-            return None
-        kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
-        return math.sqrt(max(median(widths_px) ** 2 - kernel_px**2, 0.0))
+        return measurement.blur_px
 
     def edge_residuals_px(self, measurement: Measurement) -> Array:
         """(e,) weighted mean of each edge's residuals in the joint fit, px; NaN for edges that none of them shows."""
-        consensus, edges = measurement.consensus, len(self._gripper.edge_ids)
-        edge = measurement.prediction.layout.edge[measurement.candidates.sample]
-        total = np.bincount(edge, consensus.weight, edges)
-        moment = np.bincount(edge, consensus.weight * consensus.residual_px, edges)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.where(total > 0.0, moment / np.where(total > 0.0, total, 1.0), np.nan))
+        consensus, edge = measurement.consensus, measurement.prediction.layout.edge
+        sample, edges = measurement.candidates.sample, len(self._gripper.edge_ids)
+        residual_px: Array = edge_means(sample, consensus.weight, consensus.residual_px, edge, edges)
+        return residual_px
 
     def _finger_place(
         self, image: Image, measurement: Measurement, votes: Votes, finger: int, elsewhere: tuple[Array, ...]
@@ -219,6 +215,38 @@ class FingerMeter(Settler):
             if best is None or share > CLEARLY_BETTER * best.share:
                 best = _Place(votes, fit, share)
         return best
+
+
+def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
+    """Share of each finger's profiles that agree with the measured pose; 1 for a finger that isn't sampled."""
+    prediction = measurement.prediction
+    finger, fingers = gripper.edge_finger, len(gripper.finger_ids)
+    shares = agreeing_shares(finger, prediction.layout.edge, prediction.ok, measurement.consensus.supported, fingers)
+    return list(shares.tolist())
+
+
+@compiled
+def agreeing_shares(finger: Any, edge: Any, ok: Any, supported: Any, fingers: int) -> Any:
+    """(f,) share of each finger's profiles in the image that are ``supported`` (n,); 1 without any."""
+    agreeing, sampled = np.zeros(fingers), np.zeros(fingers)
+    for n in range(len(edge)):
+        agreeing[finger[edge[n]]] += supported[n]
+        sampled[finger[edge[n]]] += ok[n]
+    for f in range(fingers):
+        agreeing[f] = agreeing[f] / sampled[f] if sampled[f] else 1.0
+    return agreeing
+
+
+@compiled
+def edge_means(sample: Any, weight: Any, residual_px: Any, edge: Any, edges: int) -> Any:
+    """(e,) weighted mean of the residuals on each edge; NaN without weight."""
+    total, moment = np.zeros(edges), np.zeros(edges)
+    for k in range(len(sample)):
+        total[edge[sample[k]]] += weight[k]
+        moment[edge[sample[k]]] += weight[k] * residual_px[k]
+    for e in range(edges):
+        moment[e] = moment[e] / total[e] if total[e] > 0.0 else np.nan
+    return moment
 
 
 def _brightest(image: Image) -> float:

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
-from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.consensus import Consensus
 from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Votes
 
 
 class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -47,13 +49,78 @@ SHOWN_BESIDE = 0.5
 FEWEST_BESIDE = 4
 """Profiles next to a corner that are looked at, however far apart they are."""
 
+_FAULTS = (
+    None,
+    CornerFault.OUTSIDE,
+    CornerFault.SELF_HIDDEN,
+    CornerFault.FEW_POINTS,
+    CornerFault.HIDDEN,
+    CornerFault.PARALLEL,
+    CornerFault.UNCERTAIN,
+)
+_OUTSIDE, _SELF_HIDDEN, _FEW_POINTS, _HIDDEN, _PARALLEL, _UNCERTAIN = range(1, len(_FAULTS))
+
+_FEWEST_POINTS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class CornerGeometry:
+    """What of the intersections doesn't depend on the image, for one prediction; p spokes, which are one edge at one
+    corner each, sorted by corner.
+
+    ``corner``, ``slot`` among the sampled edges and ``edge`` of the gripper (p,); ``way`` (p, 3): the predicted corner
+    on the edge's line, and the line's direction; ``part`` (p, 4): first and last + 1 of the profiles beside the corner,
+    and of all on the edge.  ``fault`` (c,): why a corner can't be measured in this view whatever the image, or 0.
+    """
+
+    corner: NDArray[np.intp]
+    slot: NDArray[np.intp]
+    edge: NDArray[np.intp]
+    way: Array
+    part: NDArray[np.intp]
+    fault: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, gripper: Gripper, prediction: Prediction, settings: CornerSettings) -> CornerGeometry:
+        layout, corners = prediction.layout, prediction.corners
+        bounds = [*layout.first.tolist(), len(layout.edge)]
+        slots = {edge: slot for slot, edge in enumerate(layout.edges.tolist())}
+        places, ways, faults = [], [], []
+        for i in range(len(gripper.corner_ids)):
+            edges = [edge for edge in gripper.edges_at_corner(i).tolist() if edge in slots]
+            for edge in edges:
+                first, last = bounds[slots[edge]], bounds[slots[edge] + 1]
+                direction = prediction.line_direction[edge]
+                along = float((corners.xy[i] - prediction.line_origin[edge]) @ direction)
+                reach_px = float(np.linalg.norm(prediction.uv_px[last - 1] - prediction.uv_px[first]))
+                near = round(settings.neighbourhood_px / max(reach_px, 1.0) * (last - first - 1))
+                near = min(max(near, FEWEST_BESIDE), last - first)
+                at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
+                beside = (first, first + near) if at_start else (last - near, last)
+                places.append((i, slots[edge], edge, *beside, first, last))
+                ways.append((along, *direction.tolist()))
+            faults.append(_fault_of_view(bool(corners.inside[i]), bool(corners.facing[i]), len(edges)))
+        place = np.array(places, dtype=np.intp).reshape(-1, 7)
+        corner, slot, edge = (np.ascontiguousarray(column) for column in place.T[:3])
+        part = np.ascontiguousarray(place[:, 3:])
+        way = np.array(ways, dtype=float).reshape(-1, 3)
+        return cls(corner, slot, edge, way, part, np.array(faults, dtype=np.intp))
+
+
+def _fault_of_view(inside: bool, facing: bool, edges: int) -> int:
+    if not inside:
+        return _OUTSIDE
+    if not facing:
+        return _SELF_HIDDEN
+    return _FEW_POINTS if edges < 2 else 0
+
 
 @dataclass(frozen=True, slots=True)
 class Corners:
     """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy``
     (c, 2, 2) of each by itself, ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each,
-    ``usable`` (c,) where there is none; NaN where a corner was not measured.  ``sides``: for each corner the edges on
-    which it rests, with their lines.
+    ``usable`` (c,) where there is none; NaN where a corner was not measured.  ``lines`` (v, 5) of the sampled edges,
+    see :func:`_fit_lines`; ``rests`` (p,): on which spokes of ``geometry`` its corner rests.
     """
 
     xy: Array
@@ -62,102 +129,32 @@ class Corners:
     sigma_px: Array
     fault: tuple[CornerFault | None, ...]
     usable: NDArray[np.bool_]
-    sides: tuple[list[tuple[_Spoke, _Line]], ...]
+    lines: Array
+    rests: NDArray[np.bool_]
+    geometry: CornerGeometry
 
     def joint_covariance_xy(self, taken: NDArray[np.bool_]) -> Array:
         """(2k, 2k) covariance of the k usable corners ``taken`` (c,) together: x and y of the first, then of the next.
 
         Corners at the two ends of an edge err together, since one line carries both.
         """
-        count = int(np.count_nonzero(taken))
+        count, geometry = int(np.count_nonzero(taken)), self.geometry
         joint = np.zeros((count, 2, count, 2))
         on_line: dict[int, list[tuple[int, float, Array]]] = {}
         for k, corner in enumerate(np.flatnonzero(taken).tolist()):
             joint[k, :, k] = self.covariance_xy[corner]
-            for spoke, line in self.sides[corner]:
+            for spoke in np.flatnonzero(self.rests & (geometry.corner == corner)).tolist():
+                slot, line, along = int(geometry.slot[spoke]), self.lines[geometry.slot[spoke]], geometry.way[spoke, 0]
                 # Moved by a unit there, the line shifts the corner by its weighted normal.
-                normal = np.array(line.normal(spoke)) / line.variance(spoke.along)
-                others = on_line.setdefault(spoke.slot, [])
+                normal = np.array(_normal(line, geometry.way[spoke])) / _covariance(line, along, along)
+                others = on_line.setdefault(slot, [])
                 pull = self.covariance_xy[corner] @ normal
-                for other, along, other_pull in others:
-                    block = line.covariance_between(spoke.along, along) * np.outer(pull, other_pull)
+                for other, other_along, other_pull in others:
+                    block = _covariance(line, along, other_along) * np.outer(pull, other_pull)
                     joint[k, :, other] += block
                     joint[other, :, k] += block.T
-                others.append((k, spoke.along, pull))
+                others.append((k, along, pull))
         return joint.reshape(2 * count, 2 * count)
-
-
-class _Spoke(NamedTuple):
-    """One edge at one corner, for a prediction: ``slot`` among the sampled edges, ``edge`` of the gripper, ``along``
-    the predicted corner on the edge's line, ``direction`` of the line, first and last + 1 of the profiles beside the
-    corner, and of all on the edge.
-    """
-
-    slot: int
-    edge: int
-    along: float
-    direction_x: float
-    direction_y: float
-    begin: int
-    end: int
-    first: int
-    last: int
-
-    def shows(self, agreed: list[int]) -> bool:
-        """Whether the edge shows beside the corner half as well as elsewhere; ``agreed`` are running counts of the
-        profiles that agree.
-        """
-        near, rest = self.end - self.begin, self.last - self.first - self.end + self.begin
-        seen = agreed[self.end] - agreed[self.begin]
-        elsewhere = agreed[self.last] - agreed[self.first] - seen
-        return seen >= SHOWN_BESIDE * near * (elsewhere / rest if rest >= FEWEST_BESIDE else 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class CornerGeometry:
-    """What of the intersections doesn't depend on the image, for one prediction: for each corner its sampled edges, the
-    reason why it can't be measured in this view whatever the image (or None), and the lens there, px by ideal units.
-
-    Plain numbers, since a handful of corners is less work than the calls that arrays would take.
-    """
-
-    spokes: tuple[tuple[_Spoke, ...], ...]
-    fault: tuple[CornerFault | None, ...]
-    lens: tuple[tuple[float, float, float, float], ...]
-
-    @classmethod
-    def of(cls, gripper: Gripper, prediction: Prediction, settings: CornerSettings) -> CornerGeometry:
-        layout, corners = prediction.layout, prediction.corners
-        bounds = [*layout.first.tolist(), len(layout.edge)]
-        slots = {edge: slot for slot, edge in enumerate(layout.edges.tolist())}
-        spokes, faults = [], []
-        for i in range(len(gripper.corner_ids)):
-            at_corner = []
-            for edge in gripper.edges_at_corner(i).tolist():
-                if edge not in slots:
-                    continue
-                first, last = bounds[slots[edge]], bounds[slots[edge] + 1]
-                direction = prediction.line_direction[edge]
-                along = float((corners.xy[i] - prediction.line_origin[edge]) @ direction)
-                x, y = direction.tolist()
-                reach_px = float(np.linalg.norm(prediction.uv_px[last - 1] - prediction.uv_px[first]))
-                near = round(settings.neighbourhood_px / max(reach_px, 1.0) * (last - first - 1))
-                near = min(max(near, FEWEST_BESIDE), last - first)
-                at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
-                beside = (first, first + near) if at_start else (last - near, last)
-                at_corner.append(_Spoke(slots[edge], edge, along, x, y, *beside, first, last))
-            spokes.append(tuple(at_corner))
-            faults.append(_fault_of_view(bool(corners.inside[i]), bool(corners.facing[i]), len(at_corner)))
-        lens = tuple((a, b, c, d) for a, b, c, d in corners.d_uv_d_xy.reshape(-1, 4).tolist())
-        return cls(tuple(spokes), tuple(faults), lens)
-
-
-def _fault_of_view(inside: bool, facing: bool, edges: int) -> CornerFault | None:
-    if not inside:
-        return CornerFault.OUTSIDE
-    if not facing:
-        return CornerFault.SELF_HIDDEN
-    return CornerFault.FEW_POINTS if edges < 2 else None
 
 
 def intersect_edges(
@@ -173,142 +170,160 @@ def intersect_edges(
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
     of the corner with ``(right - slope * direction) . shift = offset + slope * along``.
     """
-    prediction = votes.prediction
-    lines = _fit_lines(votes, line_weight)
-    seen = consensus.edge_seen.tolist()
-    agreed = [0, *np.cumsum(consensus.supported).tolist()]
-    sides = tuple(_seen_sides(lines, seen, spokes) for spokes in geometry.spokes)
-    measured = [
-        fault or _intersect(rests_on, agreed, lens, settings)
-        for fault, rests_on, lens in zip(geometry.fault, sides, geometry.lens, strict=True)
-    ]
-    faults = tuple(m if isinstance(m, CornerFault) else None for m in measured)
-    numbers = np.array([_NOTHING if isinstance(m, CornerFault) else m for m in measured]).reshape(-1, 6)
-    shift, sigma_px = numbers[:, :2], numbers[:, 2]
-    return Corners(
-        prediction.corners.xy + shift,
-        numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2),
-        prediction.corners.uv_px + (prediction.corners.d_uv_d_xy @ shift[..., None])[..., 0],
-        sigma_px,
-        faults,
-        np.array([fault is None for fault in faults], dtype=bool),
-        sides,
+    candidates, prediction = votes.candidates, votes.prediction
+    layout, predicted = prediction.layout, prediction.corners
+    lines = _fit_lines(
+        candidates.sample,
+        candidates.offset_px,
+        line_weight,
+        prediction.gain,
+        prediction.along,
+        layout.edges,
+        layout.first,
+        votes.edge_spread_px,
+        votes.cut_off_px,
     )
+    fault, rests, xy, uv_px, covariance_xy, sigma_px = _intersect(
+        lines,
+        consensus.edge_seen,
+        consensus.supported,
+        geometry.corner,
+        geometry.slot,
+        geometry.edge,
+        geometry.way,
+        geometry.part,
+        geometry.fault,
+        predicted.xy,
+        predicted.uv_px,
+        predicted.d_uv_d_xy,
+        math.sin(settings.smallest_angle_rad),
+        settings.largest_sigma_px,
+    )
+    faults = tuple(_FAULTS[k] for k in fault.tolist())
+    return Corners(xy, covariance_xy, uv_px, sigma_px, faults, fault == 0, lines, rests, geometry)
 
 
-_NOTHING = (math.nan,) * 6
-
-
-def _seen_sides(lines: list[_Line | None], seen: list[bool], spokes: tuple[_Spoke, ...]) -> list[tuple[_Spoke, _Line]]:
-    """The edges at a corner that were measured and count as seen."""
-    return [(spoke, line) for spoke in spokes if (line := lines[spoke.slot]) is not None and seen[spoke.edge]]
-
-
-def _intersect(
-    sides: list[tuple[_Spoke, _Line]],
-    agreed: list[int],
-    lens: tuple[float, float, float, float],
-    settings: CornerSettings,
-) -> tuple[float, float, float, float, float, float] | CornerFault:
-    """One corner: shift x and y from the prediction (ideal coordinates), sigma (px), variance x, covariance, variance
-    y.
-
-    ``agreed`` are running counts of the profiles that agree.  Hidden if fewer than two edges show right beside it.
+@compiled
+def _fit_lines(
+    sample: Any, offset_px: Any, line_weight: Any, gain: Any, along: Any, edges: Any, first: Any, edge_spread_px: Any,
+    cut_off_px: Any,
+) -> Any:  # fmt: skip
+    """Weighted straight lines ``e = offset + slope * along`` through the agreed points of every sampled edge: offset
+    and slope, variance of the offset, covariance, variance of the slope (v, 5); NaN for fewer than four points.
     """
-    beside, rows = 0, []
-    ixx = ixy = iyy = bx = by = 0.0
-    for spoke, line in sides:
-        beside += spoke.shows(agreed)
-        x, y = line.normal(spoke)
-        along = spoke.along
-        weight = 1.0 / line.variance(along)
-        wanted = weight * (line.offset + line.slope * along)
-        ixx, ixy, iyy = ixx + weight * x * x, ixy + weight * x * y, iyy + weight * y * y
-        bx, by = bx + wanted * x, by + wanted * y
-        rows.append((x, y))
-    if beside < 2:
-        return CornerFault.HIDDEN
-    if _largest_sine(rows) < math.sin(settings.smallest_angle_rad):
-        return CornerFault.PARALLEL
-    determinant = ixx * iyy - ixy * ixy
-    cxx, cxy, cyy = iyy / determinant, -ixy / determinant, ixx / determinant
-    sigma_px = _larger_sigma(lens, cxx, cxy, cyy)
-    if sigma_px > settings.largest_sigma_px:
-        return CornerFault.UNCERTAIN
-    return cxx * bx + cxy * by, cxy * bx + cyy * by, sigma_px, cxx, cxy, cyy
+    count = len(edges)
+    lines, sums, points = np.full((count, 5), np.nan), np.zeros((count, 5)), np.zeros(count, np.intp)
+    slot = 0
+    for k in range(len(sample)):
+        n = sample[k]
+        while slot + 1 < count and n >= first[slot + 1]:
+            slot += 1
+        if line_weight[k] != 0.0:
+            weight = line_weight[k] / (gain[n] * gain[n])
+            offset = gain[n] * offset_px[k]
+            points[slot] += 1
+            sums[slot, 0] += weight
+            sums[slot, 1] += weight * along[n]
+            sums[slot, 2] += weight * along[n] * along[n]
+            sums[slot, 3] += weight * offset
+            sums[slot, 4] += weight * offset * along[n]
+    for v in range(count):
+        s0, s1, s2, t0, t1 = sums[v, 0], sums[v, 1], sums[v, 2], sums[v, 3], sums[v, 4]
+        determinant = s0 * s2 - s1 * s1
+        if points[v] < _FEWEST_POINTS or not determinant > 0.0:
+            continue
+        # What an edge's points share moves the whole line.
+        common = (edge_spread_px[edges[v]] ** 2 + cut_off_px[edges[v]] ** 2) * gain[first[v]] ** 2
+        lines[v, 0], lines[v, 1] = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
+        lines[v, 2], lines[v, 3], lines[v, 4] = s2 / determinant + common, -s1 / determinant, s0 / determinant
+    return lines
 
 
-def _largest_sine(rows: list[tuple[float, float]]) -> float:
-    """Sine of the largest angle between any two lines with these normals."""
-    return max(
-        abs(ax * by - ay * bx) / (math.hypot(ax, ay) * math.hypot(bx, by))
-        for i, (ax, ay) in enumerate(rows)
-        for bx, by in rows[i + 1 :]
-    )
+@compiled
+def _intersect(
+    lines: Any, seen: Any, supported: Any, corner: Any, slot: Any, edge: Any, way: Any, part: Any, view_fault: Any,
+    predicted_xy: Any, predicted_uv_px: Any, lens: Any, smallest_sine: float, largest_sigma_px: float,
+) -> Any:  # fmt: skip
+    """Fault of each corner (0: none), the spokes that carry it, xy, uv, covariance of xy, sigma; NaN with a fault."""
+    corners, spokes = len(view_fault), len(corner)
+    fault, rests = view_fault.copy(), np.zeros(spokes, np.bool_)
+    xy, uv_px = np.full((corners, 2), np.nan), np.full((corners, 2), np.nan)
+    covariance, sigma_px = np.full((corners, 2, 2), np.nan), np.full(corners, np.nan)
+    begin = 0
+    for c in range(corners):
+        end = begin
+        while end < spokes and corner[end] == c:
+            rests[end] = seen[edge[end]] and lines[slot[end], 0] == lines[slot[end], 0]
+            end += 1
+        beside, sine, ixx, ixy, iyy, bx, by = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for p in range(begin, end):
+            if not rests[p]:
+                continue
+            line, along = lines[slot[p]], way[p, 0]
+            x, y = _normal(line, way[p])
+            beside += _shows(supported, part[p])
+            weight = 1.0 / _covariance(line, along, along)
+            wanted = weight * (line[0] + line[1] * along)
+            ixx, ixy, iyy = ixx + weight * x * x, ixy + weight * x * y, iyy + weight * y * y
+            bx, by = bx + wanted * x, by + wanted * y
+            for q in range(begin, p):
+                if rests[q]:
+                    ax, ay = _normal(lines[slot[q]], way[q])
+                    sine = max(sine, abs(ax * y - ay * x) / (math.hypot(ax, ay) * math.hypot(x, y)))
+        begin = end
+        if fault[c] == 0 and beside < 2:
+            fault[c] = _HIDDEN
+        if fault[c] == 0 and sine < smallest_sine:
+            fault[c] = _PARALLEL
+        if fault[c] != 0:
+            continue
+        determinant = ixx * iyy - ixy * ixy
+        cxx, cxy, cyy = iyy / determinant, -ixy / determinant, ixx / determinant
+        sigma = _larger_sigma(lens[c], cxx, cxy, cyy)
+        if sigma > largest_sigma_px:
+            fault[c] = _UNCERTAIN
+            continue
+        shift_x, shift_y = cxx * bx + cxy * by, cxy * bx + cyy * by
+        sigma_px[c], covariance[c, 0, 0], covariance[c, 1, 1] = sigma, cxx, cyy
+        covariance[c, 0, 1], covariance[c, 1, 0] = cxy, cxy
+        xy[c, 0], xy[c, 1] = predicted_xy[c, 0] + shift_x, predicted_xy[c, 1] + shift_y
+        for i in range(2):
+            uv_px[c, i] = predicted_uv_px[c, i] + lens[c, i, 0] * shift_x + lens[c, i, 1] * shift_y
+    return fault, rests, xy, uv_px, covariance, sigma_px
 
 
-def _larger_sigma(lens: tuple[float, float, float, float], cxx: float, cxy: float, cyy: float) -> float:
+@compiled
+def _shows(supported: Any, part: Any) -> bool:
+    """Whether an edge shows beside the corner half as well as elsewhere.  Hidden if fewer than two edges do."""
+    begin, end, first, last = part[0], part[1], part[2], part[3]
+    seen, elsewhere = 0, 0
+    for n in range(first, last):
+        if begin <= n < end:
+            seen += supported[n]
+        else:
+            elsewhere += supported[n]
+    rest = last - first - end + begin
+    usual = elsewhere / rest if rest >= FEWEST_BESIDE else 1.0
+    return bool(seen >= SHOWN_BESIDE * (end - begin) * usual)
+
+
+@compiled
+def _normal(line: Any, way: Any) -> tuple[float, float]:
+    """By how much the line's place at the corner changes for a shift of it: its normal, turned by the slope."""
+    return -way[2] - line[1] * way[1], way[1] - line[1] * way[2]
+
+
+@compiled
+def _covariance(line: Any, along: float, other: float) -> float:
+    """Of the line's places at two points of it; at one twice, the variance."""
+    return float(line[2] + (along + other) * line[3] + along * other * line[4])
+
+
+@compiled
+def _larger_sigma(lens: Any, cxx: float, cxy: float, cyy: float) -> float:
     """Standard deviation along the larger axis of a covariance in ideal coordinates, px."""
-    a, b, c, d = lens
+    a, b, c, d = lens[0, 0], lens[0, 1], lens[1, 0], lens[1, 1]
     uu = a * a * cxx + 2.0 * a * b * cxy + b * b * cyy
     uv = a * c * cxx + (a * d + b * c) * cxy + b * d * cyy
     vv = c * c * cxx + 2.0 * c * d * cxy + d * d * cyy
     return math.sqrt(0.5 * (uu + vv + math.hypot(uu - vv, 2.0 * uv)))
-
-
-class _Line(NamedTuple):
-    """``e = offset + slope * along`` with the variance of both and their covariance."""
-
-    offset: float
-    slope: float
-    var_offset: float
-    covariance: float
-    var_slope: float
-
-    def normal(self, spoke: _Spoke) -> tuple[float, float]:
-        """By how much the line's place there changes for a shift of the corner: its normal, turned by the slope."""
-        x, y = spoke.direction_x, spoke.direction_y
-        return -y - self.slope * x, x - self.slope * y
-
-    def variance(self, along: float) -> float:
-        """Of the line's place at a point of it."""
-        return self.var_offset + along * (2.0 * self.covariance + along * self.var_slope)
-
-    def covariance_between(self, along: float, other: float) -> float:
-        """Of its places at two points."""
-        return self.var_offset + (along + other) * self.covariance + along * other * self.var_slope
-
-
-def _fit_lines(votes: Votes, line_weight: Array) -> list[_Line | None]:
-    """Weighted straight lines through the agreed points of every sampled edge; None for fewer than four points."""
-    candidates, prediction = votes.candidates, votes.prediction
-    layout = prediction.layout
-    first = layout.first
-    inlier = np.flatnonzero(line_weight)
-    sample = candidates.sample[inlier]
-    gain = prediction.gain[sample]
-    along = prediction.along[sample]
-    terms = np.zeros((5, len(inlier) + 1))
-    weight, weighted_along, weighted_square, weighted_offset, weighted_both = terms[:, 1:]
-    np.divide(line_weight[inlier], gain * gain, out=weight)
-    np.multiply(weight, along, out=weighted_along)
-    np.multiply(weighted_along, along, out=weighted_square)
-    np.multiply(weight, gain * candidates.offset_px[inlier], out=weighted_offset)
-    np.multiply(weighted_offset, along, out=weighted_both)
-    # Points come sorted by edge: sums over edges are differences of running sums.
-    bounds = np.append(np.searchsorted(sample, first), len(inlier))
-    sums = np.cumsum(terms, axis=1)[:, bounds]
-    # What an edge's points share moves the whole line.
-    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)[layout.edges]
-    shared = (spread_px * prediction.gain[first]) ** 2
-    lines: list[_Line | None] = []
-    for count, common, s0, s1, s2, t0, t1 in zip(
-        np.diff(bounds).tolist(), shared.tolist(), *np.diff(sums, axis=1).tolist(), strict=True
-    ):
-        determinant = s0 * s2 - s1 * s1
-        if count < 4 or not determinant > 0.0:
-            lines.append(None)
-            continue
-        k = 1.0 / determinant
-        lines.append(_Line((s2 * t0 - s1 * t1) * k, (s0 * t1 - s1 * t0) * k, s2 * k + common, -s1 * k, s0 * k))
-    return lines

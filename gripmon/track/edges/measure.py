@@ -64,8 +64,8 @@ class Patience:
 
 
 Search = Callable[[Image, Array, float, bool], Array]
-"""From an image, an expected pose (4, 4) and opening, and whether the gripper is lost there, to poses (s, 4, 4) at which
-it may be, best first.
+"""From an image, an expected pose (4, 4) and opening, and whether the gripper is lost there, to poses (s, 4, 4) at
+which it may be, best first.
 """
 
 

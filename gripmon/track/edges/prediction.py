@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.compiled import COMPILES, compiled
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
@@ -155,6 +156,11 @@ class Prediction:
         return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
 
     @cached_property
+    def bevel_px(self) -> Array:
+        """(e,) ``edge_spread_m`` at the gripper's scale, px."""
+        return self.edge_spread_m * self.pixels_per_m
+
+    @cached_property
     def jacobian_by_unknown(self) -> Array:
         """(6 or 7, n): the Jacobian by rows, for fits."""
         return np.ascontiguousarray(self.jacobian.T)
@@ -184,7 +190,21 @@ class Prediction:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
         linearisation pose.
         """
+        if COMPILES:
+            return float(largest_motion(self.jacobian, xi))
         return float(np.abs(self.jacobian[:, : len(xi)] @ xi).max(initial=0.0))
+
+
+@compiled
+def largest_motion(jacobian: Any, xi: Any) -> float:
+    """:meth:`Prediction.moved_px`, compiled."""
+    largest = 0.0
+    for n in range(len(jacobian)):
+        moved = 0.0
+        for i in range(len(xi)):
+            moved += jacobian[n, i] * xi[i]
+        largest = max(largest, abs(moved))
+    return largest
 
 
 def lay_out(

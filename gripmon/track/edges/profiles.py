@@ -1,7 +1,7 @@
-"""Step 3 of the corner measurement: sub-pixel edge candidates on the sampled profiles.
+"""Step 3 of the corner measurement: sub-pixel edge candidates on the sampled profiles, and what each is worth.
 
-The derivative of a Gaussian is applied to all profiles as one matrix product; every local extremum that stands out of
-the noise is a candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
+The derivative of a Gaussian is applied to all profiles; every local extremum that stands out of the noise is a
+candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
 """
 
 from __future__ import annotations
@@ -9,19 +9,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array, Image
+from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.saturation import SPREAD, doubt
+from gripmon.track.edges.profile_kernel import BEYOND_PX, BLUE, FLAT, GREEN, RED, SHARPNESS, SPREAD
+from gripmon.track.edges.saturation import doubt
 
-GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
+if TYPE_CHECKING:
+    from gripmon.track.edges.consensus import ConsensusSettings
+
+GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
 """Luma weights of ITU-R BT.601 in OpenCV's channel order."""
 
 
@@ -41,6 +46,8 @@ _CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
 
 UNREST_FROM_PX, UNREST_TO_PX = 2.0, 5.0
 """Where texture is looked for that may shift an edge, from the edge to both sides, px."""
+
+_NEAR, _FAR = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +73,12 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class _Kernel:
-    """Derivative of Gaussian as a matrix (s, r): r responses inside the profile, in grey levels of a step."""
+    """Derivative of Gaussian, as ``taps`` and as a matrix (s, r): r responses inside the profile, in grey levels of a
+    step.
+    """
 
-    matrix: NDArray[np.float32]
+    taps: Array
+    matrix: Array
     first_offset_px: float
     response_noise: float
     curvature_noise_px: float
@@ -80,32 +90,64 @@ def profile_offsets_px(reach_px: float) -> Array:
     return np.arange(-half, half + 1) * STEP_PX
 
 
-def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: float32 grey levels (n, s); colour is
-    reduced to grey here, so that cost grows with edges.
+def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> Array:
+    """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: grey levels (n, s), which no step of
+    it rounds.  Colour (blue first) is reduced to grey here, so that cost grows with edges.
+
+    OpenCV's bicubic kernel; beyond the image everything is as at its border.
     """
-    samples = map_x.shape[-1]
     if map_x.size == 0:
-        return np.zeros((map_x.shape[-2], samples), dtype=np.float32)
-    rows = map_x.reshape(-1, samples), map_y.reshape(-1, samples)
-    values = cv2.remap(image, *rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    if values.ndim == 3:
-        values = values.astype(np.float32) @ GREY_BGR
+        return np.zeros(map_x.shape[-2:])
     if map_x.ndim == 2:
-        return values.astype(np.float32)
-    summed = values.reshape(map_x.shape).sum(axis=0, dtype=np.float32)
-    summed *= np.float32(1.0 / len(map_x))
-    return np.asarray(summed, dtype=np.float32)
+        map_x, map_y = map_x[None], map_y[None]
+    if not COMPILES:
+        return read_profiles_with_numpy(image, map_x, map_y)
+    profiles: Array = profile_kernel.read_profiles(
+        _pixels(image), np.ascontiguousarray(map_x, np.float32), np.ascontiguousarray(map_y, np.float32)
+    )
+    return profiles
+
+
+def read_profiles_with_numpy(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> Array:
+    """:func:`read_profiles` at maps (r, n, s) where nothing compiles, and what the compiled one is held against."""
+    pixels = _pixels(image).astype(float)
+    grey = pixels @ [BLUE, GREEN, RED] if pixels.shape[2] == 3 else pixels[:, :, 0]
+    (column, across), (row, down) = _cubic(map_x, grey.shape[1]), _cubic(map_y, grey.shape[0])
+    columns = [sum(down[j] * grey[row[j], column[i]] for j in range(4)) for i in range(4)]
+    return np.asarray(sum(across[i] * columns[i] for i in range(4)).mean(axis=0))
+
+
+def _cubic(place: NDArray[np.float32], size: int) -> tuple[list[NDArray[np.intp]], list[Array]]:
+    """The four pixels around each place along an axis of ``size`` pixels, and their weights (Keys 1981)."""
+    inside = np.fmin(np.fmax(place.astype(float), -BEYOND_PX), size - 1 + BEYOND_PX)
+    first = np.floor(inside)
+    on = inside - first
+    back = 1.0 - on
+    before, after = SHARPNESS * on * back * back, SHARPNESS * back * on * on
+    here = ((SHARPNESS + 2.0) * on - (SHARPNESS + 3.0)) * on * on + 1.0
+    pixels = [np.clip(first.astype(np.intp) + k, 0, size - 1) for k in (-1, 0, 1, 2)]
+    return pixels, [before, here, 1.0 - before - here - after, after]
+
+
+def _pixels(image: Image) -> Image:
+    """The image as (h, w, channels), with one of three types and without leave to write: each other combination would
+    be compiled anew.
+    """
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        image = image.astype(np.float32)
+    pixels = np.ascontiguousarray(image).reshape(*image.shape[:2], -1)
+    pixels.flags.writeable = False
+    return pixels
 
 
 def full_scale(image: Image) -> float:
     """Largest grey level of an image's type; 1 for float images."""
-    return 1.0 if np.issubdtype(image.dtype, np.floating) else float(np.iinfo(image.dtype.str).max)
+    return 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype.str).max)
 
 
 def quantum(image: Image) -> float:
     """Step between grey levels of an image's type; float images are taken to come from 16 bits."""
-    return 1.0 if np.issubdtype(image.dtype, np.integer) else 1.0 / 65535.0
+    return 1.0 / 65535.0 if image.dtype.kind == "f" else 1.0
 
 
 @lru_cache(maxsize=64)
@@ -118,7 +160,7 @@ def _kernel(samples: int, blur_px: float, zoom: int) -> _Kernel:
     # A unit step gives a response of one: the answer reads as the height of the step in grey levels.
     taps /= taps[x > 0].sum() + 0.5 * taps[half]
     responses = samples - 2 * half
-    matrix = np.zeros((samples, responses), dtype=np.float32)
+    matrix = np.zeros((samples, responses))
     for k in range(responses):
         matrix[k : k + len(taps), k] = taps
     # Pixels, not half-pixel samples, carry independent noise: cubic interpolation spreads each over its neighbours.
@@ -132,12 +174,12 @@ def _kernel(samples: int, blur_px: float, zoom: int) -> _Kernel:
     # curvature.
     width_squared = blur_px**2 + 0.6**2
     return _Kernel(
-        matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared
+        taps, matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared
     )
 
 
 def find_candidates(
-    profiles: NDArray[np.float32],
+    profiles: Array,
     ok: NDArray[np.bool_],
     noise: float,
     grey_range: float,
@@ -149,27 +191,51 @@ def find_candidates(
     ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`); the profiles' samples lie
     ``zoom`` half pixels apart.  Nothing found is an empty result.
     """
+    if not COMPILES:
+        return find_candidates_with_numpy(profiles, ok, noise, grey_range, settings, zoom)
+    kernel = _kernel(profiles.shape[1], settings.blur_px, zoom)
+    sample, offset_px, step, sigma_px, width_px, cut_off = profile_kernel.find_candidates(
+        profiles,
+        ok,
+        kernel.taps,
+        zoom * STEP_PX,
+        _threshold(kernel, noise, grey_range, settings),
+        zoom * noise * kernel.curvature_noise_px,
+        _NEAR,
+        _FAR,
+        grey_range,
+    )
+    return Candidates(sample, offset_px, step, sigma_px, width_px, cut_off, noise, grey_range, zoom)
+
+
+def _threshold(kernel: _Kernel, noise: float, grey_range: float, settings: EdgeSettings) -> float:
+    return max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
+
+
+def find_candidates_with_numpy(
+    profiles: Array,
+    ok: NDArray[np.bool_],
+    noise: float,
+    grey_range: float,
+    settings: EdgeSettings,
+    zoom: int = 1,
+) -> Candidates:
+    """:func:`find_candidates` where nothing compiles, and what the compiled one is held against."""
     kernel = _kernel(profiles.shape[1], settings.blur_px, zoom)
     response = profiles @ kernel.matrix
     height = np.abs(response)
-    threshold = max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
-    middle = height[:, 1:-1]
-    peak = middle > height[:, :-2]
-    peak &= middle >= height[:, 2:]
-    peak &= middle > threshold
-    peak &= ok[:, None]
-    flat = np.flatnonzero(peak)
-    sample, column = np.divmod(flat, middle.shape[1])
-    at = flat + 2 * sample + 1
-    values = height.ravel()
-    # A flat top would round to a curvature of zero in single precision.
-    left, centre, right = (values[at + k].astype(np.float64) for k in (-1, 0, 1))
-    curvature = 2.0 * centre - left - right
+    left, middle, right = height[:, :-2], height[:, 1:-1], height[:, 2:]
+    curved = (middle - left) + (middle - right)
+    peak = (middle > left) & (middle >= right) & (middle > _threshold(kernel, noise, grey_range, settings))
+    # A flat top is no peak of anything but rounding.
+    peak &= (curved > FLAT * middle) & ok[:, None]
+    sample, column = np.nonzero(peak)
+    left, centre, right, curvature = left[peak], middle[peak], right[peak], curved[peak]
     # A blurred step answers with a Gaussian, whose logarithm is a parabola.
     log_left, log_centre, log_right = (np.log(np.maximum(v, 1e-3 * centre)) for v in (left, centre, right))
     shift = 0.5 * (log_right - log_left) / (2.0 * log_centre - log_left - log_right)
     offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
-    step = response.ravel()[at].astype(np.float64)
+    step = response[:, 1:-1][peak]
     sigma_px = np.maximum(
         (noise * kernel.curvature_noise_px) / centre, STEP_PX * _unrest(response, sample, column + 1) / curvature
     )
@@ -182,7 +248,7 @@ def find_candidates(
     )
 
 
-def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
+def _unrest(response: Array, sample: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
     """Root mean square change of the response from sample to sample around each candidate (k,), but not at it.
 
     What lies beside an edge, texture and noise alike, would go on under the edge, where it shifts the peak.
@@ -195,27 +261,14 @@ def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDA
     columns = response.shape[1]
     row = sample * columns
     last = columns - 1
-    near, far = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
-    ends = [np.minimum(np.maximum(column + k, 0), last) for k in (-far, -near, near, far)]
+    ends = [np.minimum(np.maximum(column + k, 0), last) for k in (-_FAR, -_NEAR, _NEAR, _FAR)]
     a, b, c, d = (running[row + end] for end in ends)
     total = (b - a) + (d - c)
     count = (ends[1] - ends[0]) + (ends[3] - ends[2])
     return np.sqrt(np.maximum(total, 0.0) / np.maximum(count, 1))
 
 
-def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
-    """(e,) standard deviation of each edge's position, in widths of the edge, where its bright side is cut off."""
-    edges = len(prediction.line_origin)
-    if not candidates.cut_off.any():
-        return np.zeros(edges)
-    edge = prediction.layout.edge[candidates.sample]
-    # High steps are the outline's, low ones texture beside it.
-    energy = candidates.step**2
-    total = np.bincount(edge, energy, edges)
-    return SPREAD * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
-
-
-def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:
+def estimate_noise(profiles: Array, quantum: float = 1.0) -> float:
     """Standard deviation of the noise of a pixel, averaged as the profiles (n, s) are, from their quiet parts, grey
     levels.
 
@@ -223,12 +276,102 @@ def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float
     the lowest tenth is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29
     of it.
     """
-    whole = profiles[::3, ::2]
-    third = np.abs(whole[:, 3:] - whole[:, :-3] - 3.0 * (whole[:, 2:-1] - whole[:, 1:-2])).ravel()
-    floor = quantum / math.sqrt(12.0)
-    if not third.size:
-        return floor
-    tenth = float(np.partition(third, third.size // 10)[third.size // 10])
+    tenth = (profile_kernel.low_third_difference if COMPILES else low_third_difference)(profiles)
     # Of a normal distribution a tenth lies within 0.1257 sigma; a third difference of white noise has variance 20,
     # of which cubic interpolation at a random phase leaves 0.64 along the profile.
-    return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64)), floor)
+    return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64)), quantum / math.sqrt(12.0))
+
+
+def low_third_difference(profiles: Array) -> float:
+    """The tenth of third differences of every third profile; zero without any."""
+    whole = profiles[::3, ::2]
+    third = np.abs(whole[:, 3:] - whole[:, :-3] - 3.0 * (whole[:, 2:-1] - whole[:, 1:-2])).ravel()
+    return float(np.partition(third, third.size // 10)[third.size // 10]) if third.size else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Votes:
+    """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
+    ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
+
+    ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
+    prefer other edges.
+    """
+
+    candidates: Candidates
+    prediction: Prediction
+    weight: Array
+    edge_spread_px: Array
+    cut_off_px: Array
+
+
+def weigh(
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
+) -> Votes:
+    """The candidates as votes; ``polarity`` (e,) belongs to the gripper's edges."""
+    if not COMPILES:
+        return weigh_with_numpy(candidates, prediction, polarity, settings)
+    worth = profile_kernel.worth(
+        candidates.sample,
+        candidates.step,
+        candidates.sigma_px,
+        candidates.width_px,
+        candidates.cut_off,
+        prediction.layout.edge,
+        polarity,
+        prediction.bevel_px,
+        settings.point_floor_px,
+        settings.edge_floor_px,
+    )
+    return Votes(candidates, prediction, *worth)
+
+
+def weigh_with_numpy(
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
+) -> Votes:
+    """:func:`weigh` where nothing compiles, and what the compiled one is held against."""
+    # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
+    width_px = max(median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
+    return Votes(
+        candidates,
+        prediction,
+        base_weights(candidates, prediction, polarity, settings),
+        np.hypot(prediction.bevel_px, settings.edge_floor_px * width_px),
+        width_px * cut_off_spread(candidates, prediction),
+    )
+
+
+def base_weights(
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
+) -> Array:
+    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees."""
+    edge = prediction.layout.edge[candidates.sample]
+    weight = 1.0 / (candidates.sigma_px**2 + settings.point_floor_px**2)
+    wanted = polarity[edge]
+    weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
+    return weight
+
+
+def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
+    """(e,) standard deviation of each edge's position, in widths of the edge, where its bright side is cut off."""
+    edges = len(prediction.line_origin)
+    edge = prediction.layout.edge[candidates.sample]
+    # High steps are the outline's, low ones texture beside it.
+    energy = candidates.step**2
+    total = np.bincount(edge, energy, edges)
+    return SPREAD * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
+
+
+def usual_width_px(candidates: Candidates, weight: Array) -> tuple[int, float]:
+    """How many candidates have a ``weight`` (k,), and the median width of these, px; 0 without any."""
+    if COMPILES:
+        count, width_px = profile_kernel.usual_width(candidates.width_px, weight)
+        return count, width_px
+    widths_px = candidates.width_px[weight > 0.0]
+    return len(widths_px), median(widths_px) if len(widths_px) else 0.0
+
+
+def median(values: Array) -> float:
+    """The upper one of two middle values; NumPy's own checks for NaN take longer than the rest."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])

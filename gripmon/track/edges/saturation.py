@@ -11,23 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-
-CUT_OFF = 0.998
-"""Share of an image's range from which grey levels count as cut off: 254.5 of 255."""
-
-SPREAD = 0.58
-"""Root mean square shift in widths of the edge response, if anything from none to a whole one is equally likely: a step
-of twice to five times the visible height is found 0.5 to 1 of them too far on the dark side.
-"""
-
-SURELY, HARDLY = 1.1, 1.6
-"""Way from an edge to the end of the range, in widths of the edge response: a step that is cut off at nine tenths of
-its height or less gets there within the first, one that just reaches it not before the second.
-"""
+from gripmon.track.edges.profile_kernel import CUT_OFF, HARDLY, SURELY
 
 
 def doubt(
-    profiles: NDArray[np.float32],
+    profiles: Array,
     sample: NDArray[np.intp],
     place: Array,
     side: NDArray[np.intp],

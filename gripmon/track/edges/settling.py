@@ -5,13 +5,14 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
 from gripmon.model.camera import Camera
+from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Image
@@ -20,10 +21,8 @@ from gripmon.track.edges.consensus import (
     Consensus,
     ConsensusSettings,
     Prior,
-    Votes,
     agree,
     agree_on_seen,
-    base_weights,
     prior_information,
 )
 from gripmon.track.edges.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
@@ -31,13 +30,15 @@ from gripmon.track.edges.prediction import EdgeLayout, Prediction, SamplingSetti
 from gripmon.track.edges.profiles import (
     Candidates,
     EdgeSettings,
-    cut_off_spread,
+    Votes,
     estimate_noise,
     find_candidates,
     full_scale,
     profile_offsets_px,
     quantum,
     read_profiles,
+    usual_width_px,
+    weigh,
 )
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.taught import TaughtEdges
@@ -90,6 +91,8 @@ class Measurement:
     ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far
     as it is known without the image.
 
+    ``blur_px``: standard deviation across the edges that agreed, None with few of them.
+
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
@@ -107,6 +110,7 @@ class Measurement:
     normal: NormalEquations
     jaw_known_m: float
     jaw_known_sigma_m: float
+    blur_px: float | None
     trusted: bool = False
     looked_far: bool = False
 
@@ -120,16 +124,37 @@ class Measurement:
         """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without
         corners.
         """
-        usable = self.corners.usable
-        count = int(np.count_nonzero(usable))
-        if not count:
-            return None
-        prediction = self.prediction
-        turn = cam_T_grip[:3, :3] @ prediction.cam_T_grip[:3, :3].T
-        points = (self.corners_at(self.jaw_opening_m) - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
-        miss_xy = self.corners.xy - points[:, :2] / points[:, 2:]
-        miss_px = (prediction.corners.d_uv_d_xy @ miss_xy[..., None])[usable]
-        return math.sqrt(float(np.vdot(miss_px, miss_px)) / count)
+        prediction, corners = self.prediction, self.corners
+        rms_px = corner_rms(
+            corners.xy,
+            corners.usable,
+            self.corners_at(self.jaw_opening_m),
+            prediction.cam_T_grip,
+            cam_T_grip,
+            prediction.corners.d_uv_d_xy,
+        )
+        return None if math.isnan(rms_px) else rms_px
+
+
+@compiled
+def corner_rms(xy: Any, usable: Any, points_m: Any, predicted_T: Any, cam_T_grip: Any, lens: Any) -> float:
+    """Of corners ``points_m`` (c, 3) that move from one pose to the other, against ``xy``; NaN without usable ones."""
+    squares, count, place = 0.0, 0, np.empty(3)
+    for c in range(len(usable)):
+        if not usable[c]:
+            continue
+        count += 1
+        for i in range(3):
+            place[i] = cam_T_grip[i, 3]
+            for j in range(3):
+                lever = 0.0  # along the axis j of the gripper
+                for k in range(3):
+                    lever += predicted_T[k, j] * (points_m[c, k] - predicted_T[k, 3])
+                place[i] += cam_T_grip[i, j] * lever
+        miss_x, miss_y = xy[c, 0] - place[0] / place[2], xy[c, 1] - place[1] / place[2]
+        for i in range(2):
+            squares += (lens[c, i, 0] * miss_x + lens[c, i, 1] * miss_y) ** 2
+    return math.sqrt(squares / count) if count else math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +201,7 @@ class Settler:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
         most.
         """
-        settings = self._settings
+        settings, moved = self._settings, None
         for _ in range(3):
             prediction, start = self._predicted(expected)
             votes = self._look(image, prediction)
@@ -190,17 +215,19 @@ class Settler:
                 # Nothing was seen out there: the few points that agree don't determine the motion.
                 consensus = replace(consensus, share=0.0)
                 break
-            expected = self._moved(prediction, consensus.xi, expected)
+            expected, moved = self._moved(prediction, consensus.xi, expected), consensus
             if moved_px <= settings.relinearise_px:
                 break
-        prior = self._prior_about(prediction, replace(expected, held_T=None))
+        if expected.held_T is not None:
+            prior = self._prior_about(prediction, replace(expected, held_T=None))
         votes, consensus = agree_on_seen(votes, prior, consensus, settings.consensus)
         uncertainty = self._assess(votes, consensus)
         if uncertainty.contradiction > CONTRADICTION:
             found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
             if found is not None:
                 votes, consensus, uncertainty = found
-        expected = self._moved(prediction, consensus.xi, expected)
+        if consensus is not moved:
+            expected = self._moved(prediction, consensus.xi, expected)
         corners = intersect_edges(votes, consensus, uncertainty.line_weight, self._geometry, settings.corners)
         return Measurement(
             prediction,
@@ -216,19 +243,25 @@ class Settler:
             uncertainty.normal,
             expected.jaw_reported_m,
             float(self._prior[6] ** -0.5) if len(self._prior) == 7 else 0.0,
+            self._blur_px(votes.candidates, consensus.weight),
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:
         """The zoom for the next frame: by how blurred the edges are that agreed."""
-        widths_px = measurement.candidates.width_px[measurement.consensus.weight > 0.0]
-        if len(widths_px) < FEWEST_WIDTHS:
+        blur_px = measurement.blur_px
+        if blur_px is None:
             return self._zoom
-        kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
-        blur_px = math.sqrt(max(median(widths_px) ** 2 - kernel_px**2, 0.0))
         finer, coarser = BLUR_AT_ZOOM
         if blur_px > coarser * self._zoom:
             return min(2 * self._zoom, ZOOMS[-1])
         return max(self._zoom // 2, 1) if blur_px < finer * self._zoom else self._zoom
+
+    def _blur_px(self, candidates: Candidates, weight: Array) -> float | None:
+        count, width_px = usual_width_px(candidates, weight)
+        if count < FEWEST_WIDTHS:
+            return None
+        kernel_px = candidates.zoom * self._settings.edges.blur_px
+        return math.sqrt(max(width_px**2 - kernel_px**2, 0.0))
 
     def _zoom_to(self, zoom: int) -> None:
         if zoom != self._zoom:
@@ -290,12 +323,7 @@ class Settler:
         return self._votes(candidates, prediction)
 
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
-        weights = base_weights(candidates, prediction, self._polarity, self._settings.consensus)
-        # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
-        width_px = max(median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
-        bevel_px = prediction.edge_spread_m * prediction.pixels_per_m
-        spread_px = np.hypot(bevel_px, self._settings.consensus.edge_floor_px * width_px)
-        return Votes(candidates, prediction, weights, spread_px, width_px * cut_off_spread(candidates, prediction))
+        return weigh(candidates, prediction, self._polarity, self._settings.consensus)
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         return assess(votes, consensus, self._prior)
@@ -329,9 +357,3 @@ class Settler:
         jaw_opening_m = prediction.jaw_opening_m + (float(xi[6]) if len(xi) == 7 else 0.0)
         jaw_opening_m = min(max(jaw_opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
         return replace(expected, cam_T_grip=perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m=jaw_opening_m)
-
-
-def median(values: Array) -> float:
-    """The upper one of two middle values; NumPy's own checks for NaN take longer than the rest."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])

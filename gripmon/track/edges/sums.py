@@ -42,5 +42,5 @@ def edge_sums(measurement: Measurement, gripper: Gripper, cam_T_grip: Array, jaw
         sums(weighted) / total[:, None],
         sums(weighted * residual_px[:, None]),
         sums(products),
-        (prediction.edge_spread_m * prediction.pixels_per_m)[edge],
+        prediction.bevel_px[edge],
     )

@@ -8,15 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
-from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
+from gripmon.track.edges import kernel
+from gripmon.track.edges.consensus import (
+    NOT_SOLVED,
+    ROUNDS,
+    Consensus,
+    ConsensusSettings,
+    Prior,
+    agree,
+    agree_with_numpy,
+)
+from gripmon.track.edges.kernel import FEWEST_FREE, SMALLEST_SCATTER
+from gripmon.track.edges.profiles import Votes
 
 CONTRADICTION = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
 
 _EXPLAINED = 1.0 / 3.0
-_SMALLEST_SCATTER = 0.1
-_FEWEST_FREE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +77,39 @@ def assess(
     c and tau² come from the biweight's pulls, which are smaller than the residuals, so that only the edges' spread,
     which is given in px, has to be multiplied by k.  ``expected_shared_px``: at least this much of tau is assumed.
     """
+    if not COMPILES:
+        return assess_with_numpy(votes, consensus, prior_information, expected_shared_px)
+    layout = votes.prediction.layout
+    solved, (covariance, line_weight, shared_px, contradiction), normal = kernel.assess(
+        votes.candidates.sample,
+        consensus.weight,
+        consensus.residual_px,
+        consensus.information,
+        consensus.stiffness,
+        votes.prediction.jacobian,
+        layout.edge,
+        layout.stretch,
+        votes.edge_spread_px,
+        votes.cut_off_px,
+        prior_information,
+        expected_shared_px,
+    )
+    if not solved:
+        raise FloatingPointError(NOT_SOLVED)
+    return Uncertainty(covariance, line_weight, shared_px, contradiction, NormalEquations(*normal))
+
+
+def assess_with_numpy(
+    votes: Votes, consensus: Consensus, prior_information: Array, expected_shared_px: float = 0.0
+) -> Uncertainty:
+    """:func:`assess` where nothing compiles, and what the compiled one is held against."""
     inlier = np.flatnonzero(consensus.weight)
     stiffness = consensus.stiffness
     stiff = stiffness * consensus.information
     stiff.flat[:: len(stiff) + 1] += prior_information
     _, inverse, failed = dposv(stiff, np.eye(len(stiff)))
     if failed:
-        raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
+        raise FloatingPointError(NOT_SOLVED)
     unknowns = len(consensus.xi)
     if not len(inlier):
         nothing = NormalEquations(
@@ -92,7 +128,7 @@ def assess(
     moment = np.add.reduceat(alone * residual_px, first)
     freedom = len(total) - unknowns
     contradiction = _contradiction(total, moment, freedom)
-    scatter, shared = max(min(contradiction, 1.0), _SMALLEST_SCATTER), 0.0
+    scatter, shared = max(min(contradiction, 1.0), SMALLEST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
     shared = max(shared, (stiffness * expected_shared_px) ** 2)
@@ -111,7 +147,7 @@ def assess(
     middles = scatter * worth[seen][:, None, None] * information + shared * by_stretch
     middles += whole[:, :, None] * whole[:, None, :]
     # A scatter that is itself estimated from few stretches makes Student's distribution, with this variance.
-    middles *= freedom / (freedom - 2.0) if freedom >= _FEWEST_FREE else _FEWEST_FREE
+    middles *= freedom / (freedom - 2.0) if freedom >= FEWEST_FREE else FEWEST_FREE
     middle = middles.sum(axis=0)
     middle.flat[:: len(middle) + 1] += prior_information
     covariance = inverse @ middle @ inverse
@@ -129,7 +165,7 @@ def _contradiction(total: Array, moment: Array, freedom: int) -> float:
 
     Above 1 it gives tau² = (contradiction - 1) * stretches / sum of their weights.
     """
-    return float((moment**2 / total).sum()) / freedom if freedom >= _FEWEST_FREE else 1.0
+    return float((moment**2 / total).sum()) / freedom if freedom >= FEWEST_FREE else 1.0
 
 
 def without_one_edge(
@@ -141,13 +177,47 @@ def without_one_edge(
     An edge without contrast that has a straight edge of the background beside it, for example, turns the whole gripper
     towards that, a little at each of its other edges, which are too many to be outliers.
     """
-    edge = votes.prediction.layout.edge[votes.candidates.sample]
-    best: tuple[Votes, Consensus, Uncertainty] | None = None
+    without = contradictions_without if COMPILES else contradictions_without_with_numpy
+    stays = without(votes, prior, start, settings)
+    if not len(stays) or not stays.min() < _EXPLAINED * contradiction:
+        return None
+    rest = _without(votes, int(votes.prediction.layout.edges[stays.argmin()]))
+    consensus = agree(rest, prior, start, settings)
+    return rest, consensus, assess(rest, consensus, prior.information)
+
+
+def contradictions_without(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Array:
+    """(v,) the contradiction that stays in the fit from ``start`` (m,) without each of the sampled edges."""
+    candidates, prediction = votes.candidates, votes.prediction
+    stays: Array = kernel.contradictions_without(
+        prediction.layout.edges,
+        candidates.sample,
+        candidates.offset_px,
+        votes.weight,
+        prediction.jacobian,
+        prediction.layout.edge,
+        prediction.layout.stretch,
+        votes.edge_spread_px,
+        prior.mean,
+        prior.information,
+        start,
+        settings.start_width_px,
+        ROUNDS,
+    )
+    if np.isnan(stays).any():
+        raise FloatingPointError(NOT_SOLVED)
+    return stays
+
+
+def contradictions_without_with_numpy(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Array:
+    """:func:`contradictions_without` where nothing compiles, and what the compiled one is held against."""
+    fits = []
     for left_out in votes.prediction.layout.edges.tolist():
-        weight = np.where(edge == left_out, 0.0, votes.weight)
-        rest = replace(votes, weight=weight)
-        consensus = agree(rest, prior, start, settings)
-        uncertainty = assess(rest, consensus, prior.information)
-        if uncertainty.contradiction < (_EXPLAINED * contradiction if best is None else best[2].contradiction):
-            best = rest, consensus, uncertainty
-    return best
+        rest = _without(votes, left_out)
+        fits.append(assess_with_numpy(rest, agree_with_numpy(rest, prior, start, settings), prior.information))
+    return np.array([fit.contradiction for fit in fits])
+
+
+def _without(votes: Votes, left_out: int) -> Votes:
+    edge = votes.prediction.layout.edge[votes.candidates.sample]
+    return replace(votes, weight=np.where(edge == left_out, 0.0, votes.weight))

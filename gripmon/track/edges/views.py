@@ -1,4 +1,4 @@
-"""What a measurement shows besides its result: pixels for people who look, and how much of each finger agrees."""
+"""What a measurement shows besides its result: pixels for people who look."""
 
 from __future__ import annotations
 
@@ -31,13 +31,3 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
         predicted_edges_uv_px=tuple(line[there] for line, there in zip(lines, finite, strict=True)),
         predicted_corners_uv_px=corners_uv_px,
     )
-
-
-def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
-    """Share of each finger's profiles that agree with the measured pose; 1 for a finger that isn't sampled."""
-    prediction = measurement.prediction
-    finger = gripper.edge_finger[prediction.layout.edge]
-    fingers = len(gripper.finger_ids)
-    agreeing = np.bincount(finger, measurement.consensus.supported, fingers).tolist()
-    sampled = np.bincount(finger, prediction.ok, fingers).tolist()
-    return [a / n if n else 1.0 for a, n in zip(agreeing, sampled, strict=True)]

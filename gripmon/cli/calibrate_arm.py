@@ -1,0 +1,212 @@
+"""``gripmon calibrate laser`` and ``robot-world``: a fixed camera against an arm."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli.common import (
+    REQUIRED,
+    Command,
+    arm_noise,
+    check_outputs,
+    command_line,
+    positive_number,
+    progress_bar,
+    whole_number,
+    write,
+    write_document,
+    write_picture,
+    writing,
+)
+from gripmon.model.errors import InputError
+
+if TYPE_CHECKING:
+    from gripmon.calibrate.documents import RobotWorldCalibration
+    from gripmon.laser.pointer.document import LaserCalibration
+    from gripmon.laser.pointer.planning import Plan
+
+LONGEST_ARM_M = 20.0
+_LASER = """\
+Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
+plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
+row for each spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
+base_T_ee as tx_m, ty_m, tz_m with qx, qy, qz, qw or with rx_rad, ry_rad, rz_rad, or as m00 to m33; in
+YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of three orientations
+or more, better nine, the end-effector is shifted along three directions without turning: ten spots."""
+
+_LASER_OPTIONS = """
+DATA...               table of samples: .csv, .yaml or .json
+--camera CAMERA.yaml  the camera: a file of gripmon calibrate intrinsics
+--out FILE.yaml       file to write
+--picture FILE.png    also a picture of residuals and scene
+--recording FILE.rrd  also the scene as a rerun recording
+--refine-lens         estimate the lens, too, within its calibration's covariance; else it stays as it is, and what its
+                      covariance leaves open is in the result's
+--arm-noise M:RAD     standard deviations of the arm's poses, position (m) and rotation (rad), each axis
+                      (default: none)
+--plan FILE.csv       also write which poses would help the most next; --reach
+--poses N             how many are planned (default 10)
+--reach M             how far the arm reaches (m)
+--force               replace files that are there
+"""
+
+_LASER_EXAMPLES = """\
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --picture laser.png
+  gripmon calibrate laser monday.csv tuesday.csv --camera camera.yaml --out laser.yaml --recording laser.rrd
+  gripmon calibrate laser spots.yaml --camera camera.yaml --refine-lens --arm-noise 0.0001:0.0002 --out laser.yaml
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --plan next.csv --reach 0.85
+
+exit codes: 0 written; 2 wrong usage or files; 3 the spots can't be calibrated from, and why:
+nothing is written then"""
+
+_ROBOT_WORLD = """\
+Calibrate a fixed camera against an arm that holds a target, or with --eye-in-hand a camera on the arm
+against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
+DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
+qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
+or image, from which --camera and --target find it (a charuco board, or a chequerboard with an even and
+an odd number of corners, wholly in view: others don't tell which way up they are).
+Turn the hand about at least two axes; ten poses or more are good."""
+
+_ROBOT_WORLD_OPTIONS = """
+DATA...               table of poses: .csv, .yaml or .json
+--camera CAMERA.yaml  for images: a file of gripmon calibrate intrinsics
+--target TARGET       for images: as in gripmon calibrate intrinsics
+--eye-in-hand         the camera is on the hand, the target stands
+--out FILE.yaml       file to write
+--force               replace files that are there
+"""
+
+_ROBOT_WORLD_EXAMPLES = """\
+  gripmon calibrate robot-world poses.csv --out robot_world.yaml
+  gripmon calibrate robot-world views.csv --camera camera.yaml --target charuco:8x6:0.03:0.022 --out robot_world.yaml
+
+exit codes: 0 written; 2 wrong usage or files; 3 the poses can't be calibrated from, and why:
+nothing is written then"""
+
+
+def _reach(text: str) -> float:
+    value = positive_number(text)
+    if value > LONGEST_ARM_M:
+        raise argparse.ArgumentTypeError(f"{text} m isn't an arm's reach (millimetres?); metres, e.g. 0.85")
+    return value
+
+
+@Command(
+    "laser", "a fixed camera, its plane and a laser pointer on the arm", _LASER, _LASER_OPTIONS, _LASER_EXAMPLES,
+    camera=REQUIRED, out=REQUIRED, arm_noise=arm_noise, reach=_reach,
+    poses={"type": whole_number(1, 200, "isn't a number of poses; 1 to 200"), "default": 10},
+)  # fmt: skip
+def laser(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon calibrate laser``."""
+    from gripmon.daemon.config.calibrated import read_camera
+    from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
+    from gripmon.laser.pointer.samples import plan_table
+    from gripmon.model.provenance import provenance_of
+    from gripmon.record.write.laser_scene import write as write_scene
+
+    check_outputs(arguments, "out", "picture")
+    if arguments.plan is not None and arguments.reach is None:
+        raise InputError("--plan needs --reach: how far the arm reaches; metres")
+    check_outputs(arguments, "recording", "plan")
+    noise = None if arguments.arm_noise is None else PoseNoise(*arguments.arm_noise)
+    found = calibrate_laser(
+        arguments.data, read_camera(arguments.camera), refine_lens=arguments.refine_lens, arm_noise=noise,
+        progress=progress_bar,
+    )  # fmt: skip
+    for line in found.unseen:
+        print(line, file=sys.stderr)
+    planned = None if arguments.plan is None else found.plan(arguments.reach, arguments.poses)
+    inputs = [*arguments.data, arguments.camera, *found.files]
+    written = found.document(provenance_of(command_line(arguments), inputs, SEED))
+    if arguments.picture is not None:
+        write_picture(found.picture(), arguments.picture)
+    if arguments.recording is not None:
+        with writing(arguments.recording, "--recording"):
+            write_scene(arguments.recording, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
+    if planned is not None:
+        write(plan_table(planned), arguments.plan, "--plan")
+    write_document(written, arguments.out)
+    print("\n".join([*_laser_lines(written), *_plan_lines(planned), f"written: {arguments.out}"]))
+
+
+def _plan_lines(planned: Plan | None) -> list[str]:
+    if planned is None:
+        return []
+    now, then = planned.sigmas[0], planned.sigmas[-1]
+    turn = f"rotation to {math.degrees(now[1]):.3f} deg, then {math.degrees(then[1]):.3f} deg"
+    more = f"after {len(planned.uv_px)} more to {1e3 * then[0]:.2f} mm"
+    return [f"camera's position known to {1e3 * now[0]:.2f} mm, {more}; {turn}"]
+
+
+def _laser_lines(written: LaserCalibration) -> list[str]:
+    residuals, sigmas = written.residuals, written.sigmas
+
+    def shown(values: Any, keys: list[str]) -> str:
+        return ", ".join(f"{1e3 * v:.2f} ± {1e3 * sigmas[k]:.2f}" for v, k in zip(values, keys, strict=True))
+
+    def turned(keys: list[str]) -> str:
+        return "± " + ", ± ".join(f"{math.degrees(sigmas[key]):.3f}" for key in keys) + " deg"
+
+    position = [f"base_T_cam.{axis}_m" for axis in "xyz"]
+    spots = f"{residuals.used} of {residuals.spots} spots at {residuals.orientations} orientations"
+    return [
+        f"{spots}, RMS {residuals.rms_px:.3f} px; seed {written.provenance.seed}",
+        *(f"  left out: {name}" for name in residuals.outliers),
+        *(f"  {line}" for line in written.warnings),
+        f"camera in the base   {shown(written.base_T_cam.translation_m, position)} mm",
+        f"camera's rotation    {turned([f'base_T_cam.r{axis}_rad' for axis in 'xyz'])}",
+        f"plane from camera    {shown([written.plane.distance_cam_m], ['plane.distance_m'])} mm",
+        f"plane and beam tilt  {turned([f'{what}_rad' for what in _TILTS])}",
+    ]
+
+
+_TILTS = ("plane.tilt_a", "plane.tilt_b", "laser.turn_a", "laser.turn_b")
+
+
+@Command(
+    "robot-world", "camera and arm, from poses of a target on the hand", _ROBOT_WORLD, _ROBOT_WORLD_OPTIONS,
+    _ROBOT_WORLD_EXAMPLES, out=REQUIRED,
+)  # fmt: skip
+def robot_world(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon calibrate robot-world``."""
+    from gripmon.calibrate.api import calibrate_robot_world
+    from gripmon.calibrate.arm_poses import read_arm_poses
+    from gripmon.calibrate.documents import robot_world_document
+    from gripmon.daemon.calibrations import read_given_camera, target_of
+    from gripmon.model.provenance import provenance_of
+
+    check_outputs(arguments, "out")
+    target = None if arguments.target is None else target_of(arguments.target)
+    camera = None if arguments.camera is None else read_given_camera(arguments.camera).lens
+    poses = read_arm_poses(arguments.data, camera, target, progress_bar)
+    for line in poses.unseen:
+        print(line, file=sys.stderr)
+    found = calibrate_robot_world(
+        poses.base_T_ee, poses.cam_T_target, poses.covariance, eye_in_hand=arguments.eye_in_hand
+    )
+    inputs = [*arguments.data, *([arguments.camera, *poses.images] if poses.images else [])]
+    provenance = provenance_of(command_line(arguments), inputs)
+    written = robot_world_document(found, poses.names, provenance, eye_in_hand=arguments.eye_in_hand)
+    write_document(written, arguments.out)
+    print("\n".join([*_robot_world_lines(written), f"written: {arguments.out}"]))
+
+
+def _robot_world_lines(written: RobotWorldCalibration) -> list[str]:
+    residuals, sigmas = written.residuals, written.sigmas
+    rms = f"RMS {1e3 * residuals.rms_m:.3f} mm and {math.degrees(residuals.rms_rad):.4f} deg each axis"
+    lines = [
+        f"{residuals.used} of {residuals.poses} poses, {rms}",
+        *(f"  left out: {name}" for name in residuals.outliers),
+    ]
+    for name, transform in list(written.transforms.items())[:2]:
+        shown = ", ".join(
+            f"{1e3 * value:.2f} ± {1e3 * sigmas[f'{name}.{axis}_m']:.2f}"
+            for value, axis in zip(transform.translation_m, "xyz", strict=True)
+        )
+        turned = ", ".join(f"± {math.degrees(sigmas[f'{name}.r{axis}_rad']):.3f}" for axis in "xyz")
+        lines.append(f"{name:14s} {shown} mm; {turned} deg")
+    return lines

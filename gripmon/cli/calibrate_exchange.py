@@ -1,0 +1,169 @@
+"""``gripmon calibrate import`` and ``export``: calibrations of other programs, and for them."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from typing import TYPE_CHECKING
+
+from gripmon.cli.common import REQUIRED, Command, check_outputs, command_line, refuse_without, write, write_document
+from gripmon.model.errors import InputError
+
+if TYPE_CHECKING:
+    from gripmon.calibrate.verify import Calibrated
+
+CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
+HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
+_FRAMES = {
+    "gripper_frame": "gripper_tcp",
+    "camera_frame": "camera_optical_frame",
+    "robot_base_frame": "base_link",
+    "tracking_marker_frame": "calibration_plate",
+}
+
+_IMPORT = """\
+Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
+FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content."""
+
+_IMPORT_OPTIONS = """
+FILE                file of the other program
+--format            its format (default: recognised by its content)
+--camera CAM        which camera of a camchain, e.g. cam1 (default: the only one)
+--size WIDTHxHEIGHT
+                    image size (px), of an OpenCV file that doesn't say it
+--fisheye           the four coefficients of an OpenCV file are cv2.fisheye's; without fisheye_model it doesn't say so
+--out FILE.yaml     file to write
+--force             replace the file if there is one
+"""
+
+_IMPORT_EXAMPLES = """\
+  gripmon calibrate import camera_info.yaml --out camera.yaml
+  gripmon calibrate import camchain.yaml --camera cam1 --out camera.yaml
+  gripmon calibrate import intrinsics.xml --size 1280x960 --out camera.yaml
+
+exit codes: 0 written; 2 wrong usage or files: nothing is written then"""
+
+_EXPORT = """\
+Write a camera as ROS camera_info, Kalibr camchain, OpenCV FileStorage or mrcal .cameramodel, or a
+hand/eye transform as a tf2 static transform command, a URDF joint with its origin, an easy_handeye2
+file or JSON.  CALIBRATION is a file of gripmon calibrate, a configuration, a monitor's state file
+(its reference in force) or estimates.jsonl (the last valid one).
+
+A hand/eye transform is written as the camera's pose in the gripper's frame (origin at the TCP, x
+across the jaws, z out of the gripper), as a robot's tree runs; --gripper-in-camera turns it round."""
+
+_EXPORT_OPTIONS = """
+CALIBRATION  file with the calibration
+--format     what to write
+--out FILE   file to write (default: to the terminal)
+--force      replace the file if there is one
+--name NAME  the camera's name, or the calibration's in easy_handeye2 (default: gripmon)
+--fit        cameras: if the format lacks this lens, write the nearest Brown-Conrady and print how far off it is
+"""
+
+_EXPORT_FRAMES = """
+--gripper-frame NAME          the gripper's, at the TCP (default: gripper_tcp)
+--camera-frame NAME           the camera's optical frame (default: camera_optical_frame)
+--robot-base-frame NAME       in an easy_handeye2 file (default: base_link)
+--tracking-marker-frame NAME  in an easy_handeye2 file (default: calibration_plate)
+--gripper-in-camera           the gripper below the camera instead of the reverse
+"""
+
+_EXPORT_EXAMPLES = """\
+  gripmon calibrate export camera.yaml --format ros --name wrist --out wrist.yaml
+  gripmon calibrate export camera.yaml --format opencv --out camera.xml
+  gripmon calibrate export hand_eye.yaml --format ros-static --gripper-frame tool0 --camera-frame wrist_optical_frame
+  gripmon calibrate export hand_eye.yaml --format urdf --out wrist_joint.xml
+  gripmon calibrate export ~/.local/state/gripmon/arm-wrist.json --format json
+
+exit codes: 0 written; 2 wrong usage or files, or a lens that the format hasn't: nothing is written then"""
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"'{text}' isn't an image size; e.g. 1280x960")
+    return int(match[1]), int(match[2])
+
+
+def _name(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", text):
+        raise argparse.ArgumentTypeError(f"{text}: isn't a plain name; letters, digits, _ . and -")
+    return text
+
+
+@Command(
+    "import", "a camera from a file of ROS, Kalibr, OpenCV or mrcal", _IMPORT, _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
+    format={"choices": CAMERA_FORMATS}, size=_size, fisheye={"default": None}, out=REQUIRED,
+)  # fmt: skip
+def import_(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon calibrate import``."""
+    from gripmon.calibrate.interchange.cameras import ReadOptions
+    from gripmon.daemon.calibrations import import_camera
+
+    check_outputs(arguments, "out")
+    options = ReadOptions(arguments.camera, arguments.size, arguments.fisheye)
+    kind, found = import_camera(arguments.file, arguments.format, options, command_line(arguments))
+    write_document(found, arguments.out)
+    camera = found.camera
+    lens = camera.__struct_config__.tag
+    print(f"{kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px")
+    print(f"written: {arguments.out}")
+
+
+@Command(
+    "export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2", _EXPORT, _EXPORT_OPTIONS,
+    _EXPORT_EXAMPLES, {"frames of a hand/eye transform": (None, _EXPORT_FRAMES)},
+    format={"required": True, "choices": (*CAMERA_FORMATS, *HAND_EYE_FORMATS)}, name=_name,
+)  # fmt: skip
+def export(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon calibrate export``."""
+    from gripmon.daemon.calibrations import export_notes, read_calibrated
+
+    check_outputs(arguments, "out")
+    camera = arguments.format in CAMERA_FORMATS
+    # An option that would do nothing was meant for something.
+    unused = (*_FRAMES, "gripper_in_camera") if camera else ("fit",)
+    if not camera and arguments.format != "easy_handeye2":
+        unused += ("robot_base_frame", "tracking_marker_frame")
+    refuse_without(arguments, unused, f"has no meaning with --format {arguments.format}; leave it out")
+    source = read_calibrated(arguments.calibration)
+    notes = export_notes(source, command_line(arguments), with_pose=not camera)
+    data = (_camera if camera else _hand_eye)(source, notes, arguments)
+    if arguments.out is None:
+        sys.stdout.write(data.decode())
+    else:
+        write(data, arguments.out)
+        print(f"written: {arguments.out}")
+
+
+def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
+    from gripmon.calibrate.interchange.cameras import write_camera
+
+    if source.lens is None:
+        right = "a camera calibration, a hand/eye calibration or a configuration"
+        raise InputError(f"{source.name}: is {source.kind} without a camera; {right}")
+    suffix = "" if arguments.out is None else arguments.out.suffix
+    name = arguments.name or "gripmon"
+    exported = write_camera(
+        source.lens, arguments.format, notes, name=name, file=source.name, suffix=suffix, fit=arguments.fit
+    )
+    for warning in exported.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    return exported.data
+
+
+def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
+    from gripmon.calibrate.interchange.hand_eye import HandEye, write_hand_eye
+
+    if source.cam_T_grip is None:
+        right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
+        raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
+    frames = {key: getattr(arguments, key) or default for key, default in _FRAMES.items()}
+    turned, name = arguments.gripper_in_camera, arguments.name or "gripmon"
+    try:
+        hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=turned, name=name, **frames)
+        return write_hand_eye(hand_eye, arguments.format, notes).encode()
+    except ValueError as error:
+        raise InputError(f"calibrate export: {error}") from None

@@ -1,0 +1,180 @@
+"""What belongs to the network: ``gripmon feed``, ``router`` and ``schema``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+import time
+
+from gripmon.cli.common import (
+    NETWORK_OPTIONS,
+    REQUIRED,
+    Command,
+    network_errors,
+    network_of,
+    positive_number,
+    whole_number,
+)
+from gripmon.model.errors import InputError
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
+
+_MESSAGES = (
+    "transform", "state", "alert", "reference", "clock", "jaw", "frame", "pulse", "spot", "command", "reply", "error",
+)  # fmt: skip
+
+_FEED = """\
+Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
+configuration says source: {kind: zenoh}.  For trying things out, and as an example of a driver:
+docs/howto/network_camera.md says what is on the wire."""
+
+_FEED_OPTIONS = f"""
+SOURCE             a folder of images, a video file, or a camera (0, /dev/…, URL)
+--robot NAME       the robot's name in the Zenoh keys
+--camera NAME      the camera's name there (default wrist)
+--key KEY          another key than gripmon/<robot>/<camera>/image
+{NETWORK_OPTIONS.format("the monitor's").strip()}
+--format           how (default raw)
+--quality Q        of JPEG, 1 to 100 (default 90)
+--fps HZ           frames a second; default: as the input's stamps say
+--loop             begin again at the end, until interrupted
+--recorded-stamps  send the input's time stamps instead of the time of sending
+"""
+
+_FEED_EXAMPLES = """\
+  gripmon feed images/ --robot arm1
+  gripmon feed wrist.mp4 --robot arm1 --format jpeg --loop
+  gripmon feed /dev/video0 --robot arm1 --connect tcp/192.168.1.2:7447
+  gripmon feed images/ --robot arm1 --zenoh-config mine/zenoh/robot.json5    docs/howto/security.md
+
+exit codes: 0 the images are at their end; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
+
+_ROUTER = """\
+Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
+
+FILE is a configuration of Zenoh's (json5 or yaml); zenohd, Zenoh's own router, takes the same one.
+Paths of certificates in it count from its folder. A router that is to connect to another one tries
+again for ever, and says so."""
+
+_ROUTER_EXAMPLES = """\
+  gripmon certificates --out certificates              once: keys for everyone
+  gripmon router configs/zenoh/router.json5            mutual TLS, and who may do what
+  gripmon router configs/zenoh/local.json5             without security, on this machine alone
+
+exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""
+
+_SCHEMA = """\
+Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames
+and when they are null.
+
+Every message says its own schema and that one's major version: "schema": "gripmon.transform/1".  Within
+a major version fields and names may be added, and nothing else changes."""
+
+_SCHEMA_EXAMPLES = """\
+  gripmon schema --list
+  gripmon schema transform > transform.schema.json
+  gripmon schema                                      any message
+
+exit codes: 0 done; 2 wrong usage"""
+
+_LOOK_EVERY_S = 1.0
+
+
+@Command(
+    "feed", "publish images over Zenoh, as a camera's driver does", _FEED, _FEED_OPTIONS, _FEED_EXAMPLES,
+    robot=REQUIRED, camera={"default": "wrist"}, format={"choices": ("raw", "jpeg", "png"), "default": "raw"},
+    quality={"type": whole_number(1, 100, "isn't a quality; a whole number, 1 to 100"), "default": 90},
+    fps=positive_number,
+)  # fmt: skip
+def feed(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon feed``."""
+    from gripmon.io.publish.feeding import Feeder
+    from gripmon.io.sources import SourceError, open_source, settings_for_text
+    from gripmon.io.wire import Keys, Link, PublishSettings
+    from gripmon.io.wire.settings import check_key
+
+    joined = network_of(arguments)
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
+    try:
+        settings = settings_for_text(arguments.source, arguments.fps)
+        sources = [open_source(settings)]  # before anything is sent: what can't be opened is reported at once
+    except SourceError as error:
+        raise InputError(f"feed: {arguments.source}: {error}") from None
+    try:
+        with network_errors(arguments):
+            own = Keys(arguments.robot, arguments.camera)["image"]
+            key = own if arguments.key is None else check_key(arguments.key)
+            if (file := joined["zenoh_config_file"]) is not None:
+                link = Link(PublishSettings(zenoh_config=file))
+            else:
+                link = Link(PublishSettings(mode="client", connect=tuple(joined["connect"])))
+    except ValueError as error:
+        sources.pop().close()
+        raise error if isinstance(error, InputError) else InputError(f"feed: {error}") from None
+    feeder = Feeder(
+        link, key, arguments.format, jpeg_quality=arguments.quality, recorded_stamps=arguments.recorded_stamps
+    )
+    try:
+        feeder.run(lambda: sources.pop() if sources else open_source(settings), fps=arguments.fps, loop=arguments.loop)
+    finally:
+        for source in sources:
+            source.close()
+        link.close()
+        unsent = f", {feeder.unsent} not ({feeder.reason})" if feeder.unsent else ""
+        print(f"feed: {feeder.sent} frames sent on {key}{unsent}", file=sys.stderr)
+    return EXIT_DONE if feeder.sent else EXIT_FAILED
+
+
+@Command(
+    "router", "a Zenoh router between monitors and their readers", _ROUTER,
+    "FILE  Zenoh's configuration (json5, yaml)", _ROUTER_EXAMPLES,
+)  # fmt: skip
+def router(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon router``: say whom it misses, until a signal ends it."""
+    from gripmon.io.wire import Router, ZenohFileError
+
+    with signals_exit():
+        try:
+            opened = Router(arguments.file)
+        except ZenohFileError as error:
+            raise InputError(f"router: {error}") from None
+        with opened:
+            try:
+                _say(f"listening on {', '.join(opened.listens_on)}")
+                known = ""
+                while True:
+                    time.sleep(_LOOK_EVERY_S)
+                    if (fault := opened.fault()) != known:
+                        _say(fault or "connected")
+                        known = fault
+            finally:
+                _say("stopped")
+
+
+def _say(text: str) -> None:
+    print(f"router: {text}", file=sys.stderr, flush=True)
+
+
+_SCHEMA_OPTIONS = f"""
+[MESSAGE]  {", ".join(_MESSAGES)}
+--list     print name, schema and content of every message
+"""
+
+
+@Command(
+    "schema", "print the JSON Schema of the messages", _SCHEMA, _SCHEMA_OPTIONS, _SCHEMA_EXAMPLES,
+    message={"choices": _MESSAGES},
+)  # fmt: skip
+def schema(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon schema``."""
+    from gripmon.model.records import MESSAGES, json_schema, schema_name, summary
+
+    if arguments.list and arguments.message:
+        raise InputError(f"schema: --list is about all messages, but {arguments.message} is given; one of them")
+    names = tuple(MESSAGES) if arguments.message is None else (arguments.message,)
+    if arguments.list:
+        for name in names:
+            print(f"{name:10} {schema_name(MESSAGES[name]):20} {summary(name)}")
+    else:
+        print(json.dumps(json_schema(names), indent=2, ensure_ascii=False))

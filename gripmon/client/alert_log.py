@@ -1,0 +1,107 @@
+"""Every alert of every monitor, and who came and vanished: each once, in one file of JSON lines."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from gripmon.client.names import MonitorName
+from gripmon.client.status import MonitorStatus
+from gripmon.model.records import AlertRecord
+
+_WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost
+_LOOK_BACK_BYTES = 16 << 20
+
+
+class Event(NamedTuple):
+    """``line``: as it stands in the file, JSON; ``alert`` None: the monitor came or vanished, ``what`` says which."""
+
+    line: bytes
+    name: MonitorName
+    stamp_ns: int
+    what: str
+    alert: AlertRecord | None
+
+
+class AlertLog:
+    """Takes events in any thread (:class:`gripmon.client.Fleet` calls back); :meth:`write`, in one, puts them to the
+    end of the file.
+
+    The file is opened for every write, so that it may be moved away and a disk may be full for a while.  What stands
+    in its last 16 MiB already is not written again: a monitor repeats its last alerts to whoever comes later.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        """Raises OSError if the file is there and can't be read."""
+        self._path = path
+        self._lock = threading.Lock()  # guards the next one against the threads that bring events
+        self._new: deque[Event] = deque(maxlen=_WAITING_MOST)
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING_MOST)
+        self._failure = ""
+        self._written = set() if path is None or not path.is_file() else set(_last_lines(path))
+
+    def alert(self, name: MonitorName, record: AlertRecord, payload: bytes) -> None:
+        """An alert came, in this payload, JSON."""
+        line = msgspec.json.format(payload, indent=-1)
+        what = f"{record.kind} {record.event}" if record.alert_id else str(record.kind)
+        self._add(Event(line, name, record.stamp_ns, what, record))
+
+    def presence(self, status: MonitorStatus) -> None:
+        """A monitor has come or vanished, of which it can't tell itself."""
+        stamp_ns = status.gone_since_ns or time.time_ns()
+        what = "appeared" if status.gone_since_ns is None else "vanished"
+        (robot, camera), schema = status.name, "gripmon.presence/1"
+        values = {"schema": schema, "robot": robot, "camera": camera, "stamp_ns": stamp_ns, "event": what}
+        self._add(Event(msgspec.json.encode(values), status.name, stamp_ns, what, None))
+
+    def write(self) -> tuple[list[Event], str]:
+        """Append all that has come since; those events, and why the file can't be written: tried again the next time,
+        and empty if it can or if that was said before.
+        """
+        with self._lock:
+            new, self._new = list(self._new), deque(maxlen=_WAITING_MOST)
+        if self._path is None:
+            return new, ""
+        self._waiting.extend(event.line for event in new)
+        failure = ""
+        try:
+            if self._waiting:
+                _append(self._path, b"".join(line + b"\n" for line in self._waiting))
+            self._waiting.clear()
+        except OSError as error:
+            failure = error.strerror or str(error)
+        known, self._failure = self._failure, failure
+        return new, failure if failure != known else ""
+
+    def _add(self, event: Event) -> None:
+        with self._lock:
+            if event.line not in self._written:
+                self._new.append(event)
+
+
+def _append(path: Path, data: bytes) -> None:
+    """All of it or nothing, on lines of its own."""
+    with path.open("a+b", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        if size:
+            file.seek(-1, os.SEEK_END)
+            data = data if file.read(1) == b"\n" else b"\n" + data  # whoever wrote last was stopped in a line
+        try:
+            written = 0
+            while written < len(data):
+                written += file.write(data[written:]) or 0
+        except OSError:
+            file.truncate(size)
+            raise
+
+
+def _last_lines(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _LOOK_BACK_BYTES))
+        return file.read().split(b"\n")

@@ -1,0 +1,326 @@
+"""What is simulated: images with the truth beside them, and the whole daemon on a simulated wrist camera."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import shlex
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+import numpy as np
+
+from gripmon import __version__
+from gripmon.analyse.comparison import Comparison, compare
+from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
+from gripmon.daemon.config.yaml_file import lines_of, yaml_value
+from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
+from gripmon.model.atomic import writable_folder
+from gripmon.model.errors import InputError
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, FrameRecord
+from gripmon.model.stopping import StopRequest
+from gripmon.model.targets import name_of
+from gripmon.record.write.viewer import free_port
+from gripmon.simulate import (
+    CALIBRATION_KINDS,
+    SCENARIO_NAMES,
+    Rig,
+    Scenario,
+    Simulator,
+    image_count,
+    make_scenario,
+    write_calibration_images,
+    write_sequence,
+)
+from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
+
+if TYPE_CHECKING:
+    from gripmon.client import Client
+
+_ZENOH_PORT = 7447
+_CONNECT_S = 5.0
+_TRACKING = ("tracking", "drifting")
+
+
+class SimulatedImages(NamedTuple):
+    """The folder, a configuration that fits (None where calibrations come first), and how many images there are."""
+
+    folder: Path
+    config: Path | None
+    frames: int
+
+
+def simulate_images(
+    scenario: str | Path,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    seed: int = 0,
+    duration_s: float | None = None,
+    fps: float | None = None,
+    step: Callable[[int, int], None] = lambda _done, _total: None,
+) -> SimulatedImages:
+    """Write one PNG a frame, ``timestamps.csv``, ``truth.jsonl`` (:class:`gripmon.simulate.FrameTruth`) and
+    ``config.yaml`` with ``gripper.yaml`` to a new or empty folder.
+
+    ``scenario`` is a built-in name (:data:`gripmon.simulate.SCENARIO_NAMES`), which ``duration_s`` (s) and ``fps``
+    (1/s) stretch, or a YAML file; or what a calibration starts from (:data:`gripmon.simulate.CALIBRATION_KINDS`):
+    single images with ``truth.json``.  "work" and these come without a configuration: the calibrations make it.
+    ``config`` has camera, gripper and calibration; None: those of the demo.  ``step`` is called after each image with
+    how many are done, of how many.  The same seed gives the same images.
+
+    Raises :class:`InputError`: an unknown scenario, one that doesn't fit the configuration, a folder that isn't empty.
+    """
+    out = Path(out)
+    config = load_config(builtin_config("demo.yaml"), check_source=False) if config is None else config
+    if scenario in CALIBRATION_KINDS:
+        if (duration_s, fps) != (None, None):
+            raise InputError(f"simulate: {scenario} is single images; neither --seconds nor --fps")
+        return _calibration_images(str(scenario), out, config, seed, step)
+    made = _scenario(scenario, config, duration_s, fps)
+    try:
+        simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, made, seed)
+    except ValueError as error:
+        raise InputError(f"{scenario}: {error}") from None
+    _make_empty(out)
+    if scenario == "work":
+        return SimulatedImages(out, None, write_sequence(simulator, out, step))
+    config_path = out / "config.yaml"
+    shutil.copyfile(config.gripper_path, out / "gripper.yaml")
+    config_path.write_text(_config_text(config, made, seed), encoding="utf-8")
+    return SimulatedImages(out, config_path, write_sequence(simulator, out, step))
+
+
+def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: float | None) -> Scenario:
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml"):
+        if duration_s is not None or fps is not None:
+            raise InputError(f"{name}: --seconds and --fps are for built-in scenarios; duration_s and fps in the file")
+        return load_scenario(path)
+    if name not in SCENARIO_NAMES:
+        raise InputError(f"simulate: there is no '{name}'; one of {', '.join((*SCENARIO_NAMES, *CALIBRATION_KINDS))}")
+    try:
+        finger, opening_m = config.gripper.finger_ids[0], _rig(config).jaw_opening_m
+        return make_scenario(str(name), duration_s=duration_s, fps=fps, finger=finger, jaw_opening_m=opening_m)
+    except ValueError as error:
+        raise InputError(f"simulate: {error}") from None
+
+
+def _rig(config: Config) -> Rig:
+    return Rig(config.camera, config.gripper, config.cam_T_grip)
+
+
+def _calibration_images(
+    kind: str, out: Path, config: Config, seed: int, step: Callable[[int, int], None]
+) -> SimulatedImages:
+    _make_empty(out)
+    count, done = image_count(kind), itertools.count(1)
+    try:
+        write_calibration_images(kind, _rig(config), out, seed, lambda: step(next(done), count))
+    except ValueError as error:
+        raise InputError(f"simulate {kind}: {error}") from None
+    return SimulatedImages(out, None, count)
+
+
+def _make_empty(path: Path) -> None:
+    if any(writable_folder(path).iterdir()):
+        raise InputError(f"{path}: is not empty; a new or empty folder", "out")
+
+
+def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
+    """The command that takes these images of ``gripper``."""
+    out = str(made.folder)
+    if made.config is not None:
+        return shlex.join(["gripmon", "replay", out, "--config", str(made.config), "--out", f"{out}.jsonl"])
+    folder = shlex.quote(out)
+    jaw = f"--jaw-range {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g} " if gripper.has_jaw else ""
+    return {
+        "plate": f"gripmon calibrate intrinsics {folder} --target {name_of(PLATE)} --model paper --out camera.yaml",
+        "standing": f"gripmon calibrate plane {folder} --target camera.yaml --camera camera.yaml --corners "
+        f"{folder}/rough.yaml --infer {jaw}--gripper-out gripper.yaml --out hand_eye.yaml",
+        "work": f"gripmon teach {folder}/000000.png --corners standing/rough.yaml --camera camera.yaml "
+        "--gripper gripper.yaml --reference hand_eye.yaml --robot arm1 --out mine",
+        "robot_world": f"gripmon calibrate robot-world {folder}/views.csv --camera camera.yaml --target "
+        f"{name_of(BOARD)} --eye-in-hand --out robot_world.yaml",
+        "spots": f"gripmon calibrate intrinsics {folder}/plate --target {name_of(SECOND_PLATE)} --out second.yaml, "
+        f"then gripmon calibrate laser {folder}/spots.csv --camera second.yaml --out laser.yaml",
+    }[kind]
+
+
+def _config_text(config: Config, scenario: Scenario, seed: int) -> str:
+    """A configuration for the sequence, commented, in the form of the hand-written ones."""
+    reference = config.reference.cam_T_grip
+    jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
+    return f"""\
+# Written by: gripmon simulate {scenario.name} --seed {seed} (gripmon {__version__})
+robot: simulated  # name of the robot in the Zenoh keys
+camera_name: wrist  # name of the camera in the Zenoh keys
+camera:
+{lines_of(config.settings.camera, 2)}
+gripper: gripper.yaml  # path of the gripper file, relative to this file
+reference:
+  cam_T_grip:  # what a perfect calibration gave at the beginning: maps gripper coordinates to camera coordinates
+    translation_m: {yaml_value(reference.translation_m)}  # x, y, z (m)
+    rotation_xyzw: {yaml_value(reference.rotation_xyzw)}  # unit quaternion x, y, z, w
+jaw:
+  source: {jaw}  # the opening comes with each frame (timestamps.csv), or is the nominal one if fixed
+source:
+  kind: folder  # images in a folder
+  path: .  # the folder, relative to this file
+"""
+
+
+class Latency(msgspec.Struct, frozen=True):
+    """From a frame to its published transform (ms); None without frames."""
+
+    median: float | None
+    p99: float | None
+
+
+class DemoSummary(msgspec.Struct, frozen=True):
+    """How the demo went: what ``summary.json`` holds."""
+
+    frames: int
+    frames_dropped: int
+    frames_per_s: float | None
+    transforms_received: int
+    latency_ms: Latency
+    latency_while_tracking_ms: Latency
+    recordings: tuple[str, ...]
+    comparison: Comparison
+
+
+def demo_config(duration_s: float, *, fps: float | None = None, seed: int = 1, viewed: bool = False) -> Config:
+    """The shipped configuration, with the length asked for and ports that are free.
+
+    Raises :class:`InputError` for what no scenario can have.
+    """
+    config = load_config(builtin_config("demo.yaml"), check_source=False)
+    settings = config.settings
+    changes = {"duration_s": duration_s, "ends": True, "seed": seed} | ({} if fps is None else {"fps": fps})
+    try:
+        source = msgspec.convert(msgspec.to_builtins(settings.source) | changes, SimulatedSettings)
+    except msgspec.ValidationError as error:
+        raise InputError(f"demo: {error}") from None
+    publish = msgspec.structs.replace(settings.publish, listen=(f"tcp/127.0.0.1:{free_port(_ZENOH_PORT)}",))
+    view = settings.view
+    if viewed:
+        view = msgspec.structs.replace(view, port=free_port(view.port), web_port=free_port(view.web_port))
+    settings = msgspec.structs.replace(settings, source=source, publish=publish, view=view)
+    return dataclasses.replace(config, settings=settings)
+
+
+class Demo:
+    """One run: a simulated camera, the daemon, and a client on the network that counts what it receives."""
+
+    def __init__(self, config: Config) -> None:
+        """``config`` by :func:`demo_config`.  Raises :class:`InputError` if its scenario can't be."""
+        assert isinstance(config.settings.source, SimulatedSettings), "the shipped demo.yaml has a simulated camera"
+        self._config = config
+        try:
+            self._simulator: Simulator = make_simulator(config.settings.source, config.scene, config.directory)
+        except SourceError as error:
+            raise InputError(f"demo: {error}") from None
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames the scenario has."""
+        return self._simulator.frame_count
+
+    def run(
+        self,
+        out: Path,
+        *,
+        step: Callable[[], None],
+        on_network: Callable[[], object],
+        view: str | None = None,
+        stop: StopRequest | None = None,
+    ) -> tuple[int, DemoSummary | None]:
+        """The daemon's exit code, and the summary, which is also written to ``out``; None if no frame was processed.
+
+        ``step`` is called for each transform that arrives, ``on_network`` when the client has joined; ``stop``: see
+        :func:`gripmon.daemon.starting.run_monitor`.
+        """
+        from gripmon.daemon.starting import run_monitor
+
+        def truth_tcp_m(seq: int) -> tuple[float, float, float]:
+            x, y, z = self._simulator.truth(seq).cam_T_grip[:3, 3].tolist()
+            return x, y, z
+
+        with _Receiver(self._config, step) as receiver:
+
+            def joined() -> None:
+                receiver.connect()
+                on_network()
+
+            code = run_monitor(
+                self._config, out=out, stop=stop, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=joined,
+                view=view,
+            )  # fmt: skip
+        return code, _summarise(out, self._simulator, receiver.count)
+
+
+class _Receiver(AbstractContextManager["_Receiver"]):
+    """A second Zenoh session that counts the transforms that arrive, calling ``step`` for each."""
+
+    def __init__(self, config: Config, step: Callable[[], None]):
+        self.count = 0
+        self._config = config
+        self._step = step
+        self._client: Client | None = None
+
+    def connect(self) -> None:
+        """Join the network and wait until the monitor is seen there."""
+        from gripmon.client import Client
+
+        settings = self._config.settings
+        self._client = Client(settings.robot, settings.camera_name, connect=settings.publish.listen, depth=1024)
+        self._client.on_transform(self._arrived)
+        deadline_s = time.monotonic() + _CONNECT_S
+        while not self._client.alive(timeout_s=0.2) and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+
+    def __exit__(self, *_exception: object) -> None:
+        if self._client is not None:
+            self._client.close()
+
+    def _arrived(self, _record: FrameRecord) -> None:
+        self.count += 1
+        self._step()
+
+
+def _summarise(out: Path, simulator: Simulator, received: int) -> DemoSummary | None:
+    """Compare ``estimates.jsonl`` with the truth, and write ``summary.json``."""
+    estimates = out / "estimates.jsonl"
+    decode = msgspec.json.Decoder(FrameRecord).decode
+    records = [decode(line) for line in estimates.read_bytes().splitlines()] if estimates.exists() else []
+    if not records:
+        return None
+    latencies_ms = 1e-6 * np.array([record.latency_ns for record in records])
+    span_s = 1e-9 * (records[-1].stamp_ns - records[0].stamp_ns)
+    summary = DemoSummary(
+        frames=len(records),
+        frames_dropped=records[-1].seq + 1 - len(records),
+        frames_per_s=(len(records) - 1) / span_s if span_s > 0.0 else None,
+        transforms_received=received,
+        latency_ms=_latency(latencies_ms),
+        latency_while_tracking_ms=_latency(latencies_ms[[r.state in _TRACKING for r in records]]),
+        recordings=tuple(sorted(path.name for path in out.glob("*.rrd"))),
+        comparison=compare(records, simulator.truth),
+    )
+    text = json.dumps(msgspec.to_builtins(summary), indent=2) + "\n"
+    (out / "summary.json").write_text(text, encoding="utf-8")
+    return summary
+
+
+def _latency(latencies_ms: Array) -> Latency:
+    if not latencies_ms.size:
+        return Latency(None, None)
+    return Latency(float(np.median(latencies_ms)), float(np.percentile(latencies_ms, 99.0)))

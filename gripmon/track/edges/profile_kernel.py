@@ -1,0 +1,305 @@
+"""Profiles and edge candidates in machine code: what ``profiles``, ``saturation`` and ``consensus.base_weights`` do
+with NumPy, where each step's reason stands; both are held together by a test.
+
+n profiles of s samples, k candidates, e edges of the gripper.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gripmon.model.compiled import compiled
+
+BLUE, GREEN, RED = 0.114, 0.587, 0.299
+"""Luma weights of ITU-R BT.601."""
+
+SHARPNESS = -0.75
+"""Slope of the interpolating cubic one pixel away: OpenCV's, which keeps steps as steep as they are."""
+
+BEYOND_PX = 3.0
+"""So far outside the image everything is the border's pixel."""
+
+FLAT = 1e-6
+"""Curvature of a peak over its height below which rounding alone makes it one."""
+
+CUT_OFF = 0.998
+"""Share of an image's range from which grey levels count as cut off: 254.5 of 255."""
+
+SURELY, HARDLY = 1.1, 1.6
+"""Way from an edge to the end of the range, in widths of the edge response: a step that is cut off at nine tenths of
+its height or less gets there within the first, one that just reaches it not before the second.
+"""
+
+SPREAD = 0.58
+"""Root mean square shift in widths of the edge response, if anything from none to a whole one is equally likely: a step
+of twice to five times the visible height is found 0.5 to 1 of them too far on the dark side.
+"""
+
+# Indices that are known not to be negative need no look at the array's end.
+_at = np.uintp
+
+
+@compiled
+def read_profiles(image: Any, map_x: Any, map_y: Any) -> Any:
+    """``profiles.read_profiles`` of an image (h, w, 1 or 3) at maps (r, n, s)."""
+    rows, count, samples = map_x.shape
+    profiles = np.empty((count, samples))
+    taps = rows * samples
+    column, row, base = np.empty(taps, np.int32), np.empty(taps, np.int32), np.empty(taps, np.int32)
+    part, grey = np.empty(taps), np.empty(taps)
+    across, down, patch = np.empty((4, taps)), np.empty((4, taps)), np.empty(1024)
+    for n in range(count):
+        _whole_and_part(map_x, n, float(image.shape[1]), column, part)
+        _cubic(part, across)
+        _whole_and_part(map_y, n, float(image.shape[0]), row, part)
+        _cubic(part, down)
+        left, right = _extent(column)
+        top, bottom = _extent(row)
+        width, height = right - left + 4, bottom - top + 4
+        if width * height > len(patch):
+            patch = np.empty(width * height)
+        _cut_out(image, left - 1, top - 1, width, height, patch)
+        for q in range(taps):
+            base[q] = (row[q] - top) * width + (column[q] - left)
+        _interpolate(patch, base, width, across, down, grey)
+        for k in range(samples):
+            total = 0.0
+            for r in range(rows):
+                total += grey[_at(r * samples + k)]
+            profiles[n, k] = total / rows
+    return profiles
+
+
+@compiled
+def _whole_and_part(mapped: Any, n: int, size: float, whole: Any, part: Any) -> None:
+    """Pixel before each sample (r * s,) of profile ``n`` along one axis of the image, and the way on from there."""
+    rows, _, samples = mapped.shape
+    far = size - 1.0 + 2.0 * BEYOND_PX
+    for r in range(rows):
+        for k in range(samples):
+            # Positive numbers are rounded down when their fraction is cut off; what is no number goes to the border.
+            place = float(mapped[_at(r), _at(n), _at(k)]) + BEYOND_PX
+            place = place if place > 0.0 else 0.0
+            place = place if place < far else far
+            pixel = np.int32(place)
+            whole[_at(r * samples + k)] = pixel - np.int32(BEYOND_PX)
+            part[_at(r * samples + k)] = place - pixel
+
+
+@compiled
+def _cubic(part: Any, weight: Any) -> None:
+    """Weights (4, t) of the pixels around places that lie a ``part`` (t,) of the way from the second to the third."""
+    for q in range(len(part)):
+        on, back = part[q], 1.0 - part[q]
+        before, after = SHARPNESS * on * back * back, SHARPNESS * back * on * on
+        here = ((SHARPNESS + 2.0) * on - (SHARPNESS + 3.0)) * on * on + 1.0
+        weight[0, q], weight[1, q], weight[2, q], weight[3, q] = before, here, 1.0 - before - here - after, after
+
+
+@compiled
+def _extent(whole: Any) -> tuple[int, int]:
+    low, high = whole[0], whole[0]
+    for q in range(len(whole)):
+        low, high = min(low, whole[q]), max(high, whole[q])
+    return low, high
+
+
+@compiled
+def _cut_out(image: Any, left: int, top: int, width: int, height: int, patch: Any) -> None:
+    """Grey levels of a part of the image, row by row; beyond the image those at its border."""
+    rows, columns, channels = image.shape
+    if channels == 1 and left >= 0 and top >= 0 and left + width <= columns and top + height <= rows:
+        for v in range(height):
+            for u in range(width):
+                patch[_at(v * width + u)] = image[_at(top + v), _at(left + u), 0]
+        return
+    for v in range(height):
+        y = min(max(top + v, 0), rows - 1)
+        for u in range(width):
+            x = min(max(left + u, 0), columns - 1)
+            grey = float(image[y, x, 0])
+            if channels == 3:
+                grey = BLUE * grey + GREEN * image[y, x, 1] + RED * image[y, x, 2]
+            patch[v * width + u] = grey
+
+
+@compiled
+def _interpolate(patch: Any, base: Any, width: int, across: Any, down: Any, grey: Any) -> None:
+    """Sixteen pixels of a patch each, weighted down its columns and then across."""
+    for q in range(len(base)):
+        a = _at(base[q])
+        b = a + _at(width)
+        c = b + _at(width)
+        d = c + _at(width)
+        above, here, below, under = down[0, q], down[1, q], down[2, q], down[3, q]
+        first = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
+        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
+        second = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
+        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
+        third = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
+        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
+        fourth = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
+        grey[q] = (across[0, q] * first + across[1, q] * second) + (across[2, q] * third + across[3, q] * fourth)
+
+
+@compiled
+def low_third_difference(profiles: Any) -> float:
+    """``profiles.low_third_difference``."""
+    count, samples = profiles.shape
+    third = np.empty(((count + 2) // 3) * ((samples + 1) // 2))
+    found, finite = 0, 0
+    for n in range(0, count, 3):
+        for k in range(0, samples - 6, 2):
+            step = profiles[n, k + 6] - profiles[n, k]
+            size = abs(step - 3.0 * (profiles[n, k + 4] - profiles[n, k + 2]))
+            found += 1
+            if size == size:
+                third[finite] = size
+                finite += 1
+    nth = found // 10
+    if nth < finite:
+        return _nth(third, finite, nth)
+    return np.nan if found else 0.0
+
+
+@compiled
+def _nth(values: Any, count: int, nth: int) -> float:
+    """The value that would stand at ``nth`` if the first ``count`` were sorted; moves them about (Hoare's "find")."""
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[nth], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < nth:
+            low = i
+        if nth < i:
+            high = j
+    return float(values[nth])
+
+
+@compiled
+def find_candidates(
+    profiles: Any, ok: Any, taps: Any, step_px: float, threshold: float, peak_noise: float, near: int, far: int,
+    full_scale: float,
+) -> Any:  # fmt: skip
+    """``profiles.find_candidates``: sample, offset, step, sigma, width and how surely it is cut off, each (k,)."""
+    count, samples = profiles.shape
+    margin, responses = len(taps) // 2, samples - len(taps) + 1
+    sample = np.empty(count * responses // 2 + 1, np.intp)
+    found = np.empty((5, len(sample)))
+    response, height, change = np.empty(responses), np.empty(responses), np.empty(responses)
+    k = 0
+    for n in range(count):
+        spoilt = 0
+        for c in range(samples):
+            spoilt += profiles[n, c] - profiles[n, c] != 0.0  # what is no number, or has no end
+        if spoilt or not ok[n]:
+            continue
+        response[:] = 0.0
+        for t in range(len(taps)):
+            for c in range(responses):
+                response[c] += taps[t] * profiles[n, c + t]
+        for c in range(responses):
+            height[c] = abs(response[c])
+        change[0] = 0.0
+        for c in range(1, responses):
+            change[c] = (response[c] - response[c - 1]) ** 2
+        for c in range(1, responses - 1):
+            left, centre, right = height[c - 1], height[c], height[c + 1]
+            if not (centre > left and centre >= right and centre > threshold):
+                continue
+            curvature = (centre - left) + (centre - right)
+            if not curvature > FLAT * centre:
+                continue
+            # A blurred step answers with a Gaussian, whose logarithm is a parabola.
+            log_left, log_right = math.log(max(left, 1e-3 * centre)), math.log(max(right, 1e-3 * centre))
+            shift = 0.5 * (log_right - log_left) / (2.0 * math.log(centre) - log_left - log_right)
+            width = math.sqrt(centre / curvature)
+            place, bright = margin + c + shift, 1 if response[c] > 0.0 else -1
+            unrest = _unrest(change, c, near, far)
+            sample[k] = n
+            found[0, k] = step_px * (c + shift - responses // 2)
+            found[1, k] = response[c]
+            found[2, k] = max(peak_noise / centre, step_px * unrest / curvature)
+            found[3, k] = step_px * width
+            found[4, k] = _doubt(profiles, n, place, bright, width, CUT_OFF * full_scale)
+            k += 1
+    return (
+        sample[:k].copy(),
+        found[0, :k].copy(),
+        found[1, :k].copy(),
+        found[2, :k].copy(),
+        found[3, :k].copy(),
+        found[4, :k].copy(),
+    )
+
+
+@compiled
+def _unrest(change: Any, at: int, near: int, far: int) -> float:
+    """``profiles._unrest`` of one candidate from the squared ``change`` of the response from sample to sample."""
+    last = len(change) - 1
+    a, b, c, d = max(at - far, 0), max(at - near, 0), min(at + near, last), min(at + far, last)
+    total = 0.0
+    for i in range(a + 1, b + 1):
+        total += change[i]
+    for i in range(c + 1, d + 1):
+        total += change[i]
+    return math.sqrt(total / max(b - a + d - c, 1))
+
+
+@compiled
+def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: float) -> float:
+    """``saturation.doubt`` of one edge."""
+    start = int(np.rint(place))
+    for step in range(int(HARDLY * width) + 2):
+        k = start + side * step
+        if k < 0 or k >= profiles.shape[1]:
+            return 0.0
+        if profiles[n, k] >= level:
+            way = abs(k - place) / width
+            return min(max((HARDLY - way) / (HARDLY - SURELY), 0.0), 1.0)
+    return 0.0
+
+
+@compiled
+def usual_width(width_px: Any, weight: Any) -> tuple[int, float]:
+    """How many points have a weight, and the upper median of their widths; 0 without any."""
+    widths, count = np.empty(len(weight)), 0
+    for k in range(len(weight)):
+        if weight[k] > 0.0:
+            widths[count] = width_px[k]
+            count += 1
+    return count, _nth(widths, count, count // 2) if count else 0.0
+
+
+@compiled
+def worth(
+    sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
+    point_floor_px: float, edge_floor_px: float,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """What ``consensus.Votes`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
+    count, edges = len(sample), len(bevel_px)
+    weight = np.empty(count)
+    energy, cut_off_energy = np.zeros(edges), np.zeros(edges)
+    for k in range(count):
+        e = edge[sample[k]]
+        wrong = polarity[e] != 0 and np.sign(step[k]) != polarity[e]
+        weight[k] = 0.0 if wrong else 1.0 / (sigma_px[k] ** 2 + point_floor_px**2)
+        energy[e] += step[k] ** 2
+        cut_off_energy[e] += step[k] ** 2 * cut_off[k]
+    usual_px = max(_nth(width_px.copy(), count, count // 2), 1.0) if count else 1.0
+    spread_px, cut_off_px = np.empty(edges), np.empty(edges)
+    for e in range(edges):
+        spread_px[e] = math.hypot(bevel_px[e], edge_floor_px * usual_px)
+        cut_off_px[e] = usual_px * SPREAD * cut_off_energy[e] / max(energy[e], 1e-12)
+    return weight, spread_px, cut_off_px
