@@ -11,9 +11,18 @@ from support.loopback import frame_record
 from support.timely import clock
 
 from gripmon.client import MonitorName, Policy, Reading, Unusable
-from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
-from gripmon.client.inbox import HELD_BACK_S, Entry, Inbox
-from gripmon.client.judging import judge
+from gripmon.client.inbox import (
+    HELD_BACK_S,
+    NO_LEADS,
+    Entry,
+    Inbox,
+    Leads,
+    Sent,
+    waited_s,
+    with_answer,
+    without_contradicted,
+)
+from gripmon.client.reading import judge
 from gripmon.io.wire import MOST_DRIFT
 from gripmon.model.records import ClockReading, to_json
 

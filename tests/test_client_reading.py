@@ -16,8 +16,8 @@ from support.loopback import frame_record
 from support.timely import TimelyInbox as Inbox
 
 from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
-from gripmon.client.inbox import MOST_PRESENT
-from gripmon.client.judging import judge
+from gripmon.client.inbox import PRESENT_KEPT
+from gripmon.client.reading import judge
 from gripmon.model.records import FrameRecord, Transform, Verdict, to_json
 
 WRIST, ELBOW = MonitorName("arm", "wrist"), MonitorName("arm", "elbow")
@@ -159,7 +159,7 @@ def test_names_that_a_stranger_makes_up_fill_neither_memory_nor_log(caplog: pyte
     for number in range(100):
         inbox.take(MonitorName("arm", f"camera-{number}"), message, 100.0)
         inbox.appeared(MonitorName("arm", f"other-{number}"))
-    assert len(inbox.heard.present) == MOST_PRESENT and WRIST in inbox.heard.present
+    assert len(inbox.heard.present) == PRESENT_KEPT and WRIST in inbox.heard.present
     assert reading(inbox).why is Unusable.SEVERAL
     assert len(caplog.messages) == 1 and caplog.messages[0].startswith("more than one monitor is there: ")
 

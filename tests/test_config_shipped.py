@@ -11,7 +11,7 @@ import pytest
 from gripmon.daemon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import Outlook, expect
+from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"
@@ -63,21 +63,22 @@ WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml") if not is
 
 
 @pytest.fixture(params=WRIST)
-def shipped(request: pytest.FixtureRequest) -> tuple[MonitorSettings, Outlook]:
+def shipped(request: pytest.FixtureRequest) -> tuple[MonitorSettings, AccuracyForecast]:
     """A shipped configuration's settings and what one frame of its view is expected to show."""
     config = load_config(builtin_config(request.param), check_source=False, with_taught=False)
     monitor = config.settings.monitor
-    return monitor, expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
+    expected = forecast_accuracy(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m)
+    return monitor, expected
 
 
-def test_a_shipped_view_keeps_its_alert_limits(shipped: tuple[MonitorSettings, Outlook]):
+def test_a_shipped_view_keeps_its_alert_limits(shipped: tuple[MonitorSettings, AccuracyForecast]):
     """Else none of its transforms would ever be valid."""
     monitor, outlook = shipped
     assert outlook.protection.position_m <= monitor.policy.alert_limit_m
     assert outlook.protection.rotation_rad <= monitor.policy.alert_limit_rad
 
 
-def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(shipped: tuple[MonitorSettings, Outlook]):
+def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(shipped: tuple[MonitorSettings, AccuracyForecast]):
     """By what one frame of it is certain to; the mean of frames whose errors last is hardly more."""
     monitor, outlook = shipped
     if monitor.recalibration.mode == "off":

@@ -33,8 +33,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.records.recorded import Meta, RecordedCommand
-from gripmon.record.export import SCHEMAS, Exporter
-from gripmon.record.export.exporter import ROWS_A_GROUP
+from gripmon.record.export import ROWS_A_GROUP, SCHEMAS, Exporter
 from gripmon.record.read import FrameTable
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
@@ -297,7 +296,7 @@ def test_the_schema_says_units_version_and_itself(tmp_path: Path):
 
 def test_row_groups_let_readers_skip_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert ROWS_A_GROUP >= 10_000
-    monkeypatch.setattr("gripmon.record.export.exporter.ROWS_A_GROUP", 64)
+    monkeypatch.setattr("gripmon.record.export.ROWS_A_GROUP", 64)
     export(tmp_path, Run(moving(200)))
     about = pq.ParquetFile(tmp_path / "frames" / files(tmp_path)[0]).metadata
     assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [64, 64, 64, 8]

@@ -19,7 +19,7 @@ from gripmon.calibrate.plane_equations import FreePose, off_plate
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.teach.onboarding import KnownGripper
+from gripmon.teach.hand_eye import KnownGripper
 
 POINTS_M = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.008, 0.008) for z in (0.0, -0.03)])
 SIGMA = np.array([2e-6, 3e-6, 2e-5, 2e-4, 1e-4, 5e-5])
@@ -73,7 +73,7 @@ def test_a_tenth_of_a_degree_is_noticed_in_an_image():
         sight = detect(image, DISCS, "leaning.png")
         assert isinstance(sight, Sighting)
         method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
-        found.append(method.look(image, sight, guess).coincidence)
+        found.append(method.measure(image, sight, guess).coincidence)
     flat, tilted = found
     assert flat.apart_p is not None and tilted.apart_p is not None and tilted.tilt_rad is not None
     assert flat.apart_p > 1e-3 and tilted.apart_p < 1e-4

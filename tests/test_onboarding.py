@@ -28,13 +28,14 @@ from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturbation_between
-from gripmon.model.gripper import Gripper, contents_of, load_gripper
+from gripmon.model.gripper import contents_of, load_gripper
 from gripmon.model.records import Image
 from gripmon.model.targets import CircleGrid, Target
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.background import _TILE_PX
-from gripmon.teach.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of
-from gripmon.teach.onboarding.outlines import inferred_model, points_in_gripper
+from gripmon.teach.hand_eye import HandEyeOnPlate, KnownGripper, UnknownGripper
+from gripmon.teach.outline_edges import measure_outlines
+from gripmon.teach.outlines import inferred_model, measure_known, outlines_of, points_in_gripper
 
 TRUE = nominal_cam_T_grip()
 TARGETS: dict[str, Target] = {"discs": DISCS, "chequerboard": CHEQUERBOARD, "charuco": CHARUCO}
@@ -71,11 +72,13 @@ def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
         if known:
             guess = rough({name: true_corners(TRUE)[name] for name in NEAR}, seed)
             found = (
-                KnownGripper(camera, sharp_gripper(), OPENING_M).look(image(target), sight(target), guess).coincidence
+                KnownGripper(camera, sharp_gripper(), OPENING_M)
+                .measure(image(target), sight(target), guess)
+                .coincidence
             )
         else:
             guess = rough(outline_pixels(TRUE), seed)
-            found = UnknownGripper(camera, TARGETS[target]).look(image(target), sight(target), guess).coincidence
+            found = UnknownGripper(camera, TARGETS[target]).measure(image(target), sight(target), guess).coincidence
         off_px = np.linalg.norm(found.corners.uv_px - true_of(found, PAPER_LENS), axis=1)
         assert len(off_px) == 6 and off_px.max() < 0.5
         error = perturbation_between(found.cam_T_grip, TRUE)
@@ -92,7 +95,7 @@ def test_a_chequerboards_lines_beside_a_finger_arent_taken_for_its_edges():
     assert isinstance(seen, Sighting), seen
     for seed in range(6):
         guess = rough(outline_pixels(TRUE), seed, 6.0)
-        found = UnknownGripper(GivenCamera(PAPER_LENS), CHEQUERBOARD).look(frame, seen, guess).coincidence
+        found = UnknownGripper(GivenCamera(PAPER_LENS), CHEQUERBOARD).measure(frame, seen, guess).coincidence
         assert np.linalg.norm(found.corners.uv_px - true_of(found, PAPER_LENS), axis=1).max() < 1.0, seed
 
 
@@ -102,7 +105,7 @@ def test_a_strong_lens_bends_edges_and_they_are_still_lines():
         (UnknownGripper(GivenCamera(STRONG_LENS)), outline_pixels(TRUE, STRONG_LENS)),
     ):
         taken = {name: uv for name, uv in guess.items() if not name.endswith("out_far")}
-        found = method.look(image("discs", "strong"), sight("discs", "strong"), rough(taken, 1)).coincidence
+        found = method.measure(image("discs", "strong"), sight("discs", "strong"), rough(taken, 1)).coincidence
         error = perturbation_between(found.cam_T_grip, TRUE)
         assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all(), 1e6 * error[:3]
 
@@ -118,7 +121,7 @@ def test_the_simulators_parked_gripper():
         seen = detect(frame, plate, f"{index}.png")
         assert isinstance(seen, Sighting), seen
         method = KnownGripper(GivenCamera(PAPER_LENS), gripper, 0.034, nominal_cam_T_grip())
-        found = method.look(frame, seen, None).coincidence
+        found = method.measure(frame, seen, None).coincidence
         error = perturbation_between(found.cam_T_grip, true)
         assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all(), (index, 1e6 * error[:3])
 
@@ -140,10 +143,11 @@ def test_corners_have_the_spread_that_their_covariance_states():
 
 def test_the_inferred_gripper_is_the_true_one_and_a_monitor_takes_it():
     camera, outline = make_camera(PAPER_LENS), outlines_of(rough(outline_pixels(TRUE), 4))
-    look = UnknownGripper(GivenCamera(PAPER_LENS)).look(image("discs"), sight("discs"), rough(outline_pixels(TRUE), 4))
-    result = average([look.coincidence], True)
-    model = UnknownGripper(GivenCamera(PAPER_LENS)).model("new", [look], result, (0.0, 0.06), None)
-    gripper, true = Gripper(model), sharp_gripper()
+    method = UnknownGripper(GivenCamera(PAPER_LENS))
+    seen = method.measure(image("discs"), sight("discs"), rough(outline_pixels(TRUE), 4))
+    result = average([seen.coincidence], True)
+    gripper = HandEyeOnPlate(result, method, (seen,), (), (), image("discs")).gripper("new", (0.0, 0.06))
+    model, true = gripper.model, sharp_gripper()
     assert outline.names == tuple(model.points)
     for name in gripper.corner_ids:
         want = true.model.points[true_name(name)].xyz_m
@@ -244,16 +248,16 @@ def test_a_known_gripper_that_isnt_there():
     method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
     empty = np.full_like(image("discs"), 150)
     with pytest.raises(CalibrationError, match="the gripper isn't seen where it should be"):
-        method.look(empty, sight("discs"), rough({n: true_corners(TRUE)[n] for n in NEAR}, 6))
+        method.measure(empty, sight("discs"), rough({n: true_corners(TRUE)[n] for n in NEAR}, 6))
 
 
 def test_only_the_corners_that_were_named_are_taken():
     method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
     guess = rough({name: true_corners(TRUE)[name] for name in ("L_in_near", "R_in_far")}, 7)
-    look = method.look(image("discs"), sight("discs"), guess)
+    look = method.measure(image("discs"), sight("discs"), guess)
     assert look.coincidence.corners.names == ("L_in_near", "R_in_far")
     assert np.abs(perturbation_between(look.coincidence.cam_T_grip, TRUE)[:3]).max() < 5e-5
-    hidden = method.look(image("discs"), sight("discs"), rough(true_corners(TRUE), 8))
+    hidden = method.measure(image("discs"), sight("discs"), rough(true_corners(TRUE), 8))
     assert set(hidden.missing) == {"L_out_far", "R_out_far"}
 
 
@@ -263,4 +267,4 @@ def test_a_gripper_the_other_way_round_is_refused_beside_a_rough_calibration():
     guess = {name: tuple(map(float, true[place])) for name, place in other.items()}
     method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M, TRUE)
     with pytest.raises(CalibrationError, match=r"turned by 180 degrees"):
-        method.look(image("discs"), sight("discs"), guess)
+        method.measure(image("discs"), sight("discs"), guess)

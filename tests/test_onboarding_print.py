@@ -17,8 +17,8 @@ from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.targets import Target
-from gripmon.teach.onboarding import UnknownGripper
-from gripmon.teach.onboarding.plate_print import plate_print
+from gripmon.teach.hand_eye import UnknownGripper
+from gripmon.teach.plate_print import plate_print
 
 TRUE = nominal_cam_T_grip()
 
@@ -66,7 +66,7 @@ def test_fingers_that_vanish_before_dark_print_or_stand_out_light(
     frame = standing(target, turn_rad=0.35, look=Look(supersampling=3))
     seen = _sight(frame, target)
     found = (
-        UnknownGripper(GivenCamera(PAPER_LENS), target).look(frame, seen, rough(outline_pixels(TRUE), 2)).coincidence
+        UnknownGripper(GivenCamera(PAPER_LENS), target).measure(frame, seen, rough(outline_pixels(TRUE), 2)).coincidence
     )
     error = perturbation_between(found.cam_T_grip, TRUE)
     assert np.abs(error[:3]).max() < 5e-5, 1e6 * error[:3]

@@ -12,7 +12,8 @@ from support.recorded import record
 
 from gripmon.model.geometry import from_record
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
-from gripmon.record.read import FrameTable
+from gripmon.record.read import FrameTable, open_recordings
+from gripmon.record.table import TableBuilder
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,8 @@ def test_lines_of_an_older_version_have_no_bounds(tmp_path: Path):
     assert line.pop("protection")
     path = tmp_path / "older.jsonl"
     path.write_bytes(msgspec.json.encode(line) + b"\n" + to_json(record(1)) + b"\n")
-    table = FrameTable.from_jsonl(path)
+    (run,) = open_recordings([path]).recordings
+    table = run.frames
     assert np.isnan(table.protection_m).tolist() == [True, False] and np.isnan(table.integrity_risk[0])
 
 
@@ -93,9 +95,14 @@ def test_matrices_are_those_of_the_geometry(records: list[FrameRecord], table: F
 
 
 def test_joining_keeps_each_frames_reference():
-    one = FrameTable.from_records([record(0, reference_id="a"), record(1, reference_id="b")])
-    two = FrameTable.from_records([record(2, reference_id="b"), record(3, reference_id="c"), record(4)])
-    joined = FrameTable.concatenate([one, two])
+    one, two = TableBuilder(), TableBuilder()
+    for builder, rows in (
+        (one, [record(0, reference_id="a"), record(1, reference_id="b")]),
+        (two, [record(2, reference_id="b"), record(3, reference_id="c"), record(4)]),
+    ):
+        for row in rows:
+            builder.add(row)
+    joined = TableBuilder.join([one, two])
     assert [joined.reference_ids[i] for i in joined.reference] == ["a", "b", "b", "c", "first"]
     assert joined.seq.tolist() == [0, 1, 2, 3, 4]
     taken = joined.take(np.array([4, 0]))
@@ -103,7 +110,7 @@ def test_joining_keeps_each_frames_reference():
 
 
 def test_no_frames_are_an_empty_table():
-    for empty in (FrameTable.from_records([]), FrameTable.concatenate([])):
+    for empty in (FrameTable.from_records([]), TableBuilder.join([])):
         assert len(empty) == 0 and empty.covariance.shape == (0, 6, 6) and empty.matrices().shape == (0, 4, 4)
 
 
@@ -118,7 +125,8 @@ def test_blocks_make_no_difference():
 def test_json_lines_give_the_same_columns(table: FrameTable, records: list[FrameRecord], tmp_path: Path):
     path = tmp_path / "estimates.jsonl"
     path.write_bytes(b"\n".join(lines(*records)) + b"\n\n")
-    read = FrameTable.from_jsonl(path)
+    (run,) = open_recordings([path]).recordings
+    read = run.frames
     for name, column in vars(table).items():
         if isinstance(column, np.ndarray):
             assert np.array_equal(getattr(read, name), column, equal_nan=column.dtype.kind == "f"), name
@@ -127,11 +135,10 @@ def test_json_lines_give_the_same_columns(table: FrameTable, records: list[Frame
 def test_a_line_that_is_cut_off(records: list[FrameRecord], tmp_path: Path):
     path = tmp_path / "estimates.jsonl"
     path.write_bytes(b"\n".join(lines(*records[:5]))[:-30])
-    with pytest.raises(ValueError, match=r"estimates\.jsonl: 1 lines are no frame records \(line 5:"):
-        FrameTable.from_jsonl(path)
-    faults: list[str] = []
-    assert FrameTable.from_jsonl(path, faults).seq.tolist() == [0, 1, 2, 3]
-    assert len(faults) == 1
+    (run,) = open_recordings([path]).recordings
+    assert run.frames.seq.tolist() == [0, 1, 2, 3]
+    (fault,) = run.faults
+    assert fault.startswith(f"{path}: has 1 of record that can't be understood")
 
 
 def test_names_of_every_version_have_a_code():

@@ -15,7 +15,8 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
-from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
+from gripmon.teach.accuracy import Promise, forecast_frame
+from gripmon.teach.visibility import Rig
 
 DEMO = builtin_config("demo.yaml")
 
@@ -33,13 +34,13 @@ def with_policy(tmp_path: Path, policy: str) -> Path:
 
 def test_what_is_needed_is_enough_and_is_said_of_either_limit():
     wide, turned = bound(8.31e-3, 1e-4), bound(5e-5, 0.0445)
-    found = promise(wide, PolicySettings())
+    found = Promise.of(wide, PolicySettings())
     assert not found.reachable and found.needed == "alert_limit_m of at least 0.0084 (8.4 mm)"
     assert "alert limit 1 mm, 2 degrees: NOT reachable: valid needs alert_limit_m of at least 0.0084" in found.text()
-    assert promise(wide, PolicySettings(alert_limit_m=0.0084)).reachable
-    assert not promise(wide, PolicySettings(alert_limit_m=0.0082)).reachable
-    assert promise(turned, PolicySettings()).needed == "alert_limit_rad of at least 0.045 (2.6 degrees)"
-    both = promise(bound(8.31e-3, 0.0445), PolicySettings()).needed
+    assert Promise.of(wide, PolicySettings(alert_limit_m=0.0084)).reachable
+    assert not Promise.of(wide, PolicySettings(alert_limit_m=0.0082)).reachable
+    assert Promise.of(turned, PolicySettings()).needed == "alert_limit_rad of at least 0.045 (2.6 degrees)"
+    both = Promise.of(bound(8.31e-3, 0.0445), PolicySettings()).needed
     assert "alert_limit_m" in both and "alert_limit_rad" in both
     nothing = Promise(Protection(math.inf, 0.1, 1e-5), 5e-4, 0.02)
     assert not nothing.reachable and "no limit would do" in nothing.text()
@@ -55,12 +56,12 @@ def test_a_view_promises_less_than_its_covariance_alone_and_less_at_a_larger_ris
     the whole fit is enough.
     """
     usual, cam_T_grip = rig()
-    foreseen = foresee_frame(usual, cam_T_grip, None)
+    foreseen = forecast_frame(usual, cam_T_grip, None)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(foreseen.covariance[:3, :3])[-1]))
     assert foreseen.protection.position_m > 4.42 * sigma_m
     settings = usual.settings
     bold = msgspec.structs.replace(settings, policy=msgspec.structs.replace(settings.policy, integrity_risk=1e-2))
-    risky = foresee_frame(usual._replace(settings=bold), cam_T_grip, None).protection
+    risky = forecast_frame(usual._replace(settings=bold), cam_T_grip, None).protection
     assert 0.2 < risky.position_m / foreseen.protection.position_m < 0.9
 
 
@@ -69,7 +70,7 @@ def test_a_gripper_file_that_is_known_less_well_promises_less():
     promised = []
     for sigma_m in (0.0, 1e-4, 5e-4):
         rough = usual._replace(settings=msgspec.structs.replace(usual.settings, model_sigma_m=sigma_m))
-        promised.append(foresee_frame(rough, cam_T_grip, None).protection.position_m)
+        promised.append(forecast_frame(rough, cam_T_grip, None).protection.position_m)
     assert promised[0] <= promised[1] < promised[2] and promised[2] > 2.0 * promised[1]
 
 

@@ -20,8 +20,8 @@ from support.recorded import Recorded, frame, record, recorder, trace, wait_unti
 
 from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Severity
+from gripmon.record.process import SILENT_AFTER_S, Health
 from gripmon.record.write import ProcessRecorder
-from gripmon.record.write.health import SILENT_AFTER_S, Health
 
 LONG_S = 60.0
 

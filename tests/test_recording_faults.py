@@ -35,10 +35,10 @@ from support.recorded import (
 
 from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.records import ReferenceRecord
+from gripmon.record.columns import Row
+from gripmon.record.files import FileSeries
+from gripmon.record.recorder import make_scene
 from gripmon.record.write import ProcessRecorder
-from gripmon.record.write.files import FileSeries
-from gripmon.record.write.rows import Row
-from gripmon.record.write.wire import make_scene
 
 HERE = Path(__file__).parent
 
@@ -205,8 +205,8 @@ def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(tmp_path: Path
 
 def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = [2_000_000_000]
-    monkeypatch.setattr("gripmon.record.write.budget.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
-    monkeypatch.setattr("gripmon.record.write.files._FIRST_RETRY_S", 0.0)
+    monkeypatch.setattr("gripmon.record.keeping.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    monkeypatch.setattr("gripmon.record.files._FIRST_RETRY_S", 0.0)
     keeping = settings(min_free_bytes=1_000_000_000)
     files = FileSeries(make_scene(keeping, str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
     files.add_frames([Row(record(0), None, None, None)])
@@ -338,6 +338,6 @@ def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytes
 def test_the_recording_process_finds_the_package_where_the_daemon_has_it_from() -> None:
     """A checkout that isn't installed: neither the working directory nor the rooms themselves are searched."""
     import gripmon
-    from gripmon.record.write import process
+    from gripmon.record import process
 
     assert Path(process._HOME) == Path(gripmon.__file__).resolve().parents[1]

@@ -29,13 +29,11 @@ from support.recorded import (
 )
 
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
+from gripmon.record.columns import Picture, Row
+from gripmon.record.files import FileSeries
+from gripmon.record.keeping import Moments, PictureRing, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
+from gripmon.record.recorder import make_scene
 from gripmon.record.write import ProcessRecorder, RecordingSettings
-from gripmon.record.write.budget import claim
-from gripmon.record.write.columns import Picture, Row
-from gripmon.record.write.files import FileSeries
-from gripmon.record.write.pins import Pinned, is_pinned, pin_path, pinned_by
-from gripmon.record.write.ring import Moments, PictureRing, Trigger
-from gripmon.record.write.wire import make_scene
 
 BUMP = Alert(
     AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved by 4.5 mm", AlertEvent.RAISED, "1-abc", since_ns=1
@@ -240,7 +238,7 @@ def test_the_pin_names_its_alert_and_reaches_before_and_after(tmp_path: Path) ->
 def test_recording_pauses_when_pinned_files_fill_the_budget_until_one_is_unpinned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gripmon.record.write.files._FIRST_RETRY_S", 0.0)
+    monkeypatch.setattr("gripmon.record.files._FIRST_RETRY_S", 0.0)
     files = series(tmp_path, budget_bytes=4_000_000, max_file_bytes=500_000)
     i = 0
     while files.failure is None:
@@ -292,7 +290,7 @@ def test_numbers_are_not_used_again(tmp_path: Path) -> None:
 
 def test_files_roll_over_with_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
-    monkeypatch.setattr("gripmon.record.write.files.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("gripmon.record.files.time.monotonic", lambda: now[0])
     files = series(tmp_path, max_file_bytes=10_000_000, max_file_s=300.0)
     for i in range(12):
         write(files, i, 1, size=10)

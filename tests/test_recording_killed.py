@@ -19,11 +19,12 @@ import psutil
 import pytest
 from support.recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
 
+from gripmon.record.columns import Row
+from gripmon.record.container import whole_bytes
+from gripmon.record.files import FileSeries
+from gripmon.record.keeping import repair
 from gripmon.record.read import open_recordings
-from gripmon.record.write.columns import Row
-from gripmon.record.write.files import FileSeries
-from gripmon.record.write.repair import repair, whole_bytes
-from gripmon.record.write.wire import make_scene
+from gripmon.record.recorder import make_scene
 
 HERE = Path(__file__).parent
 MOST_LOST_S = 2.0
@@ -148,7 +149,7 @@ def test_a_killed_recorders_file_is_told_with_the_command_that_makes_it_whole(
     os.kill(writer.process_id, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
     writer.close(60.0)
-    with caplog.at_level(logging.INFO, "gripmon.record.write"):
+    with caplog.at_level(logging.INFO, "gripmon.record"):
         again = recorder(tmp_path)
         wait_until(lambda: "no footer" in caplog.text)
         again.close(60.0)

@@ -27,7 +27,7 @@ PICTURE = image(0)
 @pytest.fixture
 def slow_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording process that needs two seconds before it does anything, as on a busy machine."""
-    from gripmon.record.write import process
+    from gripmon.record import process
 
     monkeypatch.setattr(process, "_BOOTSTRAP", f"import time; time.sleep(2.0); {process._BOOTSTRAP}")
 
@@ -67,7 +67,7 @@ def test_a_source_that_can_wait_loses_no_image(tmp_path: Path) -> None:
 def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     writer = recorder(tmp_path, image_every=1, queue_images=4)
     process = stopped(writer)
-    with caplog.at_level(logging.WARNING, "gripmon.record.write"):
+    with caplog.at_level(logging.WARNING, "gripmon.record"):
         for i in range(30):
             writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
         wait_until(lambda: "missing in the recording so far: 0 frames" in caplog.text)
@@ -138,7 +138,7 @@ def test_a_process_that_has_everything_and_is_only_slow_is_left_to_finish(
     assert process is not None
     for i in range(20):
         writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
-    with caplog.at_level(logging.WARNING, "gripmon.record.write"):
+    with caplog.at_level(logging.WARNING, "gripmon.record"):
         writer.close(0.5)
     assert (writer.failure, writer.dropped) == (None, 0) and "incomplete" not in caplog.text
     wait_until(lambda: psutil.Process(process).status() == psutil.STATUS_ZOMBIE)

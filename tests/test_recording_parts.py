@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from support.recorded import HEIGHT_PX, WIDTH_PX
 
 from gripmon.model.records import State, Verdict
-from gripmon.record.write import palette
-from gripmon.record.write.overlay import _label_places
-from gripmon.record.write.wire import ImageRing, Unframer, framed
-from gripmon.record.write.worker import to_8_bit
+from gripmon.record.columns import Palette
+from gripmon.record.process import ImageRing, Unframer, framed
+from gripmon.record.scene import _label_places
+from gripmon.record.worker import to_8_bit
 
 
 @given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))
@@ -25,7 +25,7 @@ def test_messages_survive_any_cutting(payloads: list[bytes], cut: int) -> None:
 
 
 def test_shared_images_keep_apart() -> None:
-    ring = ImageRing.for_camera(WIDTH_PX, HEIGHT_PX, 3)
+    ring = ImageRing(WIDTH_PX, HEIGHT_PX, 3)
     rng = np.random.default_rng(5)
     pictures = [
         rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8),
@@ -46,8 +46,8 @@ def test_deep_pixels_become_8_bit() -> None:
 
 
 def test_every_state_and_verdict_has_its_own_colour() -> None:
-    assert set(palette.STATES) == set(State) and set(palette.VERDICTS) == set(Verdict)
-    assert max(Counter(palette.STATES.values()).values()) == 1
+    assert set(Palette.STATES) == set(State) and set(Palette.VERDICTS) == set(Verdict)
+    assert max(Counter(Palette.STATES.values()).values()) == 1
 
 
 def test_labels_keep_off_the_edges_and_each_other() -> None:

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from support import recorded
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
-from gripmon.analyse.replay_differences import Differences
+from gripmon.analyse.comparison import Differences
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded

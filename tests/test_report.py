@@ -13,10 +13,10 @@ import pytest
 from support.loopback import state_record
 from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
-from gripmon.analyse.report import Report, build
-from gripmon.analyse.report.page import page
-from gripmon.analyse.report.pictures import Looked, together
-from gripmon.analyse.smoother import correct
+from gripmon.analyse.build import build
+from gripmon.analyse.content import Report
+from gripmon.analyse.correction import correct
+from gripmon.analyse.page import JudgedPicture, cut_alike, page
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -453,7 +453,7 @@ def test_what_was_not_believed_is_not_shown_in_green():
     )
     green = []
     for believed in (True, False):
-        (shown,) = together([Looked(picture, believed)])
+        (shown,) = cut_alike([JudgedPicture(picture, believed)])
         data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))

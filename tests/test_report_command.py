@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gripmon.analyse.report import Report
+from gripmon.analyse.content import Report
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.io.sources import make_simulator

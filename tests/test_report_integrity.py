@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from support.reported import Run, records, stepped
 
-from gripmon.analyse.report import build
-from gripmon.analyse.report.page import page
+from gripmon.analyse.build import build
+from gripmon.analyse.page import page
 from gripmon.model.records import Protection, RecordedConfiguration, Verdict
 from gripmon.model.records.recorded import RecordedFile
 

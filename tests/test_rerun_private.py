@@ -10,10 +10,10 @@ import rerun as rr
 from rerun.chunk import LazyStore
 from support.recorded import frame, record, recorder
 
+from gripmon.record.container import RerunChangedError
+from gripmon.record.files import FileSeries
 from gripmon.record.read import open_recordings
-from gripmon.record.rerun_private import RerunChangedError
-from gripmon.record.write import wire
-from gripmon.record.write.files import FileSeries
+from gripmon.record.recorder import make_scene
 
 GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
 
@@ -21,7 +21,7 @@ GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
 def test_they_are_used_in_one_file_alone():
     private = re.compile(r"\brr\.bindings|rerun_bindings|\._chunk_index|rerun\.\w*\._|rerun\._")
     using = {path.name for path in GRIPMON.rglob("*.py") if private.search(path.read_text())}
-    assert using <= {"rerun_private.py"}
+    assert using <= {"container.py"}
 
 
 def test_without_its_chunk_index_files_are_read_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -44,7 +44,7 @@ def test_a_recorder_that_could_not_free_its_files_does_not_begin(tmp_path: Path,
     from support.recorded import CAMERA, GRIPPER, REFERENCE, settings
 
     monkeypatch.delattr(rr.bindings, "flush_and_cleanup_orphaned_recordings")
-    scene = wire.make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
+    scene = make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
     with pytest.raises(
         RerunChangedError, match=r"has no rerun\.bindings\.flush_and_cleanup_orphaned_recordings; gripmon"
     ):

@@ -19,9 +19,9 @@ from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.gripper import load_gripper
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid
 from gripmon.simulate import CALIBRATION_KINDS, Rig, image_count
+from gripmon.simulate.calibration_images import rough_corners
 from gripmon.simulate.laser import paper_cell, poses_on_plane, spot_image, spots_cam_m
 from gripmon.simulate.plates import Plate, Print, facing, points_of
-from gripmon.simulate.rough_corners import rough_corners
 
 PINHOLE = BrownConradyLens(width_px=640, height_px=480, fx_px=800.0, fy_px=800.0, cx_px=319.5, cy_px=239.5)
 BOARD = Charuco(8, 6, 0.03, 0.022, "DICT_4X4_250")

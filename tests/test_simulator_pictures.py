@@ -23,6 +23,7 @@ from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, Pa
 from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulate.background import _smear_kernel
 from gripmon.simulate.coverage import CoverageRaster
+from gripmon.simulate.disturbance import blur
 from gripmon.simulate.scenario import (
     Background,
     Creep,
@@ -32,7 +33,6 @@ from gripmon.simulate.scenario import (
     Sensor,
     Shadow,
 )
-from gripmon.simulate.sensor import blur
 
 FISHEYE_LENS = FisheyeLens(
     width_px=768,

@@ -18,17 +18,9 @@ from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook
-from gripmon.teach.forecast import (
-    Mount,
-    Rig,
-    expect,
-    field_of_view_rad,
-    moved_camera,
-    see,
-    towards,
-    try_mount,
-    with_focal,
-)
+from gripmon.teach.accuracy import forecast_accuracy
+from gripmon.teach.mounts import Mount, field_of_view_rad, towards, try_mount, with_focal
+from gripmon.teach.visibility import Rig, moved_camera, see
 from gripmon.track.edges.prediction import lay_out
 
 AT_PX = (386.0, 298.0)
@@ -137,7 +129,7 @@ def scatter(mount: Mount) -> np.ndarray:
     tracker = Tracker(camera, gripper, MonitorSettings(jaw_sigma_m=0.0))
     errors = []
     for k in range(FRAMES):
-        measured = tracker.measure(simulator.frame(k), cam_T_grip)
+        measured = tracker.measure(simulator.frame(k), cam_T_grip, k / scenario.fps)
         assert measured.trusted
         errors.append(difference(tracker.update(measured)[0], simulator.truth(k).cam_T_grip))
     return np.std(errors, axis=0)
@@ -150,7 +142,7 @@ def test_a_swept_mount_scatters_as_predicted(name: str):
     gripper = load_gripper(BOX_FINGERS)
     known = Rig(make_camera(PAPER_LENS), gripper, MonitorSettings(jaw_sigma_m=0.0))
     trial = try_mount(known, MOUNTS[name], 0, pose(MOUNTS[name]), 0.034)
-    expected = np.sqrt(trial.covariance.diagonal())
+    expected = np.sqrt(trial.measurable.frame.covariance.diagonal())
     print(name, (spread / expected).round(2), (expected[:3] * 1e6).round(1))
     assert (spread < 3.0 * expected).all()
     assert (spread > 0.1 * expected).all()
@@ -160,8 +152,8 @@ def test_a_swept_mount_scatters_as_predicted(name: str):
 def test_farther_away_less_is_noticed():
     near, far = tried(MOUNTS["near and flat"]), tried(MOUNTS["far"])
     assert near.works and far.works
-    assert far.noticed_m > near.noticed_m and far.worst_sigma_m > near.worst_sigma_m
-    assert far.margin_px > near.margin_px
+    assert far.noticed_m > near.noticed_m and far.measurable.worst_sigma_m > near.measurable.worst_sigma_m
+    assert far.measurable.margin_px > near.measurable.margin_px
 
 
 # --- why a mount would not work ---
@@ -169,8 +161,8 @@ def test_farther_away_less_is_noticed():
 
 def test_too_near_the_open_jaws_leave_the_image():
     trial = tried(Mount(0.060, math.radians(32.0), 0.0, 0.0))
-    assert trial.kind == "too little in view in a part of the jaw's travel"
-    assert "outside of the image" in trial.reasons[0]
+    assert trial.faults[0].kind == "too little in view in a part of the jaw's travel"
+    assert "outside of the image" in trial.faults[0].text
     # Counted one by one.
     enough = [see(rig(), trial.cam_T_grip, o).enough for o in np.linspace(0.0, 0.060, len(trial.openings_m))]
     assert trial.share == np.mean(enough) < 1.0
@@ -190,23 +182,27 @@ def test_edges_behind_another_finger_are_not_counted_on():
     camera, gripper, settings, _ = rig()
     layout = lay_out(camera, gripper, trial.cam_T_grip, 0.034, settings.corners.sampling)
     assert trial.sight.edges < len(layout.edges)
-    told = expect(camera, gripper, settings, reference_of(trial.cam_T_grip), 0.034)
+    told = forecast_accuracy(camera, gripper, settings, reference_of(trial.cam_T_grip), 0.034)
     assert told.edges == trial.sight.edges
-    np.testing.assert_allclose(told.covariance, trial.covariance)
+    np.testing.assert_allclose(told.covariance, trial.measurable.frame.covariance)
 
 
 def test_a_camera_that_looks_at_the_back_of_everything_sees_nothing():
     trial = tried(Mount(5.0, math.radians(32.0), 0.0, 0.0))
-    assert trial.kind == "nowhere enough in view" and trial.covariance is None
+    assert trial.faults[0].kind == "nowhere enough in view" and trial.measurable is None
     assert trial.noticed_m == math.inf
-    assert "0 edges long enough" in trial.reasons[0]
+    assert "0 edges long enough" in trial.faults[0].text
 
 
 def test_the_camera_may_shift_sideways_as_far_as_is_said():
     trial = tried(SEEN)
     ways = [sign * np.eye(6)[axis] for axis in range(2) for sign in (-1.0, 1.0)]
-    assert all(see(rig(), moved_camera(trial.cam_T_grip, 0.98 * trial.shift_m * way), 0.034).enough for way in ways)
-    assert not all(see(rig(), moved_camera(trial.cam_T_grip, trial.shift_m * way), 0.034).enough for way in ways)
+    assert all(
+        see(rig(), moved_camera(trial.cam_T_grip, 0.98 * trial.measurable.shift_m * way), 0.034).enough for way in ways
+    )
+    assert not all(
+        see(rig(), moved_camera(trial.cam_T_grip, trial.measurable.shift_m * way), 0.034).enough for way in ways
+    )
 
 
 def test_the_nominal_pose_of_the_tests_is_the_mount_it_looks_like():

@@ -10,8 +10,7 @@ from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of,
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
-from gripmon.teach.edges.estimate import pool, slopes
-from gripmon.teach.edges.lines import EdgePoints, find_line, settle_line
+from gripmon.teach.lines import EdgePoints, find_line, pool, settle_line, slopes
 from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes

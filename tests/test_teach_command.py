@@ -26,8 +26,8 @@ from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.atomic import write_atomically
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
-from gripmon.teach.edges.files import to_yaml
-from gripmon.teach.edges.picture import Labels
+from gripmon.teach.api import to_yaml
+from gripmon.teach.drawing import Labels
 from gripmon.track.edges import TaughtModel
 from gripmon.track.edges.taught import TaughtEdge, gripper_digest
 

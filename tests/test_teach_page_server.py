@@ -22,9 +22,10 @@ from gripmon.daemon.calibrations import read_rough_corners
 from gripmon.io.sources import Waiting
 from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.edges.bench import Bench, Found
-from gripmon.teach.page import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page.desk import BadRequest, Labels
+from gripmon.teach.api import Picture
+from gripmon.teach.messages import BadRequest, Saved, SaveOrder, SavingRefused
+from gripmon.teach.page_server import OutlineSession, PageServer
+from gripmon.teach.session import Evaluation, Labels, Setup, TeachSession
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
 DEADLINE_S = 30.0
@@ -37,7 +38,7 @@ class Told:
         self.orders: list[SaveOrder] = []
         self.refuse = ""
 
-    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+    def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
         if self.refuse:
             raise SavingRefused(self.refuse)
         self.orders.append(order)
@@ -57,7 +58,8 @@ def saving() -> Told:
 @pytest.fixture(scope="module")
 def served(rig: Rig, saving: Told) -> Iterator[PageServer]:
     picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
-    server = PageServer(Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving))
+    setup = Setup(rig.camera, rig.gripper, MonitorSettings(), None)
+    server = PageServer(TeachSession(setup, [picture], LABELS, saving))
     yield server
     server.close()
 
@@ -243,7 +245,8 @@ def test_saving_is_told_as_it_went(served: PageServer, saving: Told, rig: Rig):
 
 def test_done_is_answered_before_it_is_done(rig: Rig, saving: Told):
     picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
-    server = PageServer(Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving))
+    setup = Setup(rig.camera, rig.gripper, MonitorSettings(), None)
+    server = PageServer(TeachSession(setup, [picture], LABELS, saving))
     try:
         assert ask(server, "done", "POST", b"{}")[0] == 200
         assert server.done.wait(DEADLINE_S)
@@ -267,10 +270,10 @@ class Camera:
         self.closed = True
 
 
-def shown(desk: Desk) -> bytes:
+def shown(session: TeachSession) -> bytes:
     """The live image; empty while there is none."""
     try:
-        return desk.live()
+        return session.live()
     except BadRequest:
         return b""
 
@@ -278,21 +281,21 @@ def shown(desk: Desk) -> bytes:
 def test_a_camera_of_another_size_or_none_is_said(rig: Rig, saving: Told):
     labels = Labels("arm", "wrist", False, "/there", {}, None, "cam0")
     camera = Camera(Frame(0, 0, np.full((48, 64), 100, np.uint8), None, "live"))
-    desk = Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [], labels, saving, camera)
+    session = TeachSession(Setup(rig.camera, rig.gripper, MonitorSettings(), None), [], labels, saving, camera)
     try:
         with pytest.raises(BadRequest, match="64x48 pixels; 768x576"):
-            desk.live()
-        for_s, why = desk.dark()
+            session.live()
+        for_s, why = session.dark()
         assert for_s > 0.0 and "64x48 pixels" in why
         camera.answer = Frame(1, 1, rig.image, 0.034, "live")
         deadline = time.monotonic() + DEADLINE_S
-        while not (data := shown(desk)):
+        while not (data := shown(session)):
             assert time.monotonic() < deadline
-        assert data.startswith(b"\xff\xd8") and desk.dark() == (0.0, "")
-        assert [one.name for one in desk.take()] == ["live-000.png"]
-        assert desk.still(0).startswith(b"\x89PNG")
+        assert data.startswith(b"\xff\xd8") and session.dark() == (0.0, "")
+        assert [one.name for one in session.take()] == ["live-000.png"]
+        assert session.still(0).startswith(b"\x89PNG")
     finally:
-        desk.close()
+        session.close()
     assert camera.closed
 
 
@@ -301,18 +304,18 @@ def test_images_of_more_bits_are_shown_as_pictures(rig: Rig, saving: Told):
 
     deep = (rig.image.astype(np.uint16) * 16 + 200).astype(np.uint16)
     picture = Picture("deep.png", deep, None, str(Path("deep.png")))
-    desk = Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving)
-    shown = cv2.imdecode(np.frombuffer(desk.still(0), np.uint8), cv2.IMREAD_UNCHANGED)
+    session = TeachSession(Setup(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving)
+    shown = cv2.imdecode(np.frombuffer(session.still(0), np.uint8), cv2.IMREAD_UNCHANGED)
     assert shown.dtype == np.uint8 and shown.shape[:2] == rig.image.shape[:2]
     assert int(shown.max()) - int(shown.min()) > 200
-    desk.close()
+    session.close()
 
 
 def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_path: Path):
     image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
     path = tmp_path / "rough.yaml"
-    desk = RoughDesk(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
-    server = PageServer(desk)
+    session = OutlineSession(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
+    server = PageServer(session)
     names = [
         f"{finger}_{point}_{side}"
         for finger in ("left", "right")

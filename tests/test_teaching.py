@@ -24,7 +24,7 @@ from support.taught_scenes import (
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
-from gripmon.teach.edges import TeachingRefused
+from gripmon.teach.views import TeachingRefused
 from gripmon.track.edges.taught import sight_axes
 
 POSE = nominal_cam_T_grip()

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.meters import JAW_SIGMA_M, box_gripper
+from support.meters import box_gripper
 from support.simulated import nominal_cam_T_grip
-from support.taught_scenes import CAMERA, arrays, bevelled, image_of, reference, scene, table, taught_from
+from support.taught_scenes import CAMERA, RIG, arrays, bevelled, image_of, reference, scene, table, taught_from
 from support.watched import pose_of, reference_of
 from test_teaching import silhouette_offsets_m
 
@@ -20,8 +20,10 @@ from gripmon.model.records import AlertKind, Frame
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
-from gripmon.teach.edges import TeachingImage, teach
-from gripmon.track.edges import MeasurementSettings, TaughtEdges
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtEdges
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4
@@ -58,7 +60,7 @@ def test_several_jaw_openings_show_the_depth():
     """What the shape of a bevel only suggests: the deviation falls, and the depth stays that of the solid."""
     openings = (0.020, 0.034, 0.048)
     images = [TeachingImage(image_of(BEVEL_M, scene(180.0, o)), o, f"{o}.png") for o in openings]
-    several = teach(CAMERA, box_gripper(), MeasurementSettings(), JAW_SIGMA_M, reference(), images)
+    several = teach(RIG, reference(), images)
     single = taught_from(image_of(BEVEL_M))
     falls = []
     for name, (_, depth_m) in silhouette_offsets_m(BEVEL_M).items():
@@ -82,7 +84,7 @@ def test_the_corners_of_a_real_box_fit_better_where_it_was_taught():
     assert first is not None
     settings = config.settings.monitor
     images = [TeachingImage(first, 0.0, "image0000.png")]
-    taught = teach(config.camera, config.gripper, settings.corners, settings.jaw_sigma_m, config.reference, images)
+    taught = teach(Rig(config.camera, config.gripper, settings), config.reference, images)
     learnt = TaughtEdges.of(taught.edges, config.gripper, config.cam_T_grip, None)
     residual_px = {}
     for name, edges in (("sharp", None), ("taught", learnt)):

@@ -20,8 +20,8 @@ from test_run_on_the_network import configured, running
 from gripmon.cli import main
 from gripmon.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, Policy, TransformClient, Unusable
 from gripmon.client.inbox import SENDS_S, Inbox
-from gripmon.client.judging import judge
-from gripmon.client.names import MonitorName, Start
+from gripmon.client.network import MonitorName, Start
+from gripmon.client.reading import judge
 from gripmon.daemon.neighbours import Reports
 from gripmon.io.publish.presence import Presence, new_monitor_id
 from gripmon.io.wire import Keys, Link, PublishSettings

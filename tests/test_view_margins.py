@@ -19,7 +19,7 @@ from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import (
+from gripmon.teach.visibility import (
     FEWEST_CORNERS,
     Rig,
     behind_another_finger,
@@ -218,4 +218,4 @@ def test_check_says_where_the_jaws_leave_the_view_and_when_the_margin_is_small(
     assert "LESS than" not in said
     path.write_text(path.read_text().replace("monitor:\n", "monitor:\n  policy: {limit_m: 0.1}\n", 1))
     assert main(["check", str(path), "--verbose"]) == 0
-    assert "LESS than the shift past which the reference is measured anew, 100 mm" in capsys.readouterr().out
+    assert "LESS than the shift past which the reference is measured again, 100 mm" in capsys.readouterr().out

@@ -1,1 +1,1 @@
-"""Recordings looked at afterwards: the report and the off-line smoother.  Programs call :mod:`gripmon.analyse.api`."""
+"""Recordings analysed afterwards: the report and the off-line smoother.  Programs call :mod:`gripmon.analyse.api`."""

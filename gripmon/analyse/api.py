@@ -17,10 +17,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from gripmon.analyse.report.build import Told, build
-from gripmon.analyse.report.content import Report
-from gripmon.analyse.smoother import STAGES
-from gripmon.analyse.smoother.corrected import CorrectedRun, correct_table, name_of, write
+from gripmon.analyse.build import Analysed, build
+from gripmon.analyse.content import Report
+from gripmon.analyse.corrected import CorrectedRun, correct_table, name_of, write
+from gripmon.analyse.correction import STAGES
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import to_json
 from gripmon.record.read import Collection, needed_recordings
@@ -36,15 +36,15 @@ _SUFFIXES = (".jsonl", ".parquet", ".rrd")
 
 @dataclass(frozen=True)
 class Reported:
-    """What happened in recordings: as data (SI units), and each recording with what is said of it."""
+    """What happened in recordings: as data (SI units), and each recording with its report."""
 
     report: Report
-    told: tuple[Told, ...]
+    analysed: tuple[Analysed, ...]
 
     @property
     def faults(self) -> tuple[str, ...]:
         """What could not be used, one line each."""
-        return (*self.report.faults, *(fault for each in self.told for fault in each.report.faults))
+        return (*self.report.faults, *(fault for each in self.analysed for fault in each.report.faults))
 
     def json(self) -> bytes:
         """The report as data."""
@@ -52,9 +52,9 @@ class Reported:
 
     def html(self, step: Callable[[], None] = lambda: None) -> bytes:
         """The report as one page that needs no network; ``step`` is called after each recording."""
-        from gripmon.analyse.report.page import page
+        from gripmon.analyse.page import page
 
-        return page(self.report, self.told, step)
+        return page(self.report, self.analysed, step)
 
 
 def report(
@@ -127,7 +127,7 @@ def correct(
 
 def _check_target(out: Path, recordings: Sequence[Path]) -> None:
     if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}", "out")
+        raise InputError(f"{out}: is of no kind that can be written; one of {', '.join(_SUFFIXES)}", "out")
     if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
         raise InputError(f"{out}: is a recording to correct; another file", "out")
 

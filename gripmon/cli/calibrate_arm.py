@@ -106,7 +106,7 @@ def laser(arguments: argparse.Namespace) -> None:
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
     from gripmon.laser.pointer.samples import plan_table
     from gripmon.model.provenance import provenance_of
-    from gripmon.record.write.laser_scene import write as write_scene
+    from gripmon.record.spots import write_calibration
 
     check_outputs(arguments, "out", "picture")
     if arguments.plan is not None and arguments.reach is None:
@@ -126,7 +126,7 @@ def laser(arguments: argparse.Namespace) -> None:
         write_picture(found.picture(), arguments.picture)
     if arguments.recording is not None:
         with writing(arguments.recording, "--recording"):
-            write_scene(arguments.recording, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
+            write_calibration(arguments.recording, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
     if planned is not None:
         write(plan_table(planned), arguments.plan, "--plan")
     write_document(written, arguments.out)

@@ -176,9 +176,9 @@ def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:
     lines += [_image_line(image, width) for image in fit.images]
     lines += [f"note: {note}" for note in notes]
     lines += [
-        f"note: {look.coincidence.sighting.name}: {name} not measured: {reason}"
-        for look in found.looks
-        for name, reason in look.missing.items()
+        f"note: {image.coincidence.sighting.name}: {name} not measured: {reason}"
+        for image in found.images
+        for name, reason in image.missing.items()
     ]
     if fit.consistency_p is not None:
         lines.append(f"the images agree with each other: probability {fit.consistency_p:.2g} of differing as much")

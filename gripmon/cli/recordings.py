@@ -151,7 +151,7 @@ def report(arguments: argparse.Namespace) -> None:
     elif data_path is not None:
         write(found.json() + b"\n", data_path, "--json")
     if arguments.out is not None:
-        with progress_bar(len(found.told), "recording") as step:
+        with progress_bar(len(found.analysed), "recording") as step:
             data = found.html(step)
         write(data, arguments.out)
     if not to_stdout:
@@ -200,8 +200,7 @@ def correct(arguments: argparse.Namespace) -> None:
 def view(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
     from gripmon.record.read import recording_files
-    from gripmon.record.write.files_page import serve_files
-    from gripmon.record.write.viewer import NativeViewer, ViewerError, free_port, has_display, is_free
+    from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
 
     files = recording_files(arguments.recording)
     for path in files:

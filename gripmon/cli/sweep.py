@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.daemon.sweeping import Sweep
     from gripmon.model.camera import Camera
-    from gripmon.teach.forecast import Trial
+    from gripmon.teach.mounts import Trial
 
 ABOUT = """\
 RANGE is FIRST:LAST:COUNT, or single values with commas; write --roll=-90:90:3 where it begins with a minus. \
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.daemon.config import load_config
     from gripmon.daemon.forecast import rig_of
     from gripmon.daemon.sweeping import as_plain, make_grid, sweep
-    from gripmon.teach.forecast.picture import draw_sweep, encoded
+    from gripmon.teach.mount_picture import draw_sweep, encoded
 
     config = load_config(arguments.config[0], check_source=False)
     ranges = {name: _range(name, getattr(arguments, name)) for name in _BOUNDS if getattr(arguments, name) is not None}
@@ -132,7 +132,7 @@ def _as_text(swept: Sweep) -> list[str]:
     lines.append(f"{'present':<10}{_row(config.camera, present)}")
     better = f"{place} of those tried are" if place else "none of those tried is"
     lines.append(f"           {better} better than the present one")
-    lines += [f"           present: {reason}" for reason in present.reasons]
+    lines += [f"           present: {fault.text}" for fault in present.faults]
     lines += _failing(ranked)
     lines += [
         "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
@@ -166,23 +166,21 @@ def _looked_at(config: Config, present: Trial) -> list[str]:
 
 
 def _row(camera: Camera, trial: Trial) -> str:
-    mount, covariance = trial.mount, trial.covariance
+    mount, found = trial.mount, trial.measurable
     angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
     cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
     cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
-    if covariance is not None:
-        cells += [_number(math.sqrt(v), 1e3, 3) for v in covariance.diagonal()[:3].tolist()]
-        bound_m = None if trial.promise is None else trial.promise.protection.position_m
-        cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(bound_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
-        cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
-        cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
+    if found is not None:
+        cells += [_number(v, 1e3, 3) for v in found.frame.sigma[:3].tolist()]
+        bound_m = found.promise.protection.position_m
+        cells += [_number(found.worst_sigma_m, 1e3, 3), _number(bound_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
+        cells += ["never" if found.delay_frames is None else str(found.delay_frames)]
+        cells += [_number(found.margin_px, 1.0, 0), _number(found.shift_m, 1e3, 1)]
     row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))
-    return row if trial.works else f"{row}  NO: {trial.reasons[0]}"
+    return row if trial.works else f"{row}  NO: {trial.faults[0].text}"
 
 
-def _number(value: float | None, factor: float, digits: int) -> str:
-    if value is None:
-        return "-"
+def _number(value: float, factor: float, digits: int) -> str:
     scaled = factor * value
     return f"{scaled:.{digits if abs(scaled) < 10.0 or digits < 2 else 1}f}"
 
@@ -191,8 +189,8 @@ def _failing(ranked: list[Trial]) -> list[str]:
     """The commonest first reasons."""
     counts: dict[str, int] = {}
     for trial in ranked:
-        if trial.kind is not None:
-            counts[trial.kind] = counts.get(trial.kind, 0) + 1
+        if trial.faults:
+            counts[trial.faults[0].kind] = counts.get(trial.faults[0].kind, 0) + 1
     commonest = sorted(counts.items(), key=lambda item: -item[1])[:_REASONS_SHOWN]
     return [
         f"{'others' if k == 0 else '':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(commonest)

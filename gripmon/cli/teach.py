@@ -25,9 +25,10 @@ from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.teach.edges import Taught
-    from gripmon.teach.edges.bench import Found
-    from gripmon.teach.page import Desk, RoughDesk, Saved
+    from gripmon.teach.measure import Taught
+    from gripmon.teach.messages import Saved
+    from gripmon.teach.page_server import OutlineSession
+    from gripmon.teach.session import Evaluation, TeachSession
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
@@ -168,7 +169,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach --page`` and ``--corners``."""
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
-    from gripmon.daemon.teaching import page_desk, read_inputs, rough_desk, teach_from_file
+    from gripmon.daemon.teaching import outline_session, page_session, read_inputs, teach_from_file
 
     images = arguments.image
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
@@ -176,13 +177,13 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
             right = "one image, to put rough corners in, or --gripper FILE"
             raise InputError(f"teach: {len(images)} images, and no gripper; {right}")
         folder = arguments.out or Path()
-        desk = rough_desk(images[0], arguments.camera, folder)
+        session = outline_session(images[0], arguments.camera, folder)
         make_directory(folder)
         try:
-            _serve(arguments, desk)
+            _serve(arguments, session)
         finally:
-            if desk.saved is not None:
-                _say(desk.saved)
+            if session.saved is not None:
+                _say(session.saved)
         return
     files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
     inputs = read_inputs(
@@ -191,7 +192,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
     )  # fmt: skip
     make_directory(inputs.folder)
     if arguments.page:
-        _serve(arguments, page_desk(inputs))
+        _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
     print("\n".join(_table(found)))
@@ -232,14 +233,14 @@ def _say(saved: Saved) -> None:
     print("\n".join(lines), flush=True)
 
 
-def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> None:
+def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> None:
     """Until the person is done."""
-    from gripmon.teach.page import PageServer
+    from gripmon.teach.page_server import PageServer
 
     try:
-        server = PageServer(desk, arguments.port)
+        server = PageServer(session, arguments.port)
     except OSError as error:
-        desk.close()
+        session.close()
         wrong = f"can't be listened on ({error.strerror}); another one, or none"
         raise InputError(f"--port {arguments.port}: {wrong}") from None
     try:
@@ -249,15 +250,15 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> None:
         if not arguments.no_browser and displayed:
             webbrowser.open(server.url)
         while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
-            dark_s, why = desk.dark()
+            dark_s, why = session.dark()
             if arguments.live_wait is not None and dark_s > arguments.live_wait:
                 raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
     finally:
         server.close()
-        desk.close()
+        session.close()
 
 
-def _table(found: Found) -> list[str]:
+def _table(found: Evaluation) -> list[str]:
     """What was seen, for a person."""
     snapped = found.snapped
     width = max(len(corner.name) for corner in snapped.corners)
@@ -276,11 +277,11 @@ def _table(found: Found) -> list[str]:
         if found.pose.rival:
             rival = "another pose explains these corners as well; a corner outside of their plane would tell"
             lines.append(f"note: {rival}")
-    expected = found.prospects
+    expected = found.expected
     if expected is not None:
         lines.append(f"expected of a frame   {_axes(expected.sigma)}")
         lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
-        lines.append(f"promise               {expected.promise.text()}")
+        lines.append(f"promise               {expected.promise}")
     return lines
 
 

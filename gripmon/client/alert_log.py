@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from gripmon.client.names import MonitorName
-from gripmon.client.status import MonitorStatus
+from gripmon.client.fleet import MonitorStatus
+from gripmon.client.network import MonitorName
 from gripmon.model.records import AlertRecord
 
 _WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost

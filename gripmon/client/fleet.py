@@ -1,46 +1,120 @@
-"""All monitors on the network at once."""
+"""All monitors on the network at once: what is known of each, and how bad that is."""
 
 from __future__ import annotations
 
+import enum
 import logging
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import msgspec
 import zenoh
 import zenoh.ext
 
-from gripmon.client.names import MonitorName, monitor_name, start_of
-from gripmon.client.network import named_as_arguments, reader_settings
-from gripmon.client.status import MonitorStatus
+from gripmon.client.network import (
+    Listener,
+    MonitorName,
+    in_zenohs_thread,
+    monitor_name,
+    named_as_arguments,
+    reader_settings,
+    start_of,
+)
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
-from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
+from gripmon.model.records import AlertRecord, MessageRefused, Severity, StandingAlert, StateRecord, from_json
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 _log = logging.getLogger(__name__)
 
-MOST_MONITORS = 50_000
-"""More names than this are not kept, so that whoever writes to the network can't fill the memory."""
+SILENT_AFTER_S = 5.0
+"""A monitor sends its state once a second; one that hasn't for so long, though its session stands, hangs."""
+MONITORS_KEPT = 50_000
+"""More names than this are not kept, so that no writer on the network can fill the memory."""
+_STARTS_KEPT = 16  # of one name: two are too many already
+_RATE_TRANSFORMS = 64  # over which the rate is measured
+_ALERTS_KEPT = 64  # of each monitor: twice what its publisher repeats to subscribers that come late
+_RANK = {Severity.ERROR: 0, Severity.WARNING: 1, Severity.INFO: 2}
 
-_RATE_OVER = 64
-_ALERTS_REMEMBERED = 64  # of each monitor: twice what its publisher repeats to whoever comes late
+
+class Condition(enum.StrEnum):
+    """How a monitor is, the worst first."""
+
+    GONE = "gone"
+    STOPPED = "stopped"
+    SILENT = "silent"
+    SEVERAL = "several"
+    UNKNOWN = "unknown"
+    STARTING = "starting"
+    SUSPECT = "suspect"
+    VALID = "valid"
 
 
-_MOST_STARTS = 16  # of one name: two are too many already
+class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One monitor as it stood when it was asked for.
 
-_Said = tuple[StateRecord | None, float]
-"""The last state message, and when it was heard by the monotonic clock, s."""
+    ``state`` is its last state message, None before the first; ``state_age_s`` the time since that arrived, or since
+    the monitor was first seen.  ``gone_since_ns``: when its liveliness token vanished, by our clock; None while it is
+    there.  ``monitor_id`` is that of its start, empty before it is known; ``several``: another start of the same
+    name is there, too, so that neither may be used.  ``transforms_per_s`` and ``transform_age_s`` (since the last one
+    arrived, however long it was on its way: to move by it ask a TransformClient) are None unless transforms are
+    listened to and came.
+    """
+
+    name: MonitorName
+    state: StateRecord | None
+    state_age_s: float
+    gone_since_ns: int | None = None
+    transforms_per_s: float | None = None
+    transform_age_s: float | None = None
+    monitor_id: str = ""
+    several: bool = False
+
+    @property
+    def condition(self) -> Condition:
+        """By its token, its silence, and the verdict on its last transform; starting before its first state message."""
+        if self.gone_since_ns is not None:
+            # What else was wrong may follow.
+            stopped = self.state is not None and self.state.message.partition(";")[0] == "stopped"
+            return Condition.STOPPED if stopped else Condition.GONE
+        if self.state_age_s > SILENT_AFTER_S:
+            return Condition.SILENT
+        if self.several:
+            return Condition.SEVERAL
+        if self.state is None:
+            return Condition.STARTING
+        return Condition(self.state.verdict.value)
+
+    @property
+    def drift_m(self) -> float | None:
+        """How far the TCP is from where the reference has it, m; None if that isn't known."""
+        if self.state is None or self.state.tcp_shift_m is None:
+            return None
+        return math.hypot(*self.state.tcp_shift_m)
+
+    @property
+    def alerts(self) -> tuple[StandingAlert, ...]:
+        """Those that are open: the worst first, of these what is not acknowledged, then the newest."""
+        alerts = () if self.state is None else self.state.open_alerts
+        return tuple(sorted(alerts, key=lambda a: (_RANK[a.severity], a.acknowledged, -(a.since_ns or 0))))
+
+
+def trouble(status: MonitorStatus) -> tuple[object, ...]:
+    """Sorts the worst first: by condition, then the severest alert that is open, then the drift, then the name."""
+    severest = min((_RANK[alert.severity] for alert in status.alerts), default=len(_RANK))
+    return list(Condition).index(status.condition), severest, -(status.drift_m or 0.0), status.name
 
 
 @dataclass(slots=True)
 class _Known:
     """What is known of one monitor; times by the monotonic clock unless they end with ``_ns``.
 
-    ``starts``: by the id of each that is there, what it said; more than one are several monitors of one name.
+    ``starts``: by the id of each that is there, its last state message and when that was heard; more than one are
+    several monitors of one name.
     """
 
     heard_s: float
@@ -48,16 +122,16 @@ class _Known:
     gone_since_ns: int | None = None
     state: StateRecord | None = None
     unreadable: str = ""
-    transforms_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_OVER))
-    starts: dict[str, _Said] = field(default_factory=dict)
-    alerts: deque[int] = field(default_factory=lambda: deque(maxlen=_ALERTS_REMEMBERED))
+    transforms_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_TRANSFORMS))
+    starts: dict[str, tuple[StateRecord | None, float]] = field(default_factory=dict)
+    alerts: deque[int] = field(default_factory=lambda: deque(maxlen=_ALERTS_KEPT))
 
 
-class Fleet:
+class Fleet(Listener):
     """Listens to every monitor's state and liveliness token, and to more if asked to.  Any thread may ask.
 
-    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  What a
-    monitor that vanished said last is kept.
+    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  The
+    last message of a monitor that vanished is kept.
     """
 
     def __init__(
@@ -75,21 +149,16 @@ class Fleet:
         ``on_presence`` a monitor that has come (``gone_since_ns`` is None) or vanished.  Both are called in Zenoh's
         threads: they must return soon and not raise.  Raises :class:`gripmon.io.wire.PublishError`.
         """
+        super().__init__()
         self.unreadable = 0
         self._transforms, self._on_alert, self._on_presence = transforms, on_alert, on_presence
         self._known: dict[MonitorName, _Known] = {}
         self._lock = threading.Lock()  # guards what is above against Zenoh's threads
         self._keys = Keys("*", "*")
-        self._declared: list[object] = []  # Zenoh undeclares what nobody refers to
+        self._declared: list[object] = []  # Zenoh undeclares what is referred to no more
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
         self._link.attach(self._declare)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def monitors(self) -> list[MonitorStatus]:
         """Everyone seen since the start, in no order; of several that have one name each that is there."""
@@ -106,24 +175,20 @@ class Fleet:
         self._link.close()
 
     def _declare(self, session: zenoh.Session) -> None:
-        def callback(take: Callable[[zenoh.Sample], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-            # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
-            return zenoh.handlers.Callback(take, indirect=False)
-
         keys, tokens = self._keys, session.liveliness()
         self._declared = [
-            session.declare_subscriber(keys["state"], callback(self._take_state)),
-            tokens.declare_subscriber(keys["alive"], callback(self._take_token), history=True),
-            tokens.declare_subscriber(keys["alive/*"], callback(self._take_start), history=True),
+            session.declare_subscriber(keys["state"], in_zenohs_thread(self._take_state)),
+            tokens.declare_subscriber(keys["alive"], in_zenohs_thread(self._take_token), history=True),
+            tokens.declare_subscriber(keys["alive/*"], in_zenohs_thread(self._take_start), history=True),
         ]
         if self._transforms:
-            self._declared.append(session.declare_subscriber(keys["transform"], callback(self._take_transform)))
+            self._declared.append(session.declare_subscriber(keys["transform"], in_zenohs_thread(self._take_transform)))
         if self._on_alert is not None:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
             recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
             self._declared.append(
                 zenoh.ext.declare_advanced_subscriber(
-                    session, keys["alert"], callback(self._take_alert), history=history, recovery=recovery
+                    session, keys["alert"], in_zenohs_thread(self._take_alert), history=history, recovery=recovery
                 )
             )
 
@@ -147,9 +212,9 @@ class Fleet:
                 return
             if token.kind == zenoh.SampleKind.DELETE:
                 known.starts.pop(start.monitor_id, None)
-                if known.starts:  # what is left of several is not what the other one said
+                if known.starts:  # of several, the ones left sent something else
                     known.state, known.heard_s = next(reversed(known.starts.values()))
-            elif len(known.starts) < _MOST_STARTS:
+            elif len(known.starts) < _STARTS_KEPT:
                 state = known.state if known.state and known.state.monitor_id == start.monitor_id else None
                 known.starts.setdefault(start.monitor_id, (state, now_s))
 
@@ -162,7 +227,7 @@ class Fleet:
             known.present = not known.present
             known.gone_since_ns = None if known.present else time.time_ns()
             if known.present:
-                known.state, known.heard_s = None, now_s  # what it said before its end says nothing of now
+                known.state, known.heard_s = None, now_s  # a message from before its end says nothing of now
                 known.transforms_s.clear()
             status = _status(name, known, now_s)
         if self._on_presence is not None:
@@ -188,7 +253,7 @@ class Fleet:
         self._on_alert(name, record, payload)
 
     def _read(self, name: MonitorName, sample: zenoh.Sample, kind: type[_T]) -> _T | None:
-        """The message, or None if it is none: that is counted, and said once for each monitor and reason."""
+        """The message, or None if it is none: that is counted, and logged once for each monitor and reason."""
         try:
             return from_json(sample.payload.to_bytes(), kind)
         except MessageRefused as error:
@@ -205,10 +270,10 @@ class Fleet:
     def _about(self, name: MonitorName) -> _Known | None:
         """What is known of it, a new entry if it is new; None if there are too many.  With the lock held."""
         known = self._known.get(name)
-        if known is None and len(self._known) < MOST_MONITORS:
+        if known is None and len(self._known) < MONITORS_KEPT:
             known = self._known[name] = _Known(time.monotonic())
-            if len(self._known) == MOST_MONITORS:
-                _log.error("%d monitors; any more are not listened to", MOST_MONITORS)
+            if len(self._known) == MONITORS_KEPT:
+                _log.error("%d monitors; any more are not listened to", MONITORS_KEPT)
         return known
 
 

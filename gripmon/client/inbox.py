@@ -1,29 +1,122 @@
-"""What came from the network: Zenoh's threads write, any number of others read without waiting."""
+"""What came from the network: Zenoh's threads write, any number of others read without waiting.
+
+How long a transform was on its way is known without clocks that show the same time.  A message says what the monitor's
+steady clock showed when it was sent.  That alone tells nothing: one that waited for ten seconds looks like one of a
+clock that is ten seconds behind, and the fastest message ever seen may have waited, too.  A question and its answer do
+tell: what the answer says was read after the question was asked, so the monitor's clock is ahead of ours by no more
+than the difference of the two readings, however long either was on its way.  From then on that bound grows with the
+drift of the two clocks, and every further answer may only lower it.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
-from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
-from gripmon.client.message import transform_message
-from gripmon.client.names import MonitorName, Start
-from gripmon.model.records import ClockReading, FrameRecord, MessageRefused
+from gripmon.client.network import MonitorName, Start
+from gripmon.io.wire import MOST_DRIFT
+from gripmon.model.records import (
+    ClockReading,
+    FrameRecord,
+    MessageRefused,
+    Verdict,
+    from_json,
+)
 
 _log = logging.getLogger(__name__)
 
-MOST_PRESENT = 16
-"""Names of more monitors are not kept: two are too many already, and a stranger may make up any number."""
-
-
+_CLOCKS_KEPT = 16
+"""Each start of a monitor has one, and a stranger may make up any number."""
+PRESENT_KEPT = 16
+"""Monitors whose names are kept: two are too many already, and a stranger may make up any number."""
 HELD_BACK_S = 1.0
-"""So long a transform of which it isn't known how old it is waits for that, before those who wait for one are told.
-The monitor is asked meanwhile; an answer takes milliseconds."""
+"""A transform whose age isn't known waits for that long before it is handed on.  The monitor is asked meanwhile; an
+answer takes milliseconds."""
 SENDS_S = 1.0
 """Who sent a transform within that time is there, also where a router's rules let no token of its start through."""
+_UNIT_TOLERANCE = 1e-3  # of a quaternion's length
+
+
+class Sent(NamedTuple):
+    """What the monitor's clock showed when a message was sent, and ours (steady, ns) when it arrived."""
+
+    reading: ClockReading
+    arrived_ns: int
+
+
+class Lead(NamedTuple):
+    """At ``at_ns`` by our steady clock, a monitor's was ahead of it by at most ``most_ns``; both may be negative."""
+
+    most_ns: int
+    at_ns: int
+
+    def most_at_ns(self, when_ns: int) -> int:
+        """The same at another time, ns; the clocks have drifted since."""
+        return self.most_ns + math.ceil(MOST_DRIFT * abs(when_ns - self.at_ns))
+
+
+Leads = Mapping[str, Lead]
+"""By the clock's name."""
+
+NO_LEADS: Leads = MappingProxyType({})
+
+
+def with_answer(leads: Leads, answer: ClockReading, asked_ns: int, answered_ns: int) -> Leads:
+    """What is known after an answer.  What contradicts it was true before a clock jumped, and is forgotten."""
+    round_trip_ns = answered_ns - asked_ns
+    lead = Lead(answer.now_ns - asked_ns + math.ceil(MOST_DRIFT * round_trip_ns), asked_ns)
+    before = leads.get(answer.clock)
+    if before is not None and before.most_at_ns(answered_ns) >= answer.now_ns - answered_ns:
+        lead = min(lead, before, key=lambda each: each.most_at_ns(answered_ns))
+    kept = {clock: known for clock, known in leads.items() if clock != answer.clock}
+    return dict(list(kept.items())[1 - _CLOCKS_KEPT :]) | {answer.clock: lead}
+
+
+def without_contradicted(leads: Leads, sent: Sent) -> Leads:
+    """What is known after a message: nothing of its clock, if it would have arrived before it was sent."""
+    waited_ns = _waited_ns(leads, sent)
+    if waited_ns is None or waited_ns >= 0:
+        return leads
+    return {clock: lead for clock, lead in leads.items() if clock != sent.reading.clock}
+
+
+def waited_s(leads: Leads, sent: Sent | None) -> float | None:
+    """How long the message was on its way at most, s; None if that isn't known."""
+    waited_ns = None if sent is None else _waited_ns(leads, sent)
+    return None if waited_ns is None else 1e-9 * waited_ns
+
+
+def _waited_ns(leads: Leads, sent: Sent) -> int | None:
+    lead = leads.get(sent.reading.clock)
+    return None if lead is None else sent.arrived_ns + lead.most_at_ns(sent.arrived_ns) - sent.reading.now_ns
+
+
+def transform_message(payload: bytes) -> FrameRecord:
+    """Checked before anything moves by it; that all numbers are finite JSON ensures.
+
+    Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose.
+    """
+    record = from_json(payload, FrameRecord)
+    smoothed, bounds = record.smoothed, record.protection
+    for pose in (record.cam_T_grip, smoothed):
+        if pose is not None and not abs(math.hypot(*pose.rotation_xyzw) - 1.0) < _UNIT_TOLERANCE:
+            raise MessageRefused("a transform that is no pose")
+    for covariance in (record.covariance, None if smoothed is None else smoothed.covariance):
+        if covariance is not None and min(covariance[::7]) < 0.0:
+            raise MessageRefused("a covariance with a variance below 0")
+    if bounds is not None and not (min(bounds.position_m, bounds.rotation_rad) >= 0.0 and 0.0 < bounds.risk <= 1.0):
+        raise MessageRefused("a protection level below 0, or a risk that is not within 0 and 1")
+    if record.verdict is not Verdict.UNKNOWN and (record.cam_T_grip is None or record.covariance is None):
+        raise MessageRefused(f"verdict {record.verdict} without a transform and its covariance")
+    for name in ("seq", "stamp_ns", "revision", "latency_ns"):
+        if not 0 <= getattr(record, name) <= 2**63 - 1:
+            raise MessageRefused(f"{name} is not within 0 and 2⁶³ - 1")
+    return record
 
 
 class Entry(NamedTuple):
@@ -40,12 +133,12 @@ class Entry(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """What readings are made from; replaced as a whole, so that who reads it needs no lock.
+    """What readings are made from; replaced as a whole, so that reading it needs no lock.
 
     ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
     vanished since; ``unreadable``: what was wrong with the last message, if it could not be read; ``leads``: what is
     known of the monitors' clocks.  ``starts``: by their tokens, which processes these monitors are; ``senders``: when
-    each that sends was heard last; ``elsewhere``: other monitors on the network, where somebody has looked for them.
+    each that sends was heard last; ``elsewhere``: other monitors on the network, where they were looked for.
     """
 
     entry: Entry | None = None
@@ -60,14 +153,14 @@ class Heard(NamedTuple):
 
 
 class Waiter(Protocol):
-    """Somebody who waits for news; neither method may wait itself."""
+    """An iterator that waits for news; neither method may wait itself."""
 
     def put(self, entry: Entry) -> None: ...
     def wake(self) -> None: ...
 
 
 class Inbox:
-    """The newest message, who is there, and who wants to be told."""
+    """The newest message, who is there, and which iterators wait for the next one."""
 
     def __init__(self) -> None:
         self.heard = Heard()
@@ -75,7 +168,7 @@ class Inbox:
         self._lock = threading.Lock()  # for those who write
         self._held: Entry | None = None
         self._held_since_s: float | None = None
-        self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # an iterator that is let go is told no more
+        self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # an iterator that is let go gets no more
 
     def take(self, monitor: MonitorName, payload: bytes, arrival_s: float, sent: Sent | None = None) -> None:
         """A message arrived."""
@@ -86,18 +179,12 @@ class Inbox:
             return
         with self._lock:
             leads = self.heard.leads if sent is None else without_contradicted(self.heard.leads, sent)
-            self._set(
-                entry=entry,
-                present=self._present_with(monitor),
-                cut=False,
-                unreadable="",
-                leads=leads,
-                senders=_with_sender(self.heard.senders, entry),
-            )
+            present, senders = self._present_with(monitor), _with_sender(self.heard.senders, entry)
+            self._set(entry=entry, present=present, cut=False, unreadable="", leads=leads, senders=senders)
             self._hand_over(entry)
 
     def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
-        """A monitor said what its clock shows; both times by our steady clock."""
+        """A monitor answered what its clock shows; both times by our steady clock."""
         with self._lock:
             self._set(leads=with_answer(self.heard.leads, answer, asked_ns, answered_ns))
             held, self._held = self._held, None
@@ -124,7 +211,7 @@ class Inbox:
     def started(self, start: Start) -> None:
         """The token of this start is there."""
         with self._lock:
-            if len(self.heard.starts) < MOST_PRESENT:
+            if len(self.heard.starts) < PRESENT_KEPT:
                 self._set(starts=self.heard.starts | {start})
             self._wake()
 
@@ -136,7 +223,7 @@ class Inbox:
     def found(self, monitor: MonitorName) -> None:
         """It is on the network, whether it is the one that is meant or not."""
         with self._lock:
-            if len(self.heard.elsewhere) < MOST_PRESENT:
+            if len(self.heard.elsewhere) < PRESENT_KEPT:
                 self._set(elsewhere=self.heard.elsewhere | {monitor})
 
     def close(self) -> None:
@@ -146,7 +233,7 @@ class Inbox:
             self._wake()
 
     def join(self, waiter: Waiter) -> None:
-        """Tell it from now on, as long as somebody else refers to it."""
+        """Give it every message from now on, as long as it is referred to elsewhere."""
         with self._lock:
             self._waiters.add(waiter)
 
@@ -167,13 +254,13 @@ class Inbox:
     def _refuse(self, monitor: MonitorName, text: str) -> None:
         with self._lock:
             self.unreadable += 1
-            if self.heard.unreadable != text:  # said once, and again when it is something else or was over
+            if self.heard.unreadable != text:  # logged once, and again when it is something else or was over
                 _log.warning("%s: a transform message can't be read: %s", monitor, text)
                 self._set(unreadable=text)
 
     def _present_with(self, monitor: MonitorName) -> frozenset[MonitorName]:
         present = self.heard.present
-        return present if len(present) >= MOST_PRESENT else present | {monitor}
+        return present if len(present) >= PRESENT_KEPT else present | {monitor}
 
     def _set(self, **changes: object) -> None:
         before = self.heard
@@ -195,7 +282,7 @@ class Inbox:
 
 
 def several(heard: Heard, now_s: float) -> str:
-    """What to say where more than one monitor is there at ``now_s``; empty if there is one at most."""
+    """The text where more than one monitor is there at ``now_s``; empty if there is one at most."""
     if len(heard.present) > 1:  # the camera isn't named
         names = ", ".join(map(str, sorted(heard.present)))
         return f"more than one monitor is there: {names}; name the camera"
@@ -209,4 +296,4 @@ def _with_sender(senders: tuple[tuple[Start, float], ...], entry: Entry) -> tupl
     """With who sent just now, and without those that are silent."""
     start, now_s = entry.start, entry.arrival_s
     others = tuple(sender for sender in senders if sender[0] != start and now_s - sender[1] < SENDS_S)
-    return (*others[1 - MOST_PRESENT :], (start, now_s))
+    return (*others[1 - PRESENT_KEPT :], (start, now_s))

@@ -1,18 +1,24 @@
-"""A reader of everything that one monitor says, which can also tell it something."""
+"""A reader of everything that one monitor sends, which also sends it commands."""
 
 from __future__ import annotations
 
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import msgspec
 import zenoh
 
-from gripmon.client.names import MonitorName, Start, monitor_name, start_of
-from gripmon.client.network import named_as_arguments, reader_settings
+from gripmon.client.network import (
+    Listener,
+    MonitorName,
+    Start,
+    monitor_name,
+    named_as_arguments,
+    reader_settings,
+    start_of,
+)
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 from gripmon.model.records import (
     CommandError,
@@ -51,10 +57,10 @@ class Ambiguous(LookupError):
         self.argument = argument
 
 
-class Client:
+class Client(Listener):
     """Reads one monitor's messages.  Not for several threads at once, except for :meth:`close`.
 
-    A slow reader never holds anybody up: the newest ``depth`` records wait for it, older ones are dropped.
+    A slow reader never holds up the monitor: the newest ``depth`` records wait for it, older ones are dropped.
     """
 
     def __init__(
@@ -72,6 +78,7 @@ class Client:
         Raises ValueError for a name that can't be part of a key, and :class:`gripmon.io.wire.PublishError` for a bad
         configuration.
         """
+        super().__init__()
         self.keys = Keys(robot, camera if camera is not None else "*")
         settings = reader_settings(connect, zenoh_config_file)
         with named_as_arguments():
@@ -81,13 +88,6 @@ class Client:
         self._heard: MonitorName | None = None
         self._newest: FrameRecord | None = None
         self._samples = self._subscribe()
-        self._threads: list[threading.Thread] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def latest(self) -> FrameRecord | None:
         """The newest record, at once; the same one again while no newer one came; None before the first.
@@ -111,14 +111,7 @@ class Client:
 
         An exception in the callback ends its thread and goes to ``threading.excepthook``.
         """
-        samples = self._subscribe()
-
-        def pump() -> None:
-            for record in self._records(samples):
-                callback(record)
-
-        self._threads.append(threading.Thread(target=pump, name="gripmon-client", daemon=True))
-        self._threads[-1].start()
+        self._call_back(callback, self._records(self._subscribe()))
 
     def state(self, timeout_s: float = 1.0) -> StateRecord | None:
         """The monitor's last state message; None if no monitor answers in time."""
@@ -130,8 +123,7 @@ class Client:
 
     def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
         """The monitors of this name that run now, in order; all on the network for ``Client("*")``."""
-        replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
-        return tuple(sorted({monitor_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
+        return tuple(sorted(map(monitor_name, self._tokens(self.keys["alive"], timeout_s))))
 
     def send(
         self,
@@ -149,13 +141,14 @@ class Client:
         :class:`Ambiguous` if the name is that of more than one monitor; ValueError for a request that can't be one.
         ``monitor_id`` names the start of the monitor that is meant; without it there must be one.
         """
-        return self._ask(CommandRequest(argument, _or_new(request_id), monitor_id), name, timeout_s)[0]
+        new_id = uuid.uuid4().hex if request_id is None else request_id
+        return self._ask(CommandRequest(argument, new_id, monitor_id), name, timeout_s)[0]
 
     def snapshot(self, timeout_s: float = 5.0, *, monitor_id: str = "") -> tuple[CommandReply, bytes | None]:
         """The monitor's state and newest frame, and a file of its image, as ``reply.snapshot.image`` says; None if it
         has none.  Raises as :meth:`send`.
         """
-        return self._ask(CommandRequest("", _or_new(None), monitor_id), CommandName.SNAPSHOT, timeout_s)
+        return self._ask(CommandRequest("", uuid.uuid4().hex, monitor_id), CommandName.SNAPSHOT, timeout_s)
 
     def close(self) -> None:
         """Leave the network; iterations and callbacks end.
@@ -163,9 +156,7 @@ class Client:
         It waits for a callback that is at work, unless it is called in one.
         """
         self._session.close()
-        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
-            for thread in self._threads:
-                thread.join()
+        super().close()
 
     def _subscribe(self) -> zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]:
         return self._session.declare_subscriber(self.keys["transform"], zenoh.handlers.RingChannel(self._depth))
@@ -226,8 +217,7 @@ class Client:
 
     def _only_start(self, monitor: MonitorName, monitor_id: str) -> Start:
         """The one start of it that is meant; one without an id where none shows any."""
-        replies = self._session.liveliness().get(Keys(*monitor)["alive/*"], timeout=1.0)
-        starts = sorted({start_of(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+        starts = sorted(map(start_of, self._tokens(Keys(*monitor)["alive/*"])))
         names = ", ".join(start.monitor_id for start in starts)
         if monitor_id:
             if starts and Start(monitor, monitor_id) not in starts:
@@ -243,9 +233,13 @@ class Client:
         """Who is there instead of the monitor that is meant."""
         if not any(True for _ in self._session.info.links()):
             return f"there is no connection to {self._where}"
-        replies = self._session.liveliness().get(Keys("*", "*")["alive"], timeout=1.0)
-        names = sorted({str(monitor_name(reply.ok.key_expr)) for reply in replies if reply.ok is not None})
+        names = sorted(str(monitor_name(key)) for key in self._tokens(Keys("*", "*")["alive"]))
         return f"there are {', '.join(names)}" if names else f"none at all at {self._where}"
+
+    def _tokens(self, key: str, timeout_s: float = 1.0) -> set[str]:
+        """The liveliness tokens that are there."""
+        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def _check_name(self, key: zenoh.KeyExpr) -> None:
         name = monitor_name(key)
@@ -255,10 +249,6 @@ class Client:
             raise LookupError(
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
-
-
-def _or_new(request_id: str | None) -> str:
-    return uuid.uuid4().hex if request_id is None else request_id
 
 
 def _is_of_another(reply: zenoh.Reply) -> bool:

@@ -1,18 +1,24 @@
-"""What a controller gets: a transform, its age, and whether it may be used."""
+"""What a controller gets: a transform, its age, and whether it may be used by its own policy."""
 
 from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from gripmon.client.names import MonitorName
-from gripmon.model.records import Origin, Protection, Smoothed, State, Transform, Verdict
+from gripmon.client.inbox import Entry, Heard, several, waited_s
+from gripmon.client.network import MonitorName
+from gripmon.model.records import FrameRecord, Origin, Protection, Smoothed, State, Transform, Verdict
 
 if TYPE_CHECKING:
     from gripmon.model.records import Array
+
+CLOCK_AHEAD_LIMIT_S = 0.1
+"""A stamp further ahead than this is of a clock that doesn't agree: those that NTP keeps, on whatever network, are
+within some tens of milliseconds."""
 
 
 class Unusable(enum.StrEnum):
@@ -50,9 +56,9 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
     ``accept_suspect``: allow what is held, uncertain or not confirmed, too; ``max_sigma_m``: allow a transform only
     while the standard deviation of the TCP along each camera axis is at most that; ``max_protection_m``: only while its
     protection level, the bound on the TCP's position error, is known and at most that (None: the verdict decides by the
-    monitor's own alert limit).  ``clocks_agree``: the clocks of
-    monitor and controller show the same time (the same machine, PTP): the age then counts from the capture by their
-    stamps if that is more, and a stamp of the future is refused.
+    monitor's own alert limit).  ``clocks_agree``: the clocks of monitor and controller show the same time (the same
+    machine, PTP): the age then counts from the capture by their stamps if that is more, and a stamp of the future is
+    refused.
     """
 
     max_age_s: float = 0.2
@@ -78,7 +84,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
 
     ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` bounds
     the time since the monitor was handed the frame: what it needed for it, how long the message was on its way at most
-    (:mod:`gripmon.client.age`), and the time since it arrived; the way of the image into the monitor is not in it.
+    (:mod:`gripmon.client.inbox`), and the time since it arrived; the way of the image into the monitor is not in it.
     Infinite if no transform came yet, or nothing tells how long it was on its way.  ``stamp_ns`` is the capture time by
     the monitor's clock, ``monitor_id`` the start of the monitor that it is from.
     """
@@ -105,11 +111,12 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         """Do both rest on the same reference of one start of the monitor?  Only then may one be subtracted from the
         other.  False without one.
         """
-        return self.revision >= 0 and self._rests_on() == other._rests_on()
+        names = ("monitor", "monitor_id", "reference_id", "revision")
+        return self.revision >= 0 and all(getattr(self, name) == getattr(other, name) for name in names)
 
     def sigma_m(self) -> float:
         """Standard deviation of the TCP's position, m: the largest along a camera axis; infinite without one."""
-        return largest_sigma_m(self.covariance)
+        return _largest_sigma_m(self.covariance)
 
     def matrix(self, *, smoothed: bool = False) -> Array:
         """``cam_T_grip`` as a NumPy array (4, 4), m; raises :class:`NotUsable` without a transform.  Loads NumPy.
@@ -119,22 +126,129 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         pose = self.smoothed if smoothed and self.smoothed is not None else self.transform
         if pose is None:
             raise NotUsable(self)
-        import numpy as np
+        from gripmon.model.geometry import from_record
 
-        x, y, z, w = pose.rotation_xyzw
-        matrix = np.eye(4)
-        matrix[:3, :3] = (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
-        matrix[:3, 3] = pose.translation_m
-        return matrix
-
-    def _rests_on(self) -> tuple[MonitorName | None, str, str, int]:
-        return self.monitor, self.monitor_id, self.reference_id, self.revision
+        return from_record(Transform(pose.translation_m, pose.rotation_xyzw))
 
 
-def largest_sigma_m(covariance: tuple[float, ...] | None) -> float:
+def _largest_sigma_m(covariance: tuple[float, ...] | None) -> float:
     """The largest standard deviation of the position along an axis, m; infinite without a covariance."""
     return math.inf if covariance is None else math.sqrt(max(covariance[0], covariance[7], covariance[14]))
+
+
+_Refusal = tuple[Unusable, str]
+
+
+def judge(
+    heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_ns: int, fault: Callable[[], str]
+) -> Reading:
+    """The reading of ``entry`` at ``now_s`` by the monotonic clock, ``wall_ns`` by the wall clock.
+
+    ``heard`` says who is there; ``fault`` is asked only where there is no entry: whom there is no connection to.
+    """
+    if entry is None:
+        why, reason = _cut_off(heard, None, now_s) or _silence(heard, fault)
+        return Reading(monitor=None, verdict=Verdict.UNKNOWN, usable=False, why=why, reason=reason, age_s=math.inf)
+    record = entry.record
+    age_s = _age_s(heard, entry, policy, now_s, wall_ns)
+    lost = _cut_off(heard, entry, now_s) or _holds_no_longer(heard, entry, age_s, policy, wall_ns)
+    refusal = lost or _against_policy(record, policy)
+    return Reading(
+        monitor=entry.monitor,
+        verdict=Verdict.UNKNOWN if lost else record.verdict,
+        usable=refusal is None,
+        why=refusal[0] if refusal else None,
+        reason=refusal[1] if refusal else "",
+        age_s=age_s,
+        transform=None if lost else record.cam_T_grip,
+        covariance=None if lost else record.covariance,
+        smoothed=None if lost else record.smoothed,
+        protection=None if lost else record.protection,
+        state=record.state,
+        source=record.source,
+        stamp_ns=record.stamp_ns,
+        seq=record.seq,
+        reference_id=record.reference_id,
+        revision=record.revision,
+        monitor_id=record.monitor_id,
+    )
+
+
+def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
+    """It is not older, s; infinite if nothing tells how long it was on its way."""
+    age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.record.latency_ns
+    on_its_way_s = waited_s(heard.leads, entry.sent)
+    if policy.clocks_agree:
+        return max(age_s + (on_its_way_s or 0.0), 1e-9 * (wall_ns - entry.record.stamp_ns))
+    return math.inf if on_its_way_s is None else age_s + on_its_way_s
+
+
+def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None:
+    """Is it unclear whether the monitor, and which one, still stands by its last message?"""
+    if heard.closed:
+        return Unusable.CLOSED, "the client is closed"
+    if text := several(heard, now_s):
+        return Unusable.SEVERAL, text
+    if entry is None or not heard.cut:
+        return None
+    if _is_back(heard, entry):
+        return Unusable.RESTARTED, "the monitor was gone and is back, but has sent no transform yet"
+    return Unusable.GONE, "the monitor is gone"
+
+
+def _is_back(heard: Heard, entry: Entry) -> bool:
+    """Is the monitor that vanished there again?  Of its two tokens either may be the last to go."""
+    if entry.monitor not in heard.present:
+        return False
+    return not entry.record.monitor_id or any(start.monitor == entry.monitor for start in heard.starts)
+
+
+def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
+    if heard.unreadable:
+        return Unusable.UNREADABLE, f"no transform came that can be read: {heard.unreadable}"
+    if text := fault():
+        return Unusable.NOT_CONNECTED, text
+    if heard.present:
+        return Unusable.NOTHING_YET, "no transform came yet"
+    others = f"; there are {', '.join(map(str, sorted(heard.elsewhere)))}" if heard.elsewhere else ""
+    return Unusable.NOTHING_YET, f"no transform came yet, and no monitor of this name is seen{others}"
+
+
+def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, wall_ns: int) -> _Refusal | None:
+    """Is the transform unknown, too old, or of unknown age?"""
+    record = entry.record
+    if record.verdict is Verdict.UNKNOWN:
+        return Unusable.UNKNOWN, f"the monitor has no transform: {record.reason or record.state}"
+    ahead_s = 1e-9 * (record.stamp_ns - wall_ns)
+    if policy.clocks_agree and ahead_s > CLOCK_AHEAD_LIMIT_S:
+        # With clocks that agree there is no such thing: one of them is wrong, and they give no age.
+        text = f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
+        return Unusable.CLOCKS, text
+    if age_s == math.inf:
+        why = "the monitor has not answered yet what its clock shows"
+        if entry.sent is None:
+            why = "a monitor of an older version doesn't tell; update it, or let the clocks agree and set clocks_agree"
+        return Unusable.AGE_UNKNOWN, f"how long the transform was on its way is not known: {why}"
+    if age_s > policy.max_age_s:
+        since = f"; what came since can't be read: {heard.unreadable}" if heard.unreadable else ""
+        return Unusable.STALE, f"the newest transform is {age_s:.3g} s old, allowed are {policy.max_age_s:g} s{since}"
+    return None
+
+
+def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
+    """Its verdict, deviation and, since what the monitor doesn't promise is not to be relied on, its bound."""
+    if record.verdict is Verdict.SUSPECT and not policy.accept_suspect:
+        return Unusable.SUSPECT, f"the transform is suspect: {record.reason or record.state}"
+    allowed_m = policy.max_sigma_m
+    if allowed_m is not None and (sigma_m := _largest_sigma_m(record.covariance)) > allowed_m:
+        text = f"the transform is certain to {1e3 * sigma_m:.3g} mm, allowed are {1e3 * allowed_m:g} mm"
+        return Unusable.UNCERTAIN, text
+    allowed_m = policy.max_protection_m
+    if allowed_m is None:
+        return None
+    if record.protection is None:
+        return Unusable.UNPROTECTED, "the monitor states no protection level; a newer version of it does"
+    bound_m = record.protection.position_m
+    if bound_m <= allowed_m:
+        return None
+    return Unusable.UNPROTECTED, f"the TCP may be {1e3 * bound_m:.3g} mm off, allowed are {1e3 * allowed_m:g} mm"

@@ -1,30 +1,42 @@
-"""The newest transform of one monitor, for programs that move by it."""
+"""The newest transform of one monitor, for programs that move by it, at once or one after another."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Self
 
 import zenoh
 
-from gripmon.client.age import Sent
-from gripmon.client.asking import ClockAsker
-from gripmon.client.inbox import Entry, Inbox
-from gripmon.client.iterators import AsyncReadings, Readings
-from gripmon.client.judging import judge
-from gripmon.client.names import monitor_name, start_of
-from gripmon.client.network import named_as_arguments, reader_settings
-from gripmon.client.reading import NotUsable, Policy, Reading
-from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
-from gripmon.model.records import ClockReading, MessageRefused, from_json
+from gripmon.client.inbox import Entry, Inbox, Sent
+from gripmon.client.network import (
+    Listener,
+    in_zenohs_thread,
+    monitor_name,
+    named_as_arguments,
+    reader_settings,
+    start_of,
+)
+from gripmon.client.reading import NotUsable, Policy, Reading, judge
+from gripmon.io.wire import CLOCK_PARAMETER, DEFAULT_ENDPOINT, Keys, Link, steady_ns
+from gripmon.model.records import ClockReading, MessageRefused, Verdict, from_json
 
+ASK_EVERY_S = 1.0
+"""The bound on a message's age grows by 1 ms meanwhile (:data:`gripmon.io.wire.MOST_DRIFT`); 200 bytes each way."""
+_ASK_AGAIN_S = 0.1  # while nothing is known: a question may be lost
+_ANSWER_WITHIN_S = 10.0  # a late answer is as true as a quick one, and says less
+FIRST_WITHIN_S = 2.0
+"""A monitor that is there has sent a transform by then; else a reading says that none comes, and who is there."""
+_LOOK_AROUND_S = 0.5  # of these, for the answers to who is there
 _LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds
+_LATE_S = 1e-3  # to be past the end of a time and not just before it
 
 
-class TransformClient:
+class TransformClient(Listener):
     """Hears one monitor.  Any thread may call any method.
 
     It may start before the monitor and the router, and needs no help when they end and come again.  With a ``with``
@@ -46,27 +58,21 @@ class TransformClient:
         ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
         ``depth`` is how many readings wait for each iterator or callback that is slower than the camera: 1 gives it
         always the newest.  Raises ValueError for a name that can't be part of a key or a ``depth`` below 1, and
-        :class:`gripmon.io.wire.PublishError` for a bad configuration; that nobody answers is no error.
+        :class:`gripmon.io.wire.PublishError` for a bad configuration; to get no answer is not an error.
         """
         if depth < 1:
             raise ValueError(f"depth is {depth}; give 1 or more")
+        super().__init__()
         self.policy = policy if policy is not None else Policy()
         self.keys = Keys(robot, camera if camera is not None else "*")
         self._depth = depth
         self._inbox = Inbox()
-        self._asker = ClockAsker(self.keys["transform"], self._inbox.answered)
-        self._threads: list[threading.Thread] = []
-        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
+        self._session: zenoh.Session | None = None
+        self._next_question_s = 0.0
+        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what is referred to no more
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
-        self._session: zenoh.Session | None = None
         self._link.attach(self._declare)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def latest(self, policy: Policy | None = None) -> Reading:
         """The newest transform and whether it may be used now, at once; by the client's policy or another one.
@@ -104,15 +110,7 @@ class TransformClient:
 
         An exception in the callback ends its thread and goes to ``threading.excepthook``.
         """
-        readings = iter(self)
-
-        def pump() -> None:
-            for reading in readings:
-                callback(reading)
-
-        thread = threading.Thread(target=pump, name="gripmon-client", daemon=True)
-        self._threads.append(thread)
-        thread.start()
+        self._call_back(callback, iter(self))
 
     @property
     def unreadable(self) -> int:
@@ -130,9 +128,7 @@ class TransformClient:
         """
         self._inbox.close()
         self._link.close()
-        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
-            for thread in self._threads:
-                thread.join()
+        super().close()
 
     def judge(self, entry: Entry) -> Reading:
         """The reading of a message, as of now."""
@@ -140,14 +136,15 @@ class TransformClient:
 
     def look_around(self) -> None:
         """Ask, without waiting, which monitors are on the network; what was heard then stands in the ``reason``."""
-        found = zenoh.handlers.Callback(self._find, indirect=False)
+
+        def find(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._inbox.found(monitor_name(reply.ok.key_expr))
+
         if self._session is not None:
             with contextlib.suppress(zenoh.ZError):  # another thread closes it just now
-                self._session.liveliness().get(Keys("*", "*")["alive"], found, timeout=_LOOK_WITHIN_S)
-
-    def _find(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._inbox.found(monitor_name(reply.ok.key_expr))
+                everyone, found = Keys("*", "*")["alive"], in_zenohs_thread(find)
+                self._session.liveliness().get(everyone, found, timeout=_LOOK_WITHIN_S)
 
     def _fault(self) -> str:
         try:
@@ -157,42 +154,169 @@ class TransformClient:
 
     def _declare(self, session: zenoh.Session) -> None:
         self._session = session
-        # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
-        transforms = zenoh.handlers.Callback(self._receive, indirect=False)
-        tokens = zenoh.handlers.Callback(self._see, indirect=False)
-        self._asker.use(session)
-        starts = zenoh.handlers.Callback(self._see_start, indirect=False)
+        keys, tokens = self.keys, session.liveliness()
         self._declared = (
-            session.declare_subscriber(self.keys["transform"], transforms),
-            session.liveliness().declare_subscriber(self.keys["alive"], tokens, history=True),
-            session.liveliness().declare_subscriber(self.keys["alive/*"], starts, history=True),
+            session.declare_subscriber(keys["transform"], in_zenohs_thread(self._receive)),
+            tokens.declare_subscriber(keys["alive"], in_zenohs_thread(self._see), history=True),
+            tokens.declare_subscriber(keys["alive/*"], in_zenohs_thread(self._see_start), history=True),
         )
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             arrival_s, arrived_ns = time.monotonic(), steady_ns()
-            sent = _sent(sample, arrived_ns)
+            reading = None if sample.attachment is None else _clock_reading(sample.attachment)
+            sent = None if reading is None else Sent(reading, arrived_ns)
             self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s, sent)
             if sent is not None:
-                self._asker.ask(known=self._inbox.age_known)
+                self._ask_for_clock(known=self._inbox.age_known)
 
     def _see(self, token: zenoh.Sample) -> None:
         seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
         seen(monitor_name(token.key_expr))
         if token.kind == zenoh.SampleKind.PUT:
-            self._asker.ask(known=False)  # so that its first transform is usable
+            self._ask_for_clock(known=False)  # so that its first transform is usable
 
     def _see_start(self, token: zenoh.Sample) -> None:
         seen = self._inbox.started if token.kind == zenoh.SampleKind.PUT else self._inbox.ended
         seen(start_of(token.key_expr))
 
+    def _ask_for_clock(self, *, known: bool) -> None:
+        """Ask what the monitor's clock shows if it is time; sooner if nothing is ``known`` yet.  In Zenoh's threads."""
+        session, now_s = self._session, time.monotonic()
+        if session is None or now_s < self._next_question_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
+            return
+        self._next_question_s = now_s + ASK_EVERY_S
+        asked_ns = steady_ns()
 
-def _sent(sample: zenoh.Sample, arrived_ns: int) -> Sent | None:
-    """When it was sent and when it arrived; None if the message doesn't say."""
-    attached = sample.attachment
-    if attached is None:
-        return None
+        def take(reply: zenoh.Reply) -> None:
+            answered_ns = steady_ns()
+            reading = None if reply.ok is None else _clock_reading(reply.ok.payload)
+            if reading is not None:  # a monitor of a version that doesn't tell answers with its last transform
+                self._inbox.answered(reading, asked_ns, answered_ns)
+
+        with contextlib.suppress(zenoh.ZError):  # the session is being closed
+            session.get(
+                f"{self.keys['transform']}?{CLOCK_PARAMETER}",
+                in_zenohs_thread(take),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_ANSWER_WITHIN_S,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.REAL_TIME,  # the answer's, too: not behind what is less urgent
+                express=True,
+            )
+
+
+def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
     try:
-        return Sent(from_json(attached.to_bytes(), ClockReading), arrived_ns)
+        return from_json(payload.to_bytes(), ClockReading)
     except MessageRefused:
         return None
+
+
+class _Queue:
+    """What one reader has not had yet: the newest ``depth`` messages, older ones are dropped.
+
+    Besides, once, a reading of verdict ``unknown`` when the last one given holds no longer: the monitor vanished, or
+    nothing newer came in time; and, once, one that says why when no first message comes.  So a loop that only
+    waits for the next reading stops in time, too.
+    """
+
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        self._client = client
+        self._entries: deque[Entry] = deque(maxlen=depth)
+        self._given = client.latest()
+        waits = self._given.verdict is Verdict.UNKNOWN
+        self._look_s = time.monotonic() + FIRST_WITHIN_S - _LOOK_AROUND_S if waits else None
+        self._say_s: float | None = None
+
+    def put(self, entry: Entry) -> None:
+        self._entries.append(entry)
+        self.wake()
+
+    def wake(self) -> None:
+        raise NotImplementedError
+
+    def _take(self) -> Reading | None:
+        """The next reading if there is one."""
+        if self._entries:
+            self._look_s = self._say_s = None
+            self._given = self._client.judge(self._entries.popleft())
+            return self._given
+        if self._given.verdict is not Verdict.UNKNOWN and (now := self._client.latest()).verdict is Verdict.UNKNOWN:
+            self._given = now
+            return now
+        return self._silence(time.monotonic())
+
+    def _silence(self, now_s: float) -> Reading | None:
+        """What there is in place of a first message, when it is time to say so."""
+        if self._look_s is not None and now_s >= self._look_s:
+            self._look_s, self._say_s = None, now_s + _LOOK_AROUND_S
+            self._client.look_around()
+        elif self._say_s is not None and now_s >= self._say_s:
+            self._say_s = None
+            self._given = self._client.latest()
+            return self._given
+        return None
+
+    def _patience_s(self) -> float | None:
+        """When to look again though nothing came; None: not at all."""
+        next_s = self._look_s if self._look_s is not None else self._say_s
+        if next_s is not None:
+            return max(0.0, next_s - time.monotonic()) + _LATE_S
+        if self._given.verdict is Verdict.UNKNOWN:
+            return None
+        return max(0.0, self._client.policy.max_age_s - self._client.latest().age_s) + _LATE_S
+
+
+class Readings(_Queue):
+    """Iterator for one thread; ends when the client is closed."""
+
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        super().__init__(client, depth)
+        self._news = threading.Event()
+
+    def wake(self) -> None:
+        self._news.set()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Reading:
+        while not self._client.closed:
+            self._news.clear()  # before looking: what comes after that is not missed
+            if (reading := self._take()) is not None:
+                return reading
+            if not self._client.closed:
+                self._news.wait(self._patience_s())
+        raise StopIteration
+
+
+class AsyncReadings(_Queue):
+    """Asynchronous iterator for one task of asyncio; ends when the client is closed.
+
+    A cancelled wait loses nothing: the next ``anext`` goes on.
+    """
+
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        super().__init__(client, depth)
+        self._loop = asyncio.get_running_loop()
+        self._news = asyncio.Event()
+
+    def wake(self) -> None:
+        with contextlib.suppress(RuntimeError):  # its loop has ended, and with it the wait
+            self._loop.call_soon_threadsafe(self._news.set)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Reading:
+        while not self._client.closed:
+            self._news.clear()
+            if (reading := self._take()) is not None:
+                return reading
+            if not self._client.closed:
+                with contextlib.suppress(TimeoutError):  # then it is time to look again
+                    async with asyncio.timeout(self._patience_s()):
+                        await self._news.wait()
+        raise StopAsyncIteration

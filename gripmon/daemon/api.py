@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sized
 from pathlib import Path
-from typing import NamedTuple
 
 from gripmon import monitor
 from gripmon.daemon.config import Config, ConfigError, SecondConfig
@@ -73,13 +72,6 @@ def open_source(source: str | Path | SourceSettings | Config, fps: float | None 
     return OpenedSource(start(source))
 
 
-class RecordedInput(NamedTuple):
-    """What was found in a folder or a video: a few words, and what is odd about its beginning (None: nothing)."""
-
-    detail: str
-    odd: str | None
-
-
 def open_configured(config: Config | SecondConfig, link: Link | None = None) -> Source:
     """Start the configured source, on the network through ``link``.  Raises :class:`ConfigError` if it can't start."""
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
@@ -93,8 +85,9 @@ def open_configured(config: Config | SecondConfig, link: Link | None = None) -> 
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 
 
-def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
-    """Look at the beginning of recorded frames; None for a source of another kind.
+def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
+    """What is found at the beginning of recorded frames, in a few words, and what is odd about it (None: nothing); None
+    for a source of another kind.
 
     Raises :class:`ConfigError` for frames that don't fit the camera, and :class:`NoResultError` if none can be read.
     """
@@ -115,10 +108,10 @@ def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
     count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
     detail = f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
     if not unreadable:
-        return RecordedInput(detail, None)
+        return detail, None
     first, *more = unreadable
     others = f", nor can the next {len(more)}" if more else ""
-    return RecordedInput(detail, f"its first frame can't be read ({first}){others}")
+    return detail, f"its first frame can't be read ({first}){others}"
 
 
 def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:

@@ -31,8 +31,7 @@ from gripmon.model.provenance import Provenance, provenance_of
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, TargetError, checked, parse_target
 from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
-from gripmon.teach.onboarding import RoughCorners, outlines_of
-from gripmon.teach.onboarding.measuring import check_rough
+from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
 
 _RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its estimates (JSON lines)"

@@ -138,7 +138,7 @@ def _source_report(config: Config | SecondConfig) -> SourceReport:
     source = config.settings.source
     kind = str(type(source).__struct_config__.tag)
     if (recorded := look_ahead(config)) is not None:
-        return SourceReport(kind, True, recorded.detail, recorded.odd)
+        return SourceReport(kind, True, *recorded)
     if isinstance(source, LiveSettings):
         return SourceReport(kind, *_live_reachable(source))
     if isinstance(source, NetworkSettings):

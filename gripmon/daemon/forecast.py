@@ -36,25 +36,27 @@ from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
 from gripmon.monitor import CORNER_COUNTS
-from gripmon.teach.forecast import (
+from gripmon.teach.accuracy import (
     EDGE_POINT_SIGMA_PX,
+    AccuracyForecast,
+    Promise,
+    UnknownOpening,
+    accuracy_over_jaw,
+    forecast_accuracy,
+    forecast_frame,
+)
+from gripmon.teach.mounts import Mount
+from gripmon.teach.visibility import (
     FEWEST_CORNERS,
     FEWEST_EDGES,
-    JawOutlook,
-    Mount,
-    Outlook,
-    Promise,
+    SOUGHT_M,
+    SOUGHT_RAD,
     Rig,
     border,
-    certainty,
-    expect,
-    foresee_frame,
     freedom,
     over_jaw,
-    promise,
     see,
 )
-from gripmon.teach.forecast.margins import SOUGHT_M, SOUGHT_RAD
 
 __all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
 
@@ -112,7 +114,7 @@ def promise_of(config: Config) -> Promise | None:
     rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
     if not see(rig, cam_T_grip, opening_m).enough:
         return None
-    return promise(foresee_frame(rig, cam_T_grip, opening_m).protection, config.settings.monitor.policy)
+    return Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, config.settings.monitor.policy)
 
 
 def limits_warning(config: Config) -> str | None:
@@ -189,24 +191,24 @@ def _corners(config: Config) -> tuple[CornerView, ...]:
 
 def _accuracy(config: Config) -> Accuracy:
     settings = config.settings.monitor
-    outlook = expect(
+    expected = forecast_accuracy(
         config.camera, config.gripper, settings, config.reference, config.jaw_opening_m, config.taught_edges
     )
-    enough, jaw = outlook.enough, outlook.jaw
+    enough, jaw = expected.enough, expected.jaw
     return Accuracy(
         measurement=settings.measurement,
-        edges=outlook.edges,
+        edges=expected.edges,
         edges_needed=FEWEST_EDGES,
         edge_point_sigma_px=EDGE_POINT_SIGMA_PX,
-        recalibration=_recalibration(config, outlook),
-        expected=PoseValues.of(outlook.sigma) if enough else None,
-        weakest=PoseValues.of(outlook.weakest) if enough else None,
-        jaw=None if jaw is None or not enough else _jaw_accuracy(jaw, outlook.lever_m, settings.jaw_sigma_m),
-        drift=_drift(config, outlook) if enough else None,
+        recalibration=_recalibration(config, expected),
+        expected=PoseValues.of(expected.sigma) if enough else None,
+        weakest=PoseValues.of(expected.weakest) if enough else None,
+        jaw=None if jaw is None or not enough else _jaw_accuracy(jaw, expected.lever_m, settings.jaw_sigma_m),
+        drift=_drift(config, expected) if enough else None,
     )
 
 
-def _jaw_accuracy(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> JawAccuracy:
+def _jaw_accuracy(jaw: UnknownOpening, lever_m: float, reported_sigma_m: float) -> JawAccuracy:
     per_m = [abs(v) * (1.0 if k < 3 else lever_m) for k, v in enumerate(jaw.pose_per_m.tolist())]
     unknown = PoseValues.of(jaw.sigma)
     return JawAccuracy(
@@ -219,9 +221,9 @@ def _jaw_accuracy(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> J
     )
 
 
-def _drift(config: Config, outlook: Outlook) -> DriftForecast:
+def _drift(config: Config, expected: AccuracyForecast) -> DriftForecast:
     settings = config.settings.monitor.drift
-    foresight = foresee(outlook.covariance, settings)
+    foresight = foresee(expected.covariance, settings)
     delays: Any = {f"{m:g}": tuple(foresight.delay_frames(m, axis) for axis in range(3)) for m in _STEPS_M}
     return DriftForecast(
         settings.false_alarms_per_day,
@@ -232,10 +234,10 @@ def _drift(config: Config, outlook: Outlook) -> DriftForecast:
     )
 
 
-def _recalibration(config: Config, outlook: Outlook) -> RecalibrationForecast:
+def _recalibration(config: Config, expected: AccuracyForecast) -> RecalibrationForecast:
     """One frame's certainty counts: what is averaged over frames whose errors last is hardly more certain."""
     gripper, settings = config.gripper, config.settings.monitor
-    taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[settings.recalibrate_corners])
+    taken = gripper.innermost_corners(expected.corners, CORNER_COUNTS[settings.recalibrate_corners])
     points_grip_m = gripper.points_grip_m(config.jaw_opening_m)[gripper.corner_points][taken]
     reason = refusal(points_grip_m)
     return RecalibrationForecast(
@@ -243,7 +245,7 @@ def _recalibration(config: Config, outlook: Outlook) -> RecalibrationForecast:
         coplanar=bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
         possible=reason is None,
         reason=reason,
-        sigma_m=float(max(outlook.sigma[:3])) if outlook.enough else None,
+        sigma_m=float(max(expected.sigma[:3])) if expected.enough else None,
         sure_sigma_m=settings.recalibration.sure_sigma_m,
         mode=settings.recalibration.mode,
     )
@@ -289,9 +291,9 @@ def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
     travel = over_jaw(rig, config.cam_T_grip)
     if travel is None:
         return None
-    certain = certainty(rig, config.cam_T_grip)
+    certain = accuracy_over_jaw(rig, config.cam_T_grip)
     policy = config.settings.monitor.policy
-    bounds = [None if each is None else each.protection for each in certain.promises]
+    bounds = [None if each is None else each.protection for _, each in certain]
     return JawTravelForecast(
         share=travel.share,
         gaps=tuple(GapValues(*gap) for gap in travel.gaps),
@@ -300,8 +302,8 @@ def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
         from_m=config.gripper.jaw_min_m,
         to_m=config.gripper.jaw_max_m,
         certainty=OpeningCertainty(
-            opening_m=tuple(certain.openings_m.tolist()),
-            worst_sigma_m=tuple(map(_or_none, certain.sigma_m.tolist())),
+            opening_m=tuple(opening_m for opening_m, _ in certain),
+            worst_sigma_m=tuple(None if each is None else each.tcp_sigma_m for _, each in certain),
             protection_m=tuple(None if b is None else b.position_m for b in bounds),
             protection_rad=tuple(None if b is None else b.rotation_rad for b in bounds),
             alert_limit_m=policy.alert_limit_m,

@@ -13,17 +13,16 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.analyse.replay_differences import Differences
+from gripmon.analyse.comparison import Differences
 from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
-from gripmon.record.read import recording_files
-from gripmon.record.read.replayed import RecordedFrames, SeveralRunsError, UnusableError
+from gripmon.record.compared import ComparedRecorder
+from gripmon.record.keeping import keep_whole
+from gripmon.record.read import RecordedFrames, SeveralRunsError, UnusableError, recording_files
+from gripmon.record.recorder import make_scene
 from gripmon.record.write import NullRecorder, Recorder, open_recorder
-from gripmon.record.write.compared import ComparedRecorder
-from gripmon.record.write.repair import keep_whole
-from gripmon.record.write.wire import make_scene
 
 RECORDING_PATIENCE_S = 30.0
 """Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""
@@ -215,7 +214,7 @@ def _missing(recorder: Recorder) -> str | None:
 @contextmanager
 def _silent_recording() -> Iterator[None]:
     """What a daemon logs of its recording while it goes on, a replay reports in one line when it is over."""
-    logger = logging.getLogger("gripmon.record.write")
+    logger = logging.getLogger("gripmon.record")
     propagates, silent = logger.propagate, logging.NullHandler()
     logger.addHandler(silent)
     logger.propagate = False

@@ -27,7 +27,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
 from gripmon.model.targets import name_of
-from gripmon.record.write.viewer import free_port
+from gripmon.record.viewer import free_port
 from gripmon.simulate import (
     CALIBRATION_KINDS,
     SCENARIO_NAMES,

@@ -25,8 +25,8 @@ from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
 from gripmon.model.stopping import StopRequest
+from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
 from gripmon.record.write import ViewSettings, open_recorder, open_spot_recorder
-from gripmon.record.write.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
 
 _log = logging.getLogger(__name__)
 

@@ -14,15 +14,16 @@ from gripmon.daemon.forecast import rig_of
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import to_record
-from gripmon.teach.forecast import (
+from gripmon.model.records import Array
+from gripmon.teach.mounts import (
     Grid,
+    Measurable,
     Mount,
     Trial,
     field_of_view_rad,
     towards,
     tried,
     try_mount,
-    weakest_direction,
     with_focal,
 )
 
@@ -165,12 +166,7 @@ def as_plain(swept: Sweep) -> dict[str, Any]:
 
 
 def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
-    transform, covariance = to_record(trial.cam_T_grip), trial.covariance
-    sigma = weakest = None
-    if covariance is not None and trial.lever_m is not None:
-        sigma = [math.sqrt(v) for v in covariance.diagonal().tolist()]
-        weakest = weakest_direction(covariance, trial.lever_m).tolist()
-    smallest = None if trial.smallest is None else trial.smallest.tolist()
+    transform, found = to_record(trial.cam_T_grip), trial.measurable
     angle = field_of_view_rad(camera)
     return {
         **trial.mount._asdict(),
@@ -182,7 +178,7 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
             "rotation_xyzw": list(transform.rotation_xyzw),
         },
         "works": trial.works,
-        "reasons": list(trial.reasons),
+        "reasons": [fault.text for fault in trial.faults],
         "corners": trial.sight.corners,
         "edges": trial.sight.edges,
         "jaw": {
@@ -191,20 +187,30 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
             "edges": trial.edges.tolist(),
             "share": trial.share,
         },
-        "sigma": None if sigma is None else {"tcp_m": sigma[:3], "rotation_rad": sigma[3:]},
-        "weakest": None if weakest is None else {"tcp_m": weakest[:3], "rotation_rad": weakest[3:]},
-        "worst_sigma_m": trial.worst_sigma_m,
-        "worst_at_m": trial.worst_at_m,
-        "protection": None
-        if trial.promise is None
-        else {
-            "position_m": trial.promise.protection.position_m,
-            "rotation_rad": trial.promise.protection.rotation_rad,
-            "risk": trial.promise.protection.risk,
-        },
-        "smallest": None if smallest is None else {"tcp_m": smallest[:3], "rotation_rad": smallest[3:]},
-        "delay_frames": trial.delay_frames,
-        "margin_px": trial.margin_px,
-        # JSON knows no infinity.
-        "shift_m": None if trial.shift_m is None or math.isinf(trial.shift_m) else trial.shift_m,
+        **(dict.fromkeys(_OF_MEASURABLE) if found is None else _measurable_values(found)),
     }
+
+
+_OF_MEASURABLE = (
+    "sigma", "weakest", "worst_sigma_m", "worst_at_m", "protection", "smallest", "delay_frames", "margin_px", "shift_m"
+)  # fmt: skip
+
+
+def _measurable_values(found: Measurable) -> dict[str, Any]:
+    bound = found.promise.protection
+    return {
+        "sigma": _pose_values(found.frame.sigma),
+        "weakest": _pose_values(found.frame.weakest),
+        "worst_sigma_m": found.worst_sigma_m,
+        "worst_at_m": found.worst_at_m,
+        "protection": {"position_m": bound.position_m, "rotation_rad": bound.rotation_rad, "risk": bound.risk},
+        "smallest": _pose_values(found.smallest),
+        "delay_frames": found.delay_frames,
+        "margin_px": found.margin_px,
+        # JSON has no infinity.
+        "shift_m": None if math.isinf(found.shift_m) else found.shift_m,
+    }
+
+
+def _pose_values(vector: Array) -> dict[str, list[float]]:
+    return {"tcp_m": vector[:3].tolist(), "rotation_rad": vector[3:].tolist()}

@@ -64,9 +64,7 @@ class GripperSearch:
         if lost and self._searches == 1:
             return search_poses(image, camera, gripper, cam_T_grip, jaw_opening_m, settings)
         kept = image.copy()
-        self._backlog.add(
-            lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s
-        )
+        self._backlog.add(lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s)
         return NOWHERE
 
     def end_frame(self, measurement: Measurement) -> None:

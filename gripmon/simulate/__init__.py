@@ -1,12 +1,11 @@
 """A simulated wrist camera with exact truth: two solid fingers before moving clutter, sensor, disturbances."""
 
+from gripmon.simulate.bodies import FrameTruth, Hidden
 from gripmon.simulate.builtin import DEFAULT_FPS, SCENARIO_NAMES, make_scenario
 from gripmon.simulate.calibration_images import KINDS as CALIBRATION_KINDS
 from gripmon.simulate.calibration_images import Rig, image_count, write_calibration_images
-from gripmon.simulate.export import write_sequence
 from gripmon.simulate.scenario import Scenario
-from gripmon.simulate.sequence import Simulator
-from gripmon.simulate.truth import FrameTruth, Hidden
+from gripmon.simulate.sequence import Simulator, write_sequence
 
 __all__ = [
     "CALIBRATION_KINDS",

@@ -17,8 +17,8 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
 from gripmon.simulate import textures
+from gripmon.simulate.coverage import RayGrid
 from gripmon.simulate.scenario import Background
-from gripmon.simulate.viewing import RayGrid
 
 _TILE_PX = 2048
 _SQUARE_M = 0.01

@@ -1,26 +1,32 @@
-"""The solids of a scenario and where they are: fingers, the bodies that carry them, the grasped object, covers."""
+"""The solids of a scenario and where they are: fingers, the bodies that carry them, the grasped object, covers.  And
+what is true about a frame, to rounding: poses, openings, corner pixels, what hides which corner, and how much of each
+finger's outline can be seen.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.simulate.scenario import Cover, Prop, Scenario
 from gripmon.simulate.scene import COVER_TRAVEL, SceneState
 from gripmon.simulate.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place
-from gripmon.simulate.truth import Hidden
 
 # Half width of a cover over half the view's larger side.
 COVER_HALF = 1.35
 
 
 class Bodies:
-    """Shapes only, no looks.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
+    """Shapes only, no textures.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
 
     def __init__(self, gripper: Gripper, scenario: Scenario, view_half: Array) -> None:
         self.gripper = gripper
@@ -95,8 +101,8 @@ class Bodies:
         for k, finger in enumerate(self.fingers):
             if finger is solid:
                 return Hidden.OTHER_FINGER, self._corner_finger == k
-        nobody = np.zeros(len(self._corner_finger), dtype=bool)
-        return (Hidden.CARRIER if any(solid is c for c in self.carriers) else Hidden.OBJECT), nobody
+        none = np.zeros(len(self._corner_finger), dtype=bool)
+        return (Hidden.CARRIER if any(solid is c for c in self.carriers) else Hidden.OBJECT), none
 
 
 def _behind(outline: Array, points_cam_m: Array) -> NDArray[np.bool_]:
@@ -162,3 +168,121 @@ def _hand_outline(front: float, half: float, length: float) -> Array:
         corners.append((knuckles, y + radius))
     corners += [(2.0 * length, half), (2.0 * length, -half)]
     return np.array(corners)
+
+
+_POINTS_PER_EDGE = 24
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineSeen:
+    """Shares (f,) of each finger's edges: of those of its tip, and of all of them in the image.
+
+    1 where nothing but the gripper itself hides any; edges that the gripper hides don't count.
+    """
+
+    tips: Array
+    edges: Array
+
+
+class Outline:
+    """Points on the edges of a gripper's model; only contours, so that a wrong model is judged by the true one."""
+
+    def __init__(self, gripper: Gripper) -> None:
+        share = (np.arange(_POINTS_PER_EDGE) + 0.5) / _POINTS_PER_EDGE
+        start, end = gripper.edge_points.T
+        corner = np.zeros(len(gripper.point_finger), dtype=bool)
+        corner[gripper.corner_points] = True
+        self._start, self._end = np.repeat(start, _POINTS_PER_EDGE), np.repeat(end, _POINTS_PER_EDGE)
+        self._share = np.tile(share, len(start))[:, None]
+        self._tip = corner[self._start] & corner[self._end]
+        self._finger = gripper.point_finger[self._start]
+        self._fingers = len(gripper.finger_ids)
+
+    def seen(self, camera: Camera, bodies: Bodies, state: SceneState) -> OutlineSeen:
+        """Shares in a scene's state."""
+        grip = state.points_grip_m
+        points = (1.0 - self._share) * grip[self._start] + self._share * grip[self._end]
+        points = points @ state.cam_T_grip[:3, :3].T + state.cam_T_grip[:3, 3]
+        uv = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = (uv >= 0.0).all(axis=1) & (uv <= (camera.width_px - 1.0, camera.height_px - 1.0)).all(axis=1)
+        own, other = np.zeros(len(points), dtype=bool), bodies.covered(state, points)
+        for body in bodies.placed(state):
+            if bodies.is_gripper(body.solid):
+                own |= hidden_by(body, points)
+            else:
+                other |= hidden_by(body, points)
+        tips = self._shares(~own & self._tip, ~other & inside)
+        return OutlineSeen(tips, self._shares(~own & inside, ~other))
+
+    def _shares(self, there: NDArray[np.bool_], seen: NDArray[np.bool_]) -> Array:
+        total = np.bincount(self._finger, there, self._fingers)
+        return np.bincount(self._finger, there & seen, self._fingers) / np.maximum(total, 1.0)
+
+
+class Hidden(enum.StrEnum):
+    """Why a corner can't be seen."""
+
+    OUTSIDE = "outside"
+    SELF = "self"
+    OTHER_FINGER = "other_finger"
+    CARRIER = "carrier"
+    OBJECT = "object"
+    COVER = "cover"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTruth:
+    """Truth of one frame, at the middle of its exposure.
+
+    ``reference_cam_T_grip`` is what a perfect calibration gave before; ``tcp_shift_m`` (3,) the TCP's displacement
+    since, camera axes.  ``corner_uv_px`` (c, 2), in the gripper's order, lie in the distorted image, NaN behind the
+    camera; ``hidden`` (c,) is None where visible.  ``finger_bend`` (f, 4, 4) maps a finger's points at nominal opening
+    to where its bending takes them, gripper frame.
+    """
+
+    index: int
+    time_s: float
+    stamp_ns: int
+    cam_T_grip: Array
+    reference_cam_T_grip: Array
+    tcp_shift_m: Array
+    jaw_opening_m: float
+    jaw_reported_m: float | None
+    corner_ids: tuple[str, ...]
+    corner_uv_px: Array
+    hidden: tuple[Hidden | None, ...]
+    finger_bend: Array
+    events: tuple[str, ...]
+    exposure: float
+    defocus_px: float
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """(c,) which corners can be seen."""
+        return np.array([h is None for h in self.hidden])
+
+    def to_json(self, file: str) -> bytes:
+        """One line of JSON without a line feed, naming the image file."""
+        corners = [
+            {"id": name, "uv_px": uv.tolist() if np.isfinite(uv).all() else None, "hidden": hidden}
+            for name, uv, hidden in zip(self.corner_ids, self.corner_uv_px, self.hidden, strict=True)
+        ]
+        return msgspec.json.encode(
+            {
+                "index": self.index,
+                "file": file,
+                "time_s": self.time_s,
+                "stamp_ns": self.stamp_ns,
+                "cam_T_grip": self.cam_T_grip.tolist(),
+                "reference_cam_T_grip": self.reference_cam_T_grip.tolist(),
+                "tcp_shift_m": self.tcp_shift_m.tolist(),
+                "jaw_opening_m": self.jaw_opening_m,
+                "jaw_reported_m": self.jaw_reported_m,
+                "corners": corners,
+                "finger_bend": self.finger_bend.tolist(),
+                "events": self.events,
+                "exposure": self.exposure,
+                "defocus_px": self.defocus_px,
+            }
+        )

@@ -24,14 +24,12 @@ from gripmon.model.geometry import exp_rotation, invert, make_transform, perturb
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.model.targets import Charuco, CircleGrid, Target, name_of
-from gripmon.simulate.export import PNG_COMPRESSION
+from gripmon.simulate.coverage import RayGrid
+from gripmon.simulate.disturbance import SensorModel
 from gripmon.simulate.laser import cluttered, paper_cell, pixels_of, poses_on_plane, spot_image
 from gripmon.simulate.plates import Plate, PlateBackdrop, facing
-from gripmon.simulate.rough_corners import rough_corners
 from gripmon.simulate.scenario import JawScript, Scenario, Sensor
-from gripmon.simulate.sensor import SensorModel
-from gripmon.simulate.sequence import Simulator
-from gripmon.simulate.viewing import RayGrid
+from gripmon.simulate.sequence import PNG_COMPRESSION, Simulator
 
 PLATE = CircleGrid(12, 10, 0.008, 0.004)
 """Mostly light, so that dark fingers show before it."""
@@ -49,7 +47,7 @@ _FREE_VIEWS, _FINGER_VIEWS = 6, 6
 _ROBOT_POSES = 12
 _ORIENTATIONS, _FRESH_ORIENTATIONS = 5, 2
 _BORDER_PX = 15.0
-"""Spots stay so far from the image's border: three times their radius."""
+"""Distance of spots from the image's border: three times their radius."""
 _ARM_SIGMAS = np.array([5e-5] * 3 + [1e-4] * 3)
 """How exact the robot's reported poses are, each axis (m, rad): a good arm's repeatability."""
 _CAMERA_MOTION = np.array([2e-3, -1e-3, 1e-3, 0.002, 0.004, -0.003])
@@ -256,3 +254,42 @@ def _with_gripper(rig: Rig, plate: Plate, seed: int, number: int) -> Image:
 def _without_gripper(camera: Camera, plate: Plate, seed: int, number: int) -> Image:
     sensor = SensorModel(RayGrid(camera), Scenario(name="plate"), seed * 100 + number)
     return sensor.expose(plate.light(camera.settings, Sensor().psf_sigma_px), 0, 0.0)
+
+
+_CONTACT_M = 2e-4
+"""Distance from the foremost point within which a point touches the plate."""
+_RISE = 0.35
+"""Of the rising edge's length: some way up, where the edge still shows."""
+
+
+def rough_corners(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, rng: np.random.Generator, off_px: float
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """True pixels (2,) and rough ones, up to ``off_px`` off in u and v, by the names for a gripper without a file:
+    ``left_inner_near`` and so on, the left finger on the left of the image and the near side above.  ValueError where
+    two fingertips of three corners or more don't stand on one plane.
+    """
+    points = gripper.points_grip_m(jaw_opening_m)
+    uv = camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+    touching = points[:, 2] > points[:, 2].max() - _CONTACT_M
+    tips = [np.flatnonzero(touching & (gripper.point_finger == k)) for k in range(len(gripper.finger_ids))]
+    if len(tips) != 2 or min(map(len, tips)) < 3:
+        raise ValueError("gripper: standing on a plate takes two fingertips with three corners or more in one plane")
+    out = {}
+    for side, tip in zip(("left", "right"), sorted(tips, key=lambda t: float(uv[t, 0].mean())), strict=True):
+        near, far = sorted(tip[np.argsort(np.abs(points[tip, 0]))[:2]], key=lambda k: float(uv[k, 1]))
+        outer = min(set(tip.tolist()) - {near, far}, key=lambda k: float(np.abs(points[k, 1] - points[near, 1])))
+        out[f"{side}_inner_near"], out[f"{side}_inner_far"] = uv[near], uv[far]
+        out[f"{side}_outer_near"] = uv[outer]
+        foot, top = points[far], points[_above(gripper, far, touching)]
+        rise = (cam_T_grip[:3, :3] @ (foot + _RISE * (top - foot)) + cam_T_grip[:3, 3])[None]
+        out[f"{side}_rise_far"] = camera.project(rise)[0]
+    return out, {name: at + rng.uniform(-off_px, off_px, 2) for name, at in out.items()}
+
+
+def _above(gripper: Gripper, foot: int, touching: Array) -> int:
+    """The other end of the edge that rises from a corner."""
+    for a, b in gripper.edge_points.tolist():
+        if foot in (a, b) and not touching[b if a == foot else a]:
+            return int(b if a == foot else a)
+    raise ValueError(f"gripper: no edge rises from {gripper.point_ids[foot]}")

@@ -1,6 +1,6 @@
 """A laser pointer on an arm, a plane and a fixed camera: poses that keep the spot in view, and its images.
 
-The set-up is the laser-pointer paper's (Hu and Chang, Industrial Robot 39/2, 2012).  It doesn't say how far the hand
+The set-up is the laser-pointer paper's (Hu and Chang, Industrial Robot 39/2, 2012).  It leaves open how far the hand
 may be from the plane, how slanted the beam, nor how long the shifts: here the laser is 15 to 35 cm from its spot, up to
 50 degrees off the plane's normal, shifts are up to 12 cm.
 """

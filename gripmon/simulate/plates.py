@@ -33,7 +33,7 @@ Grey = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Print:
-    """What a plate looks like.  ``dark`` and ``light`` grey values (DN); ``margin`` of the plate around its pattern, in
+    """A plate's appearance.  ``dark`` and ``light`` grey values (DN); ``margin`` of the plate around its pattern, in
     squares or spacings, inf for a plate without a border; ``clutter`` what lies in its plane beyond that border;
     ``inverted``: dark and light exchanged; ``errors_m`` (rows, columns, 2): how far each point of the print is off.
     """

@@ -1,6 +1,6 @@
 """What happens in a simulated sequence: settings only, every length in metres, time in seconds from the first frame.
 
-A scenario says nothing about camera, gripper and nominal calibration; the simulator gets those beside it.  Grey values
+A scenario holds neither camera, gripper nor nominal calibration; the simulator gets those beside it.  Grey values
 are in DN, the counts 0..255 of the 8-bit image at exposure 1.
 """
 

@@ -1,7 +1,11 @@
-"""The simulator: frame i of a scenario, with its truth, for any i in any order."""
+"""The simulator: frame i of a scenario, with its truth, for any i in any order; and its images and truth as files."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,13 +13,11 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Frame
 from gripmon.simulate import disturbance
-from gripmon.simulate.bodies import Bodies
-from gripmon.simulate.outline import Outline, OutlineSeen
+from gripmon.simulate.bodies import Bodies, FrameTruth, Hidden, Outline, OutlineSeen
+from gripmon.simulate.disturbance import SensorModel
 from gripmon.simulate.render import Backdrop, Renderer
 from gripmon.simulate.scenario import Scenario
 from gripmon.simulate.scene import Scene
-from gripmon.simulate.sensor import SensorModel
-from gripmon.simulate.truth import FrameTruth, Hidden
 
 
 class Simulator:
@@ -124,7 +126,7 @@ class Simulator:
         return self.scenario.start_ns + round(index * 1e9 / self.scenario.fps)
 
     def _reported(self, index: int, opening_m: float) -> float | None:
-        """What the robot says: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
+        """What the robot reports: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
         jaw = self.scenario.jaw
         if not jaw.reported or not self.gripper.has_jaw:
             return None
@@ -136,3 +138,33 @@ class Simulator:
         with np.errstate(invalid="ignore"):
             low = (uv_px >= -0.5).all(axis=1)
             return low & (uv_px[:, 0] < self.camera.width_px - 0.5) & (uv_px[:, 1] < self.camera.height_px - 0.5)
+
+
+PNG_COMPRESSION = 1  # noise doesn't compress; time matters more
+
+
+def write_sequence(simulator: Simulator, out_dir: Path, progress: Callable[[int, int], None] | None = None) -> int:
+    """Write all frames of a scenario into a folder (made if missing); returns their number.
+
+    ``timestamps.csv`` has the columns ``file,stamp_ns,jaw_opening_m`` (what the robot reports; empty where it doesn't),
+    ``truth.jsonl`` one line a frame.  ``progress(done, total)`` is called after each frame.  Raises OSError when a
+    file can't be written, FileExistsError when the folder already holds a sequence.
+    """
+    out_dir.mkdir(parents=True, exist_ok=True)
+    total = simulator.frame_count
+    digits = max(len(str(total - 1)), 6)
+    # Mode "x": an older sequence is never mixed with this one.
+    stamps_path, truth_path = out_dir / "timestamps.csv", out_dir / "truth.jsonl"
+    with stamps_path.open("x", encoding="utf-8") as stamps, truth_path.open("xb") as truths:
+        stamps.write("file,stamp_ns,jaw_opening_m\n")
+        for index in range(total):
+            file = f"{index:0{digits}d}.png"
+            image, truth = simulator.render(index), simulator.truth(index)
+            if not cv2.imwrite(str(out_dir / file), image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]):
+                raise OSError(f"can't write {out_dir / file}")
+            opening = "" if truth.jaw_reported_m is None else repr(truth.jaw_reported_m)
+            stamps.write(f"{file},{truth.stamp_ns},{opening}\n")
+            truths.write(truth.to_json(file) + b"\n")
+            if progress is not None:
+                progress(index + 1, total)
+    return total

@@ -19,7 +19,7 @@ _AS_MODELLED = FingerShape()
 class Solid:
     """A convex solid in its body's frame: vertices (v, 3), faces as loops counter-clockwise seen from outside.
 
-    ``bevel`` tells which faces are bevels, ``normals`` (f, 3) point outwards, ``n·x <= offsets`` (f,) inside.
+    ``bevel``: which faces are bevels, ``normals`` (f, 3) point outwards, ``n·x <= offsets`` (f,) inside.
     """
 
     name: str
@@ -54,7 +54,7 @@ def box(name: str, low_m: Array, high_m: Array) -> Solid:
 
 
 def finger_solids(gripper: Gripper, shape: FingerShape = _AS_MODELLED) -> tuple[Solid, ...]:
-    """One solid a finger at nominal opening, its bevels cut, worn as ``shape`` says.
+    """One solid a finger at nominal opening, its bevels cut, worn by ``shape``.
 
     Raises ValueError for a gripper without closed faces.
     """
@@ -171,7 +171,7 @@ def place(solid: Solid, cam_T_body: Array) -> PlacedSolid:
 
 
 def paint_order(placed: list[PlacedSolid]) -> list[PlacedSolid]:
-    """From back to front.  Two convex bodies are told apart by a face plane between them, else by their distance."""
+    """From back to front.  Two convex bodies are ordered by a face plane between them, else by their distance."""
     order: list[PlacedSolid] = []
     rest = list(placed)
     while rest:

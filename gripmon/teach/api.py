@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
+import msgspec
+import yaml
 
-from gripmon.io.sources.folder import TIMESTAMPS_NAME
+from gripmon import __version__
+from gripmon.io.sources import SourceError
+from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_image, read_table
+from gripmon.judge.inspection import inspect
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, ReferenceRecord
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.edges import Taught, TeachingImage, TeachingRefused
-from gripmon.teach.edges import teach as teach_images
-from gripmon.teach.edges.files import Picture, read_picture, taught_model, to_yaml
-from gripmon.teach.edges.picture import draw
-from gripmon.track.edges import TaughtEdges, TaughtModel
+from gripmon.teach.drawing import draw_taught
+from gripmon.teach.measure import Taught
+from gripmon.teach.measure import teach as teach_images
+from gripmon.teach.views import TeachingImage, TeachingRefused
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtEdges
+from gripmon.track.edges.taught import Provenance, TaughtImage, TaughtModel, identity
 
 __all__ = ["Configured", "Teaching", "teach"]
 
@@ -72,7 +83,7 @@ class Teaching:
         """The first image that was used with what was taught, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
         config = self.config
         edges = TaughtEdges.of_model(self.model, config.gripper)
-        drawn = draw(config.camera, config.gripper, config.cam_T_grip, self.first, edges, self.model)
+        drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.first, edges, self.model)
         return bytes(cv2.imencode(ending, drawn)[1].tobytes())
 
 
@@ -113,7 +124,7 @@ def teach(
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures
     ]
     try:
-        taught = teach_images(config.camera, gripper, settings.corners, settings.jaw_sigma_m, config.reference, shown)
+        taught = teach_images(Rig(config.camera, gripper, settings), config.reference, shown)
     except TeachingRefused as refused:
         raise NoResultError(f"teach: {refused}") from None
     model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)
@@ -129,3 +140,139 @@ def _check_different(pictures: Sequence[Picture]) -> None:
         if digest in seen:
             raise InputError(f"{each.path}: is the same image as {seen[digest]}; each image once")
         seen[digest] = each.path
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image to teach from; ``jaw_opening_m`` None where it isn't known.  ``path`` None: taken live, no file yet."""
+
+    name: str
+    image: Image
+    jaw_opening_m: float | None
+    path: str | None
+
+
+def read_picture(
+    path: Path, camera: Camera, gripper: Gripper, bit_depth: int, jaw_opening_m: float | None = None
+) -> Picture:
+    """An image that fits the camera, in full scale, with its jaw opening: the one given, else that of its folder's
+    ``timestamps.csv``.  Raises :class:`~gripmon.model.errors.InputError`.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; image files, e.g. {path}/*.png")
+    image = read_any(path)
+    frame = in_full_scale(Frame(0, 0, image, None, str(path)), bit_depth)
+    refused = inspect(frame, camera, gripper)
+    if refused is not None or frame.image is None:
+        kind, why = refused or (frame.refusal, frame.fault)
+        raise InputError(f"{path}: {kind}: {why}")
+    return Picture(path.name, frame.image, _opening(path, gripper, jaw_opening_m), str(path))
+
+
+def read_any(path: Path) -> Image:
+    """An image of any camera.  Raises :class:`~gripmon.model.errors.InputError`."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; an image file")
+    image, fault = read_image(path)
+    if image is None:
+        raise InputError(f"{path}: {fault}; an image file")
+    return image
+
+
+def _opening(path: Path, gripper: Gripper, opening_m: float | None) -> float | None:
+    if not gripper.has_jaw:
+        if opening_m is not None:
+            raise InputError("the gripper has no jaw; leave it out", "jaw_opening_m")
+        return None
+    if opening_m is None and (path.parent / TIMESTAMPS_NAME).exists():
+        try:
+            row = read_table(path.parent / TIMESTAMPS_NAME).get(path.name)
+        except SourceError as error:
+            raise InputError(str(error)) from None
+        opening_m = None if row is None else row.jaw_opening_m
+    if opening_m is not None and not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise InputError(
+            f"{path}: jaw opening {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        )
+    return opening_m
+
+
+def taught_model(
+    taught: Taught,
+    camera: Camera,
+    gripper: Gripper,
+    settings: MonitorSettings,
+    reference: ReferenceRecord,
+    pictures: Sequence[Picture],
+    command: str,
+    data: Mapping[str, bytes] = {},
+) -> TaughtModel:
+    """What was taught, bound to what it was taught with.  ``data``: images that become files only now, by path."""
+    images = []
+    for picture in pictures:
+        assert picture.path is not None, "an image has a file before it is taught from"
+        content = data.get(picture.path) or Path(picture.path).read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        images.append(TaughtImage(file=picture.path, sha256=digest, jaw_opening_m=picture.jaw_opening_m))
+    lens, model, stands = identity(camera, gripper, reference.reference_id, from_record(reference.cam_T_grip))
+    return TaughtModel(
+        provenance=Provenance(
+            gripmon=__version__,
+            time=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=command,
+            images=tuple(taught.used(images)),
+            closure_px=taught.closure_px,
+        ),
+        camera=lens,
+        gripper=model,
+        reference=stands,
+        edge_settings=settings.corners.edges,
+        edges=taught.edges,
+        corners=taught.corners,
+    )
+
+
+_HEADER = """\
+# Taught model: written by gripmon teach, named by `taught:` in a configuration.  Not to be edited: teach again.
+# It belongs to exactly this camera, gripper file, reference and edge settings, and is refused with any others.
+#   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
+#   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
+#                       sight, positive to the right of somebody who walks along it in the image (m); sigma_m: its
+#                       standard deviation
+#   edges.*.depth_m     how much deeper it lies, along the line of sight; follows from the shape of a bevel (m)
+#   edges.*.crease      true: between two visible faces; false: an outline
+#   edges.*.brighter    the brighter side, where it may be relied on
+#   edges.*.rms_px      scatter of the edge points about the line (px); seen: part of its profiles that showed it
+#   edges.*.left, right grey level of the finger on that side over the median of all edges, its spread along the edge
+#   corners.*.uv_px     where taught edges meet in the first image (px), and its standard deviation
+# The measurement uses offsets, depths, their deviations, crease and brighter; the rest describes what was seen.
+"""
+
+
+_WORDS = ("true", "false", "null", "yes", "no", "on", "off", "y", "n")
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
+    """Text in quotes wherever it could be taken for something else."""
+
+
+def _text(dumper: _Dumper, text: str) -> Any:
+    plain = re.fullmatch(r"[A-Za-z_][\w./-]*", text) and text.lower() not in _WORDS
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
+
+
+_Dumper.add_representer(str, _text)
+
+
+def to_yaml(model: TaughtModel) -> str:
+    """The file's text; reading it gives the same model, to the last bit."""
+    values = _without_nothing(msgspec.to_builtins(model))
+    return _HEADER + yaml.dump(
+        values, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=160, allow_unicode=True
+    )
+
+
+def _without_nothing(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nothing(item) for key, item in value.items() if item is not None}
+    return [_without_nothing(item) for item in value] if isinstance(value, list | tuple) else value

@@ -8,7 +8,7 @@ a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of te
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ import numpy as np
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.calibrate.plane import GivenCamera
-from gripmon.calibrate.plane_average import PlaneCalibration, average
-from gripmon.calibrate.sighting import CalibrationError, NotFound
+from gripmon.calibrate.intrinsics import plate_pose
+from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners
+from gripmon.calibrate.plane import calibrate_plane as calibrate_image
+from gripmon.calibrate.plane_average import PlaneCalibration, against, average
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
@@ -32,8 +34,17 @@ from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
 from gripmon.model.targets import Target, TargetError, parse_target
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
-from gripmon.teach.onboarding.picture import draw
+from gripmon.teach.drawing import draw_on_plate
+from gripmon.teach.outline_edges import measure_outlines
+from gripmon.teach.outlines import (
+    Outline,
+    inferred_model,
+    measure_known,
+    outlines_of,
+    points_in_gripper,
+    rough_pose,
+)
+from gripmon.teach.plate_print import plate_print
 from gripmon.track.edges.taught import TaughtEdges, gripper_digest
 
 Rough = Mapping[str, tuple[float, float]]
@@ -42,14 +53,80 @@ Pose = tuple[Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
+class ImageOnPlate:
+    """What an image gives.  ``missing``: corners that were wanted and not measured, and why; ``outline`` of an inferred
+    gripper, with its points as measured.
+    """
+
+    coincidence: Coincidence
+    missing: dict[str, str] = field(default_factory=dict)
+    outline: Outline | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class KnownGripper:
+    """Calibrates with a gripper file, at one jaw opening (nominal if None); ``expected_cam_T_grip`` (4, 4) is a rough
+    calibration, if there is one.
+    """
+
+    camera: GivenCamera
+    gripper: Gripper
+    jaw_opening_m: float | None = None
+    expected_cam_T_grip: Array | None = None
+
+    def measure(self, image: Image, sighting: Sighting, rough: Rough | None) -> ImageOnPlate:
+        """``rough`` corners choose which ones are taken; without them all are, and they are expected where the rough
+        calibration has them.  Raises :class:`CalibrationError`.
+        """
+        gripper, opening_m, camera = self.gripper, self.jaw_opening_m, make_camera(self.camera.lens)
+        points_m = gripper.points_grip_m(opening_m)
+        contact_m = float(points_m[:, 2].max())  # it stands on its outermost point along z
+        expected = self.expected_cam_T_grip
+        if rough is not None:
+            cam_T_plate = plate_pose(self.camera.lens, sighting)[0]
+            expected = rough_pose(camera, gripper, cam_T_plate, rough, opening_m, contact_m)
+        if expected is None:
+            raise CalibrationError("nothing says where the gripper is in the image; rough corners, or a calibration")
+        corners, missing = measure_known(camera, gripper, image, expected, opening_m, rough)
+        places = [gripper.point_ids.index(name) for name in corners.names]
+        found = calibrate_image(self.camera, sighting, corners, KnownCorners(points_m[places], contact_m))
+        if self.expected_cam_T_grip is not None:
+            turned = against(found.cam_T_grip, self.expected_cam_T_grip)
+            if turned is not None:
+                raise CalibrationError(turned)
+        return ImageOnPlate(found, missing)
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownGripper:
+    """Calibrates with rough outlines alone; the gripper comes out, too.  ``target``: the plate, whose print is then
+    distinguished from the fingers.
+    """
+
+    camera: GivenCamera
+    target: Target | None = None
+
+    def measure(self, image: Image, sighting: Sighting, rough: Rough | None) -> ImageOnPlate:
+        """Raises :class:`CalibrationError`."""
+        if rough is None:
+            raise InputError("a gripper that isn't known needs rough corners")
+        outline, camera = outlines_of(rough), make_camera(self.camera.lens)
+        printed = plate_print(camera, plate_pose(self.camera.lens, sighting)[0], sighting, self.target, image)
+        corners, snapped = measure_outlines(camera, image, outline, printed)
+        return ImageOnPlate(
+            calibrate_image(self.camera, sighting, corners, None), {}, replace(outline, points=snapped.points)
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class HandEyeOnPlate:
-    """``fit`` of all images together; ``looks``: what each image gives; ``not_used``: images that give nothing, and
+    """``fit`` of all images together; ``images``: what each gives; ``not_used``: images that give nothing, and
     why; ``notes``: what was assumed; ``shown``: the first image that was used.
     """
 
     fit: PlaneCalibration
     method: KnownGripper | UnknownGripper
-    looks: tuple[Look, ...]
+    images: tuple[ImageOnPlate, ...]
     not_used: tuple[str, ...]
     notes: tuple[str, ...]
     shown: Image
@@ -79,8 +156,14 @@ class HandEyeOnPlate:
         """The gripper: the known one, or the one that the images show (``jaw_range_m`` in which its jaws move)."""
         if isinstance(self.method, KnownGripper):
             return self.method.gripper
+        outlines = [image.outline for image in self.images if image.outline is not None]
+        outline, camera = outlines[0], make_camera(self.method.camera.lens)
+        # Corners from all images jointly, ends of edges by their mean.
+        alike = [one.points for one in outlines if one.names == outline.names]
+        points_m = np.mean([points_in_gripper(camera, outline, uv_px, self.cam_T_grip) for uv_px in alike], axis=0)
+        points_m[list(outline.corners)] = self.fit.corners_m
         try:
-            return Gripper(self.method.model(name, self.looks, self.fit, jaw_range_m, jaw_opening_m, provenance))
+            return Gripper(inferred_model(name, outline, points_m, jaw_range_m, jaw_opening_m, provenance))
         except GripperError as error:
             raise CalibrationError(f"what the corners show is no gripper: {error}") from None
 
@@ -115,7 +198,7 @@ class HandEyeOnPlate:
             "rms_px": fit.rms_px,
             "consistency_p": fit.consistency_p,
             "warnings": fit.warnings,
-            "images": [_image_values(look) for look in self.looks],
+            "images": [_image_values(image) for image in self.images],
         }
         if self.inferred:
             out["sides_m"] = (2.0 * fit.corners_m[3, :2]).tolist()
@@ -130,11 +213,11 @@ class HandEyeOnPlate:
 
     def picture(self) -> Image:
         """The first image with its residuals, enlarged; BGR."""
-        return draw(self.shown, self.method.camera.lens, self.looks[0].coincidence)
+        return draw_on_plate(self.shown, self.method.camera.lens, self.images[0].coincidence)
 
 
-def _image_values(look: Look) -> dict[str, Any]:
-    image = look.coincidence
+def _image_values(seen: ImageOnPlate) -> dict[str, Any]:
+    image = seen.coincidence
     sigma_px = (image.corners.covariance_px.diagonal() ** 0.5).reshape(-1, 2)
     rows = zip(image.corners.names, image.corners.uv_px, sigma_px, image.residuals_m, strict=True)
     return {
@@ -146,7 +229,7 @@ def _image_values(look: Look) -> dict[str, Any]:
             name: {"uv_px": uv.tolist(), "sigma_px": sigma.tolist(), "residual_m": residual.tolist()}
             for name, uv, sigma, residual in rows
         },
-        "missing": look.missing,
+        "missing": seen.missing,
         "residuals_p": image.p_value,
         "tilt_rad": None if image.tilt_rad is None else image.tilt_rad.tolist(),
         "gap_m": image.gap_m,
@@ -168,9 +251,9 @@ def calibrate_plane(
 ) -> HandEyeOnPlate:
     """``cam_T_grip`` from images of the gripper standing on a calibration plate (the Plane Coincidence Constraint).
 
-    Where the gripper is to be looked for, rough ``corners`` say (name: (u, v) in px; for all images or for each), or a
-    rough calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, whose
-    names :func:`gripmon.teach.onboarding.outlines_of` tells.  ``jaw_opening_m`` in the images; nominal if None.
+    Where to look for the gripper: rough ``corners`` (name: (u, v) in px; for all images or for each), or a rough
+    calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, whose
+    names stand at :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` in the images; nominal if None.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
@@ -180,14 +263,13 @@ def calibrate_plane(
         else KnownGripper(given, gripper, _checked_opening(gripper, jaw_opening_m), cam_T_grip)
     )
     taken = _of_camera(images, given.lens)
-    rough = _for_each(corners, len(taken))
-    looks: list[Look] = []
+    used: list[ImageOnPlate] = []
     shown: Image | None = None
     not_used = []
     with progress(len(taken), "image") as step:
-        for (name, image), where in zip(taken, rough, strict=True):
+        for (name, image), rough in zip(taken, _for_each(corners, len(taken)), strict=True):
             try:
-                looks.append(_look(method, target, name, image, where))
+                used.append(method.measure(image, _sighting(image, target, name), rough))
                 shown = image if shown is None else shown
             except CalibrationError as error:
                 not_used.append(f"{name}: {error}")
@@ -195,8 +277,8 @@ def calibrate_plane(
     if shown is None:
         more = f" (and {len(not_used) - 1} more images)" if len(not_used) > 1 else ""
         raise CalibrationError(f"{not_used[0]}{more}")
-    fit = average([look.coincidence for look in looks], isinstance(method, UnknownGripper))
-    return HandEyeOnPlate(fit, method, tuple(looks), tuple(not_used), _notes(method, jaw_opening_m), shown)
+    fit = average([image.coincidence for image in used], gripper is None)
+    return HandEyeOnPlate(fit, method, tuple(used), tuple(not_used), _notes(method, jaw_opening_m), shown)
 
 
 def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamera:
@@ -245,21 +327,17 @@ def _for_each(corners: Rough | Sequence[Rough] | None, images: int) -> Sequence[
     return list(corners) * (images if len(corners) == 1 else 1)
 
 
-def _look(method: KnownGripper | UnknownGripper, target: Target, name: str, image: Image, rough: Rough | None) -> Look:
-    sight = detect(image, target, name)
-    if isinstance(sight, NotFound):
-        if sight.larger:
-            raise TargetError(f"{name}: {sight.reason}; its full size")
-        raise CalibrationError(sight.reason)
-    if isinstance(method, KnownGripper):
-        return method.look(image, sight, rough)
-    if rough is None:
-        raise InputError("a gripper that isn't known needs rough corners")
-    return method.look(image, sight, rough)
+def _sighting(image: Image, target: Target, name: str) -> Sighting:
+    found = detect(image, target, name)
+    if isinstance(found, Sighting):
+        return found
+    if found.larger:
+        raise TargetError(f"{name}: {found.reason}; its full size")
+    raise CalibrationError(found.reason)
 
 
 def gripper_values(model: GripperModel) -> dict[str, Any]:
-    """A gripper as a file has it: without keys that only say what goes without saying."""
+    """A gripper as a file has it: without keys that have their default."""
     out: dict[str, Any] = msgspec.to_builtins(model)
     out["fingers"] = {
         name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()

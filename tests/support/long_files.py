@@ -21,7 +21,7 @@ LONGEST = (
     "test_bench_wire",
     "test_onboarding",
     "test_motion",
-    "test_outlook",
+    "test_accuracy_forecast",
     "test_search",
     "test_monitor",
     "test_fleet_load",

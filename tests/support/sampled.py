@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
-from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
+from gripmon.teach.accuracy import EDGE_POINT_SIGMA_PX, ForecastMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
 from gripmon.track.edges.consensus import Consensus, ConsensusSettings
 from gripmon.track.edges.prediction import Prediction
@@ -24,7 +24,7 @@ OPENING_M = 0.034
 _GROSS_PX = 6.0
 
 
-class NoisyMeter(ForeseeingMeter):
+class NoisyMeter(ForecastMeter):
     """Edge points with the assumed noise about the place where the nominal pose at the true opening puts them; a share
     of them is anywhere on its profile instead.
     """

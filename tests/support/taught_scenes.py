@@ -12,14 +12,18 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
+from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, JawScript
-from gripmon.teach.edges import Taught, TeachingImage, teach
+from gripmon.teach.measure import Taught, teach
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
 from support.meters import JAW_SIGMA_M, NARROW, USUAL_SHARE, box_gripper, difference
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
 CAMERA = make_camera(PAPER_LENS)
+RIG = Rig(CAMERA, box_gripper(), MonitorSettings(jaw_sigma_m=JAW_SIGMA_M))
 OPENING_M = 0.034
 TABLE_DN = 180.0
 
@@ -71,7 +75,7 @@ def reference(
 def taught_from(*images: Image, using: ReferenceRecord | None = None, opening_m: float = OPENING_M) -> Taught:
     """The sharp model taught."""
     frames = [TeachingImage(image, opening_m, f"{n}.png") for n, image in enumerate(images)]
-    return teach(CAMERA, box_gripper(), MeasurementSettings(), JAW_SIGMA_M, using or reference(), frames)
+    return teach(RIG, using or reference(), frames)
 
 
 def arrays(taught: Taught, cam_T_grip: np.ndarray | None = None) -> TaughtEdges:

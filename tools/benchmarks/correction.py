@@ -174,7 +174,7 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
 
     from benchmarks.noise_model import NoiseModel
     from benchmarks.scene import config_for
-    from gripmon.analyse.smoother import chart
+    from gripmon.analyse.vectors import to_poses
     from gripmon.model.geometry import from_record
 
     nominal_T = from_record(config_for((768, 576)).reference.cam_T_grip)
@@ -184,9 +184,9 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
     way = np.outer(scenario.way(time_s, rng), np.array(rough.per_m)[:, 1]) + vibrates
     wrong = rng.random(len(error)) < scenario.wild
     seen = error + wrong[:, None] * 30.0 * error.std(axis=0) * rng.choice([-1.0, 1.0], (len(error), 6))
-    true_T = chart.to_poses(nominal_T, way)
+    true_T = to_poses(nominal_T, way)
     # The error is applied after the motion.
-    measured_T = np.array([chart.to_poses(t, s[None])[0] for t, s in zip(true_T, seen, strict=True)])
+    measured_T = np.array([to_poses(t, s[None])[0] for t, s in zip(true_T, seen, strict=True)])
     measured = np.ones(len(error), bool)
     if scenario.gap_s is not None:
         measured &= ~((time_s >= scenario.gap_s[0]) & (time_s < scenario.gap_s[1]))
@@ -196,7 +196,7 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
 def _one(scenario: Scenario, error: Any, vibrates: Any, covariance: Any, rng: Any) -> _Run:
     import numpy as np
 
-    from gripmon.analyse.smoother import correct
+    from gripmon.analyse.correction import correct
 
     stamp_ns, true_T, measured_T, measured = stream(scenario, error, vibrates, rng)
     live_T, raw_T = live(measured_T, covariance, measured)
@@ -278,7 +278,7 @@ def draw(path: Path, seed: int) -> None:
     import numpy as np
 
     from benchmarks.noise_model import NoiseModel
-    from gripmon.analyse.smoother import correct
+    from gripmon.analyse.correction import correct
 
     wanted = [s for s in scenarios() if s.regime == "working" and s.name in ("five steps", "creep of 0.1 mm/min")]
     figure, axes = plt.subplots(len(wanted), 1, figsize=(10, 7), constrained_layout=True)

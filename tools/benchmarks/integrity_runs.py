@@ -39,7 +39,8 @@ from gripmon.model.records import (
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.teach.forecast import Rig, foresee_frame
+from gripmon.teach.accuracy import forecast_frame
+from gripmon.teach.visibility import Rig
 
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""
@@ -198,7 +199,7 @@ def _settings(watched: Watched) -> MonitorSettings:
     known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
     settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
     rig = Rig(watched.camera, watched.gripper, settings, None)
-    foretold = foresee_frame(rig, watched.start_cam_T_grip, None).protection
+    foretold = forecast_frame(rig, watched.start_cam_T_grip, None).protection
     policy = msgspec.structs.replace(
         settings.policy,
         alert_limit_m=max(settings.policy.alert_limit_m, 3.0 * foretold.position_m),

@@ -20,8 +20,7 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.simulate.scenario import Sensor
-from gripmon.teach.onboarding import KnownGripper, UnknownGripper
-from gripmon.teach.onboarding.measuring import contact_height_m
+from gripmon.teach.hand_eye import KnownGripper, UnknownGripper
 
 ROUGH_PX = 4.0
 """Somebody clicks on corners; they are off by up to so much."""
@@ -117,9 +116,9 @@ def solve(way: str, setting: Setting, image: Image, sight: Sighting, rng: np.ran
         single = calibrate_single_view(sight)
         camera = GivenCamera(single.camera, single.parameters, single.covariance)
     if way == "inferred":
-        return UnknownGripper(camera, DISCS).look(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
+        return UnknownGripper(camera, DISCS).measure(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
     known = KnownGripper(camera, gripper(), OPENING_M)
-    return known.look(image, sight, _rough(setting, {name: (name, None) for name in _SEEN}, rng)).coincidence
+    return known.measure(image, sight, _rough(setting, {name: (name, None) for name in _SEEN}, rng)).coincidence
 
 
 def revealed(count: int, seed: int, progress: Callable[[], object] = lambda: None) -> list[Revealed]:
@@ -172,7 +171,7 @@ def _by_corners(one: Coincidence) -> Coincidence:
     points_m = gripper().points_grip_m(OPENING_M)
     known = KnownCorners(
         points_m[[gripper().point_ids.index(name) for name in one.corners.names]],
-        contact_height_m(gripper(), OPENING_M),
+        float(gripper().points_grip_m(OPENING_M)[:, 2].max()),
     )
     return calibrate_plane(GivenCamera(PAPER_LENS), one.sighting, replace(one.corners, free=None), known)
 

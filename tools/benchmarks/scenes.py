@@ -25,10 +25,13 @@ from gripmon.model.camera import Camera, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord
+from gripmon.monitor import MonitorSettings
 from gripmon.simulate import FrameTruth, Hidden, Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
-from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
-from gripmon.track.edges import MeasurementSettings, TaughtEdges
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage, TeachingRefused
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtEdges
 
 CAMERA = PaperLens(
     width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
@@ -187,7 +190,7 @@ def _taught(
     flat = tuple(covariance.ravel().tolist())
     reference = ReferenceRecord("taught", 0, 0, "configuration", to_record(cam_T_grip), flat)
     try:
-        learnt = teach(camera, gripper, MeasurementSettings(), 0.0, reference, images)
+        learnt = teach(Rig(camera, gripper, MonitorSettings(jaw_sigma_m=0.0)), reference, images)
     except TeachingRefused as refused:
         print(f"accuracy: not taught: {refused}", file=sys.stderr)
         return None

@@ -2,8 +2,8 @@
 configuration that runs.  It stands here because it knows configurations, which the room ``teach`` does not.
 """
 
-from gripmon.daemon.teaching.inputs import Inputs, read_inputs, rough_desk
-from gripmon.daemon.teaching.saving import FileSaving, page_desk, teach_from_file
+from gripmon.daemon.teaching.inputs import Inputs, outline_session, read_inputs
+from gripmon.daemon.teaching.saving import FileSaving, page_session, teach_from_file
 from gripmon.daemon.teaching.written import name_taught
 
-__all__ = ["FileSaving", "Inputs", "name_taught", "page_desk", "read_inputs", "rough_desk", "teach_from_file"]
+__all__ = ["FileSaving", "Inputs", "name_taught", "outline_session", "page_session", "read_inputs", "teach_from_file"]

@@ -27,11 +27,11 @@ from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord, to_json
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.edges.bench import Bench, rough_fault
-from gripmon.teach.edges.corner_pose import CameraError
-from gripmon.teach.edges.files import Picture, read_any, read_picture
-from gripmon.teach.onboarding.outlines import RoughCorners
-from gripmon.teach.page import RoughDesk
+from gripmon.teach.api import Picture, read_any, read_picture
+from gripmon.teach.corner_pose import CameraError, corners_fault
+from gripmon.teach.outlines import RoughCorners
+from gripmon.teach.page_server import OutlineSession
+from gripmon.teach.session import Setup
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 
@@ -42,7 +42,7 @@ class Inputs:
     the files of ``gripmon calibrate`` that a configuration names in place of sections, by key.
     """
 
-    bench: Bench
+    setup: Setup
     pictures: tuple[Picture, ...]
     gripper_path: Path
     folder: Path
@@ -79,22 +79,22 @@ def read_inputs(
     given = None
     if config is not None:
         given = load_config(config, check_source=False, with_taught=False)
-        bench = Bench(given.camera, given.gripper, given.settings.monitor, given.reference)
+        setup = Setup(given.camera, given.gripper, given.settings.monitor, given.reference)
         gripper_path = given.gripper_path
         robot, camera_name = given.settings.robot, given.settings.camera_name
         if jaw_opening_m is None and given.settings.jaw.source == "fixed":
             jaw_opening_m = given.jaw_opening_m
     else:
         model, gripper_path = _gripper(gripper)
-        bench = Bench(*_calibrations(camera, reference, model))
-    if jaw_source is not None and not bench.gripper.has_jaw:
+        setup = Setup(*_calibrations(camera, reference, model))
+    if jaw_source is not None and not setup.gripper.has_jaw:
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
-    depth = bench.settings.bit_depth
-    pictures = tuple(read_picture(path, bench.camera, bench.gripper, depth, jaw_opening_m) for path in images)
-    source = live_settings(live, bench.camera) if live is not None else FolderSettings(path=str(images[0].parent))
+    depth = setup.settings.bit_depth
+    pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
+    source = live_settings(live, setup.camera) if live is not None else FolderSettings(path=str(images[0].parent))
     calibrations = {"camera": camera, "reference": reference}
     return Inputs(
-        bench=bench,
+        setup=setup,
         pictures=pictures,
         gripper_path=gripper_path,
         folder=out or (Path() if given is None else given.directory),
@@ -114,13 +114,13 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     rough = read_settings(path, RoughCorners)
     # The file may be the one of calibrate plane --infer, which also names points on edges: they are no corners.
     corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
-    fault = rough_fault(corners, gripper)
+    fault = corners_fault(corners, gripper)
     if fault is not None:
         raise InputError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}")
     return corners
 
 
-def rough_desk(image: Path, camera: Path | None, folder: Path) -> RoughDesk:
+def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, to be saved in ``folder``."""
     shown, target = read_any(image), None
     if camera is not None:
@@ -142,7 +142,7 @@ def rough_desk(image: Path, camera: Path | None, folder: Path) -> RoughDesk:
     )
     note = f"{plate}; with jaws that move also --jaw-range MIN:MAX (m)"
     picture = Picture(image.name, shown, None, str(image))
-    return RoughDesk(picture, folder / ROUGH, shlex.join(map(str, words)), note)
+    return OutlineSession(picture, folder / ROUGH, shlex.join(map(str, words)), note)
 
 
 def _gripper(path: Path | None) -> tuple[Gripper, Path]:
@@ -158,7 +158,7 @@ def _gripper(path: Path | None) -> tuple[Gripper, Path]:
 def _calibrations(
     camera_path: Path | None, reference_path: Path | None, gripper: Gripper
 ) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, CameraError | None]:
-    """What a bench takes, from files; a reference's file holds its camera, too."""
+    """What teaching begins with, from files; a reference's file holds its camera, too."""
     lens, error = (None, None) if camera_path is None else _read_lens(camera_path)
     reference = None
     if reference_path is not None:

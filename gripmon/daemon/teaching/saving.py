@@ -24,13 +24,11 @@ from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.edges import TeachingImage, TeachingRefused
-from gripmon.teach.edges.bench import Found
-from gripmon.teach.edges.files import taught_model, to_yaml
-from gripmon.teach.edges.snapping import FEWEST_PUT
-from gripmon.teach.page import Desk, Picture, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page.desk import Labels
-from gripmon.teach.page.messages import Put
+from gripmon.teach.api import Picture, taught_model, to_yaml
+from gripmon.teach.messages import Put, Saved, SaveOrder, SavingRefused
+from gripmon.teach.session import Evaluation, Labels, TeachSession
+from gripmon.teach.snapping import FEWEST_PUT
+from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
@@ -55,7 +53,7 @@ class FileSaving:
 
     def labels(self) -> Labels:
         """What the page shows."""
-        inputs, known = self._inputs, self._inputs.bench.reference
+        inputs, known = self._inputs, self._inputs.setup.reference
         return Labels(
             robot=inputs.robot,
             camera_name=inputs.camera_name,
@@ -66,7 +64,7 @@ class FileSaving:
             live=inputs.live,
         )
 
-    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+    def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
         """As :class:`gripmon.teach.page.Saving`."""
         paths = self._paths
         notes: list[str] = []
@@ -128,29 +126,29 @@ class FileSaving:
     def _taught(
         self,
         order: SaveOrder,
-        found: Found,
+        found: Evaluation,
         reference: ReferenceRecord,
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
     ) -> tuple[TaughtModel, list[str]]:
-        bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
+        setup, opening_m = self._inputs.setup, found.snapped.jaw_opening_m
         given = order.put.jaw_opening_m is not None
         pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
-        nominal_m = bench.gripper.jaw_nominal_m
+        nominal_m = setup.gripper.jaw_nominal_m
         images = [
             TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, p.name) for p in pictures
         ]
         try:
-            taught, _ = bench.taught(reference, images)
+            taught, _ = setup.taught(reference, images)
         except TeachingRefused as refused:
             raise SavingRefused(f"no taught model: {refused}; or save without it") from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
         model = taught_model(
-            taught, bench.camera, bench.gripper, bench.settings, reference, pictures, self._inputs.command, files
+            taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files
         )
         return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
-    def _corners(self, order: SaveOrder, found: Found, image: str) -> str:
+    def _corners(self, order: SaveOrder, found: Evaluation, image: str) -> str:
         """Corners as ``--corners`` reads them."""
         lines = [
             f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
@@ -168,7 +166,7 @@ class FileSaving:
             lines[-1] = "corners: {}"
         return "\n".join(lines) + "\n"
 
-    def _config(self, order: SaveOrder, found: Found, taught: bool) -> str:
+    def _config(self, order: SaveOrder, found: Evaluation, taught: bool) -> str:
         given = self._inputs.config
         if given is not None:
             return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
@@ -178,7 +176,7 @@ class FileSaving:
         """As a configuration in ``to``, or the folder written to, names it."""
         return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
 
-    def _try_out(self, order: SaveOrder, found: Found, texts: Mapping[str, str]) -> None:
+    def _try_out(self, order: SaveOrder, found: Evaluation, texts: Mapping[str, str]) -> None:
         """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
         if "config" not in texts:
             return
@@ -219,30 +217,30 @@ class FileSaving:
         return written
 
 
-def page_desk(inputs: Inputs) -> Desk:
+def page_session(inputs: Inputs) -> TeachSession:
     """What the page works on.  Raises :class:`~gripmon.model.errors.InputError` for a camera that can't be."""
     try:
-        live = None if inputs.live is None else open_source(live_settings(inputs.live, inputs.bench.camera))
+        live = None if inputs.live is None else open_source(live_settings(inputs.live, inputs.setup.camera))
     except SourceError as error:
         raise InputError(str(error), "live") from None
     saving = FileSaving(inputs)
-    return Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live)
+    return TeachSession(inputs.setup, inputs.pictures, saving.labels(), saving, live)
 
 
-def teach_from_file(inputs: Inputs, path: Path) -> tuple[Found, Callable[[bool], Saved]]:
+def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[bool], Saved]]:
     """What the corners in a file give in the one picture, and what writes it: with True over files that are there.
 
     Raises :class:`~gripmon.model.errors.InputError` for corners that can't be, and
     :class:`~gripmon.model.errors.NoResultError` where nothing can be taught from them.
     """
-    rough, bench, picture = read_rough(path, inputs.bench.gripper), inputs.bench, inputs.pictures[0]
-    if bench.reference is None and len(rough) < FEWEST_PUT:
+    rough, setup, picture = read_rough(path, inputs.setup.gripper), inputs.setup, inputs.pictures[0]
+    if setup.reference is None and len(rough) < FEWEST_PUT:
         raise InputError(
             f"{path}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, hidden ones too, about where they "
             "would show; or --reference FILE (of gripmon calibrate plane)"
         )
     corners = {name: np.array(at) for name, at in rough.items()}
-    found = bench.look(picture.image, corners, (), picture.jaw_opening_m)
+    found = setup.evaluate(picture.image, corners, (), picture.jaw_opening_m)
     if found.snapped.refused is not None:
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
     put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)

@@ -21,9 +21,9 @@ from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.edges.bench import Found
-from gripmon.teach.edges.corner_pose import CornerPose
-from gripmon.teach.page import SaveOrder
+from gripmon.teach.corner_pose import CornerPose
+from gripmon.teach.messages import SaveOrder
+from gripmon.teach.session import Evaluation
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
@@ -32,7 +32,7 @@ _AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", 
 
 
 def config_text(
-    inputs: Inputs, order: SaveOrder, found: Found, taught: str | None, folder: Callable[[Path], str]
+    inputs: Inputs, order: SaveOrder, found: Evaluation, taught: str | None, folder: Callable[[Path], str]
 ) -> str:
     """A whole file; ``folder`` names a path as the file does, ``taught`` is the taught model's name (None: none)."""
     source = inputs.source
@@ -60,7 +60,7 @@ def config_text(
         parts += ["  kind: folder  # images in a folder", f"  path: {place}  # relative to this file"]
     else:
         parts.append(lines_of(source, 2))
-    if inputs.bench.gripper.has_jaw:
+    if inputs.setup.gripper.has_jaw:
         parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
     parts += ["", _defaults()]
     return "\n".join(parts) + "\n"
@@ -70,7 +70,7 @@ def _camera(inputs: Inputs, folder: Callable[[Path], str]) -> list[str]:
     if "camera" in inputs.calibrations:
         there = yaml_value(folder(inputs.calibrations["camera"]))
         return [f"camera: {there}  # file of gripmon calibrate intrinsics, relative to this file; or a section"]
-    return ["camera:", lines_of(inputs.bench.camera.settings, 2)]
+    return ["camera:", lines_of(inputs.setup.camera.settings, 2)]
 
 
 def with_taught(path: Path, taught: str) -> str:

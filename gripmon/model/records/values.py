@@ -44,14 +44,14 @@ class OpenEnum(enum.StrEnum):
         return unknown
 
 
-class Transform(msgspec.Struct, frozen=True):
+class Transform(msgspec.Struct, frozen=True, gc=False):
     """``cam_T_grip``: from gripper to camera coordinates, the gripper's origin at the TCP."""
 
     translation_m: Translation
     rotation_xyzw: Rotation
 
 
-class Drift(msgspec.Struct, frozen=True):
+class Drift(msgspec.Struct, frozen=True, gc=False):
     """Motion against the reference: ``d`` and ``delta`` of equation (14) and the TCP's displacement in the camera
     frame.
     """
@@ -63,7 +63,7 @@ class Drift(msgspec.Struct, frozen=True):
     ]
 
 
-class Smoothed(msgspec.Struct, frozen=True):
+class Smoothed(msgspec.Struct, frozen=True, gc=False):
     """The transform averaged over time."""
 
     translation_m: Translation
@@ -71,7 +71,7 @@ class Smoothed(msgspec.Struct, frozen=True):
     covariance: Covariance
 
 
-class Protection(msgspec.Struct, frozen=True):
+class Protection(msgspec.Struct, frozen=True, gc=False):
     """Bounds on the error of a transform: it lies beyond either with at most the stated probability."""
 
     position_m: Annotated[float, Meta(description="protection level: bound on the TCP's position error, m")]

@@ -143,6 +143,8 @@ def _irls(
         # One Gauss-Newton step: (J' W J + P) step = J' W r + P (mean - xi).
         information[:], step[:] = 0.0, 0.0
         for j in range(count):
+            if weight[j] == 0.0:
+                continue
             for i in range(SIZE):
                 weighted = weight[j] * jacobian[j, i]
                 step[i] += weighted * residual[j]

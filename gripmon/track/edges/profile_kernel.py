@@ -222,8 +222,8 @@ def find_candidates(
             if not curvature > FLAT * centre:
                 continue
             # A blurred step answers with a Gaussian, whose logarithm is a parabola.
-            log_left, log_right = math.log(max(left, 1e-3 * centre)), math.log(max(right, 1e-3 * centre))
-            shift = 0.5 * (log_right - log_left) / (2.0 * math.log(centre) - log_left - log_right)
+            log_left, log_right = math.log(max(left / centre, 1e-3)), math.log(max(right / centre, 1e-3))
+            shift = 0.5 * (log_left - log_right) / (log_left + log_right)
             width = math.sqrt(centre / curvature)
             place, bright = margin + c + shift, 1 if response[c] > 0.0 else -1
             unrest = _unrest(change, c, near, far)

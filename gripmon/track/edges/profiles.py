@@ -232,8 +232,8 @@ def find_candidates_with_numpy(
     sample, column = np.nonzero(peak)
     left, centre, right, curvature = left[peak], middle[peak], right[peak], curved[peak]
     # A blurred step answers with a Gaussian, whose logarithm is a parabola.
-    log_left, log_centre, log_right = (np.log(np.maximum(v, 1e-3 * centre)) for v in (left, centre, right))
-    shift = 0.5 * (log_right - log_left) / (2.0 * log_centre - log_left - log_right)
+    log_left, log_right = (np.log(np.maximum(beside / centre, 1e-3)) for beside in (left, right))
+    shift = 0.5 * (log_left - log_right) / (log_left + log_right)
     offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
     step = response[:, 1:-1][peak]
     sigma_px = np.maximum(

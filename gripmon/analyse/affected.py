@@ -1,0 +1,233 @@
+"""When something should not be relied on; the limits for it, from the recorded configuration; and how large errors may
+have been beside them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from gripmon.analyse.content import COVERAGE, AffectedRange, Displacement, Event, Integrity, Limits
+from gripmon.analyse.events import MOTIONS
+from gripmon.analyse.track import SECOND_NS, Track, displacement
+from gripmon.judge.policy import PolicySettings
+from gripmon.model.records import Array
+from gripmon.record.read import FrameTable, Recording
+
+_MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
+_RELIEF = 0.8  # of the limit, below which it is over
+_SHORTEST_NS = SECOND_NS // 10
+_MEANING = {
+    "old_calibration": "Grasps and data that used the calibration from the beginning are off by up to this much. "
+    "gripmon correct gives the transform for every instant.",
+    "stale_reference": "What used the monitor's reference instead of its live transforms was off by up to this much.",
+    "suspect": "Transforms were given as suspect: motions begun by them are doubtful.",
+    "unknown": "No transform was given: what was done in this time was done without one.",
+}
+
+
+def motion_ranges(
+    track: Track, keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
+) -> list[AffectedRange]:
+    """Where a calibration didn't hold: the one from the beginning, and, if that was replaced, the one in force.
+
+    ``keys``: id and revision of the references, as ``track.reference`` counts them.
+    """
+    if not track.measured.any():
+        return []
+    onsets = [event.onset.stamp_ns for event in events if event.kind in MOTIONS]
+    moved = track.stamp_ns >= min(onsets, default=np.iinfo(np.int64).max)
+    kinds = [("old_calibration", track.against_first, np.zeros(len(track), np.int64))]
+    if len(keys) > 1:
+        kinds.append(("stale_reference", track.against_reference, track.reference))
+    out: list[AffectedRange] = []
+    for what, vectors, reference in kinds:
+        before_ns = 0
+        for run in _past(track, vectors, limits, reference, moved):
+            each = _motion_range(what, track, vectors, run, keys[int(reference[run[0]])], events)
+            # Of two runs past the limit by one motion only the first counts from its beginning.
+            if each.start_ns < before_ns and each.limit_ns is not None:
+                each = msgspec.structs.replace(each, start_ns=each.limit_ns)
+            out.append(each)
+            before_ns = each.end_ns
+    return out
+
+
+def verdict_ranges(
+    track: Track, names: Sequence[str], verdict: NDArray[np.int8], keys: Sequence[tuple[str, int]]
+) -> list[AffectedRange]:
+    """Where transforms were suspect or there were none, for a tenth of a second or more."""
+    out = []
+    for name in ("suspect", "unknown"):
+        for part in runs_of_equal(verdict == names.index(name)):
+            first, last = part.start, part.stop - 1
+            if verdict[first] != names.index(name):
+                continue
+            open_end = last + 1 >= len(track)
+            end_ns = int(track.stamp_ns[last if open_end else last + 1])
+            if end_ns - int(track.stamp_ns[first]) < _SHORTEST_NS:
+                continue
+            reference_id, revision = keys[int(track.reference[first])]
+            out.append(
+                AffectedRange(
+                    what=name,
+                    start_ns=int(track.stamp_ns[first]),
+                    end_ns=end_ns,
+                    ended_by="end_of_recording" if open_end else "measured_again",
+                    reference_id=reference_id,
+                    revision=revision,
+                    frames=last - first + 1,
+                    meaning=_MEANING[name],
+                )
+            )
+    return out
+
+
+def _past(
+    track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64], moved: NDArray[np.bool_]
+) -> list[tuple[int, int]]:
+    """First and last frame of each time past the limits, in one group each; it is over only when a frame was measured
+    that is clearly within.  Before anything has ``moved`` (n,) it begins only where it is more than a frame's transform
+    is uncertain by: where that is as much as the limit, being past it means nothing.
+    """
+    frames = np.flatnonzero(track.measured)
+    smooth = np.empty((len(frames), 6))
+    for part in runs_of_equal(group[frames]):  # a median over a change of reference would mix two
+        smooth[part] = median_filter(vectors[frames[part]], size=(_MEDIAN_FRAMES, 1), mode="nearest")
+    size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
+    turn = np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad
+    excess = np.maximum(size, turn)
+    significant = (size >= 1.0) & _significant(smooth[:, :3], track.sigma[frames, :3])
+    significant |= (turn >= 1.0) & _significant(smooth[:, 3:], track.sigma[frames, 3:])
+    significant |= moved[frames]
+    out: list[tuple[int, int]] = []
+    start: int | None = None
+    for i, frame in enumerate(frames.tolist()):
+        if start is not None and (excess[i] < _RELIEF or group[frame] != group[start]):
+            out.append((start, frame - 1))
+            start = None
+        if start is None and excess[i] >= 1.0 and significant[i]:
+            start = frame
+    if start is not None:
+        out.append((start, len(track) - 1))
+    return [(a, b) for a, b in out if int(track.measured[a : b + 1].sum()) > _MEDIAN_FRAMES // 2]
+
+
+def _significant(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
+    """(n,) which vectors (n, 3) are longer than what a ± of their deviations (n, 3) stands for along them."""
+    along = np.linalg.norm(vectors * sigma, axis=1)
+    return np.asarray(~(np.square(vectors).sum(axis=1) <= COVERAGE * along))  # also where there is no deviation
+
+
+def runs_of_equal(values: NDArray[np.int64] | NDArray[np.bool_]) -> list[slice]:
+    """Slices over which a value stays the same."""
+    cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    return [slice(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+
+
+def _motion_range(
+    what: str, track: Track, vectors: Array, run: tuple[int, int], key: tuple[str, int], events: Sequence[Event]
+) -> AffectedRange:
+    first, last = run
+    limit_ns = int(track.stamp_ns[first])
+    begun = [
+        event.onset.stamp_ns
+        for event in events
+        if event.kind in MOTIONS and event.onset.stamp_ns <= limit_ns <= (event.end_ns or limit_ns) + SECOND_NS
+    ]
+    at_end = last >= len(track) - 1
+    renewed = not at_end and track.reference[last + 1] != track.reference[first]
+    ended_by = "end_of_recording" if at_end else "recalibration" if renewed and what == "stale_reference" else "return"
+    return AffectedRange(
+        what=what,
+        start_ns=min([limit_ns, *begun[-1:]]),
+        limit_ns=limit_ns,
+        end_ns=int(track.stamp_ns[min(last + 1, len(track) - 1)]),
+        ended_by=ended_by,
+        reference_id=key[0],
+        revision=key[1],
+        frames=last - first + 1,
+        largest=_largest(track, vectors, first, last),
+        meaning=_MEANING[what],
+    )
+
+
+def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacement:
+    """The farthest of the medians over a few frames: a single wild frame is none."""
+    frames = first + np.flatnonzero(track.measured[first : last + 1])
+    blocks = [frames[i : i + _MEDIAN_FRAMES] for i in range(0, len(frames), _MEDIAN_FRAMES)]
+    if len(blocks) > 1 and len(blocks[-1]) < _MEDIAN_FRAMES // 2:
+        blocks.pop()
+    levels = np.array([np.median(vectors[block], axis=0) for block in blocks])
+    i = int(np.argmax(np.linalg.norm(levels[:, :3], axis=1)))
+    return displacement(levels[i], np.median(track.sigma[blocks[i]], axis=0))
+
+
+def limits_of(source: Recording, affected_m: float | None, affected_rad: float | None) -> Limits:
+    """From the recorded configuration; defaults where it names none, or is none.
+
+    ``affected_m`` and ``affected_rad`` are a person's own; None: what is worth a warning.
+    """
+    policy, origin = _policy(source)
+    if affected_m is not None or affected_rad is not None:
+        origin += "; what counts as affected was given with the command"
+    return Limits(
+        affected_m=policy.warn_m if affected_m is None else affected_m,
+        affected_rad=policy.warn_rad if affected_rad is None else affected_rad,
+        warn_m=policy.warn_m,
+        warn_rad=policy.warn_rad,
+        limit_m=policy.limit_m,
+        limit_rad=policy.limit_rad,
+        alert_limit_m=policy.position_limit_m,
+        alert_limit_rad=policy.alert_limit_rad,
+        origin=origin,
+    )
+
+
+def excess(size_m: float, turn_rad: float, limits: Limits) -> float:
+    """How many times as large as what counts as affected; NaN counts as nothing."""
+    parts = (size_m / limits.affected_m, turn_rad / limits.affected_rad)
+    return max((part for part in parts if math.isfinite(part)), default=0.0)
+
+
+def _policy(source: Recording) -> tuple[PolicySettings, str]:
+    configuration = source.configuration
+    file = None if configuration is None else configuration.files.get(configuration.main)
+    if file is None:
+        return PolicySettings(), "gripmon's defaults: the recording holds no configuration"
+    try:
+        document: Any = yaml.safe_load(file.data.decode("utf-8", "replace"))
+        known = {field.name for field in msgspec.structs.fields(PolicySettings)}
+        given = {k: v for k, v in ((document.get("monitor") or {}).get("policy") or {}).items() if k in known}
+        return msgspec.convert(given, PolicySettings), "the recording's configuration"
+    except (yaml.YAMLError, msgspec.ValidationError, AttributeError, TypeError, ValueError):
+        return PolicySettings(), "gripmon's defaults: the recording's configuration can't be read"
+
+
+def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:
+    """Of one recording; None where no frame has bounds."""
+    known = np.isfinite(table.protection_m) & np.isfinite(table.protection_rad)
+    if not known.any() or limits.alert_limit_m is None or limits.alert_limit_rad is None:
+        return None
+    position_m, rotation_rad = table.protection_m[known], table.protection_rad[known]
+    within = (position_m <= limits.alert_limit_m) & (rotation_rad <= limits.alert_limit_rad)
+    median_m, p99_m = np.percentile(position_m, (50.0, 99.0)).tolist()
+    median_rad, p99_rad = np.percentile(rotation_rad, (50.0, 99.0)).tolist()
+    return Integrity(
+        frames=int(known.sum()),
+        valid=float(np.mean(table.verdict == table.VERDICTS.index("valid"))),
+        within=float(within.sum() / len(table)),
+        median_m=median_m,
+        p99_m=p99_m,
+        median_rad=median_rad,
+        p99_rad=p99_rad,
+        risk=float(np.median(table.integrity_risk[known])),
+    )

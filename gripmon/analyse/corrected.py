@@ -1,0 +1,240 @@
+"""A corrected run, and how it is written: JSON lines, Parquet or a track for the viewer, with where it comes from."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gripmon import __version__
+from gripmon.analyse.correction import BLOCK_S, SOURCES, Correction, correct, sample
+from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
+from gripmon.analyse.smoothing import MID_S, SLOW_S
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Origin, Transform
+from gripmon.record.read import FrameTable, Recording
+
+BETWEEN = "between"
+"""Source of an instant that is no frame's."""
+
+
+@dataclass(frozen=True)
+class CorrectedRun:
+    """One run of a monitor and its correction; ``wanted_ns`` (n,): the instants to write instead of its frames."""
+
+    recording: Recording
+    correction: Correction
+    wanted_ns: NDArray[np.int64] | None = None
+
+    @property
+    def name(self) -> str:
+        """See :func:`name_of`."""
+        return name_of(self.recording)
+
+
+def name_of(recording: Recording) -> str:
+    """The first files of a run."""
+    return ", ".join(path.name for path in recording.files[:3]) + (", …" if len(recording.files) > 3 else "")
+
+
+def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
+    """Correct the frames of a table; ``step`` is called after each stage.  ValueError where too little was measured."""
+    held = frames.ORIGINS.index(Origin.HELD.value)
+    length = np.linalg.norm(frames.cam_T_grip[:, 3:], axis=1)
+    measured = np.isfinite(frames.cam_T_grip).all(axis=1) & (frames.source != held) & ~frames.refused & (length > 0.0)
+    poses = np.full((len(frames), 4, 4), np.nan)
+    good = frames.cam_T_grip[measured]
+    poses[measured] = np.eye(4)
+    if len(good):
+        poses[measured, :3, :3] = Rotation.from_quat(good[:, 3:]).as_matrix()
+    poses[measured, :3, 3] = good[:, :3]
+    return correct(frames.stamp_ns, poses, frames.covariance, measured, step)
+
+
+class WrittenChangePoint(msgspec.Struct, frozen=True):
+    """``size``: x, y, z of the TCP (m) and rotation vector (rad) from before to after, camera axes."""
+
+    seq: int
+    stamp_ns: int
+    earliest_ns: int
+    latest_ns: int
+    size: tuple[float, ...]
+    size_covariance: tuple[float, ...]
+
+
+class WrittenRun(msgspec.Struct, frozen=True):
+    """A run of a monitor; ``learnt`` by the six whitened axes, in units of the reported variance."""
+
+    recording_id: str
+    robot: str
+    camera: str
+    files: tuple[str, ...]
+    frames: int
+    change_points: tuple[WrittenChangePoint, ...]
+    learnt: dict[str, tuple[float, ...]]
+    faults: tuple[str, ...]
+
+
+class Provenance(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.correction/1"):
+    """First line of the file, or metadata ``gripmon`` of the table: ``inputs`` are SHA-256 by file name."""
+
+    version: str
+    inputs: tuple[tuple[str, str], ...]
+    settings: dict[str, float]
+    runs: tuple[WrittenRun, ...]
+
+
+class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.corrected/1"):
+    """One instant.  ``run`` counts the runs; ``seq`` is -1 for an instant that is no frame's; ``segment`` counts the
+    change points before; ``sigma_tcp_m`` is the standard deviation of the TCP's position, all axes together.
+    """
+
+    run: int
+    seq: int
+    stamp_ns: int
+    cam_T_grip: Transform
+    covariance: tuple[float, ...]
+    segment: int
+    source: str
+    sigma_tcp_m: float
+
+
+def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
+    """Where a file comes from."""
+    settings = {
+        "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
+        "block_s": BLOCK_S,
+        "slow_error_s": SLOW_S,
+        "mid_error_s": MID_S,
+    }
+    return Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
+
+
+def _run(each: CorrectedRun) -> WrittenRun:
+    recording, made = each.recording, each.correction
+    seqs = recording.frames.seq
+    learnt = {name: getattr(made.learnt, name) for name in ("white", "mid", "slow", "frame", "unseen")}
+    learnt |= {"wander_per_s": made.dynamics.wander, "turn_per_s3": made.dynamics.turn}
+    return WrittenRun(
+        recording.recording_id,
+        recording.robot,
+        recording.camera,
+        tuple(path.name for path in recording.files),
+        len(seqs),
+        tuple(
+            WrittenChangePoint(
+                int(seqs[point.index]),
+                point.stamp_ns,
+                point.earliest_ns,
+                point.latest_ns,
+                tuple(point.size.tolist()),
+                tuple(point.size_covariance.ravel().tolist()),
+            )
+            for point in made.change_points
+        ),
+        {name: tuple(values.tolist()) for name, values in learnt.items()},
+        (*recording.faults, *made.faults),
+    )
+
+
+def _columns(each: CorrectedRun) -> dict[str, Any]:
+    """One run's instants: arrays, and the sources as text."""
+    made, frames = each.correction, each.recording.frames
+    if each.wanted_ns is None:
+        stamp_ns, seq, segment, poses, covariance = (
+            made.stamp_ns, frames.seq, made.segment, made.cam_T_grip, made.covariance
+        )  # fmt: skip
+        source = [SOURCES[code] for code in made.source.tolist()]
+    else:
+        stamp_ns = each.wanted_ns
+        poses, covariance, segment = sample(made, stamp_ns)
+        at = np.minimum(np.searchsorted(made.stamp_ns, stamp_ns), len(made.stamp_ns) - 1)
+        own = made.stamp_ns[at] == stamp_ns
+        seq = np.where(own, frames.seq[at], -1)
+        codes = made.source[at].tolist()
+        source = [SOURCES[code] if mine else BETWEEN for code, mine in zip(codes, own.tolist(), strict=True)]
+    return {
+        "seq": seq,
+        "stamp_ns": stamp_ns,
+        "segment": segment,
+        "source": source,
+        "sigma_tcp_m": np.sqrt(np.einsum("nii->ni", covariance)[:, :3].sum(axis=1)),
+        "translation_m": poses[:, :3, 3],
+        "rotation_xyzw": Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True),
+        "covariance": covariance.reshape(-1, 36),
+    }
+
+
+def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]], number: int = 0) -> None:
+    """A file, whole or not at all, of the kind that its suffix names; a track (.rrd) is of run ``number`` alone.
+
+    ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
+    """
+    part = path.with_name(f".{path.name}.part")
+    about = provenance(runs, inputs)
+    try:
+        if path.suffix.lower() == ".jsonl":
+            _write_jsonl(part, runs, about)
+        elif path.suffix.lower() == ".parquet":
+            _write_parquet(part, runs, about)
+        else:
+            from gripmon.record.compared import write_track
+
+            recording = runs[number].recording
+            write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
+        part.replace(path)
+    except OSError as error:
+        raise NoResultError(f"--out {path}: writing failed ({error.strerror or error})") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _write_jsonl(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
+    """A :class:`Provenance`, then a :class:`CorrectedFrame` a line."""
+    encode = msgspec.json.Encoder().encode
+    with path.open("wb") as file:
+        file.write(encode(about) + b"\n")
+        for run, each in enumerate(runs):
+            columns = _columns(each)
+            rows = (columns[name] if name == "source" else columns[name].tolist() for name in columns)
+            for seq, stamp_ns, segment, source, sigma_tcp_m, translation_m, rotation_xyzw, covariance in zip(
+                *rows, strict=True
+            ):
+                transform = Transform(tuple(translation_m), tuple(rotation_xyzw))
+                frame = CorrectedFrame(run, seq, stamp_ns, transform, tuple(covariance), segment, source, sigma_tcp_m)
+                file.write(encode(frame) + b"\n")
+
+
+def _write_parquet(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
+    """The same as a table, the covariance as a list of 36 (m², m rad, rad²), :class:`Provenance` as metadata."""
+    whole = pa.concat_tables([_table(number, each) for number, each in enumerate(runs)])
+    pq.write_table(whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)}), path, compression="zstd")
+
+
+def _table(number: int, each: CorrectedRun) -> pa.Table:
+    columns = _columns(each)
+    count = len(columns["source"])
+    plain = {name: columns[name] for name in ("seq", "stamp_ns", "segment", "source", "sigma_tcp_m")}
+    parts = [(f"translation_{axis}_m", columns["translation_m"][:, k]) for k, axis in enumerate("xyz")]
+    parts += [(f"rotation_{axis}", columns["rotation_xyzw"][:, k]) for k, axis in enumerate("xyzw")]
+    return pa.table(
+        {
+            "run": np.full(count, number, np.int32),
+            "robot": pa.array([each.recording.robot] * count, pa.string()),
+            "camera": pa.array([each.recording.camera] * count, pa.string()),
+            **plain,
+            "source": pa.array(columns["source"], pa.string()),
+            **{name: np.ascontiguousarray(values) for name, values in parts},
+            "covariance": pa.FixedSizeListArray.from_arrays(pa.array(columns["covariance"].ravel()), 36),
+        }
+    )

@@ -1,0 +1,185 @@
+"""The report in one paragraph of plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gripmon.analyse.affected import excess
+from gripmon.analyse.content import (
+    AffectedRange,
+    Event,
+    RecordingReport,
+    clock_time,
+    count,
+    date,
+    degrees,
+    duration,
+    millimetres,
+    percent,
+    period,
+    size,
+    span,
+)
+from gripmon.analyse.events import MOTIONS
+from gripmon.model.records import AlertKind, Cause
+
+CAUSES: dict[str, str] = {
+    Cause.CAMERA_MOUNT: "the camera's mount moved",
+    Cause.FINGER_BENT: "a finger was bent",
+    Cause.JAW_OPENING: "the jaw's opening was wrong",
+    Cause.LENS: "focal length or focus changed",
+    Cause.VIEW_BLOCKED: "the view was blocked",
+    Cause.IMAGE_BAD: "images were bad",
+    Cause.CAMERA_REPLACED: "the camera was replaced",
+    Cause.CAMERA_FROZEN: "the camera was frozen",
+    Cause.CLOCK: "clock or frame rate were wrong",
+    Cause.PLANE_MOVED: "the plane under the laser moved",
+    Cause.LASER_MOVED: "the laser pointer moved on the arm",
+    Cause.NO_CAMERA: "there was no camera",
+    Cause.TOO_SLOW: "the monitor was too slow for the camera",
+    Cause.UNKNOWN: "cause unknown",
+}
+_MAX_SHOWN = 3
+_ACCEPTERS = ("monitor", "operator")
+
+
+def cause_words(event: Event) -> str:
+    """``the camera's mount moved (99.8 %)``."""
+    text = CAUSES.get(event.cause, event.cause.replace("_", " "))
+    if event.part:
+        text = f"the {event.part} finger was bent" if event.cause == Cause.FINGER_BENT else f"{text} ({event.part})"
+    if event.cause == Cause.UNKNOWN or event.cause_probability is None:
+        return text
+    return f"{text} ({percent(event.cause_probability)})"
+
+
+def paragraph(report: RecordingReport) -> str:
+    """When did the camera move, how far, what did it, is it still so, what is affected, what was lost?"""
+    who = f"{report.robot} / {report.camera}"
+    if not report.running.frames:
+        return f"{who}: no frame could be read, so nothing is known about its camera."
+    motions = [event for event in report.events if event.kind in MOTIONS]
+    parts = [_motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
+    return " ".join(part for part in parts if part)
+
+
+def headline(report: RecordingReport) -> str:
+    """The same in a sentence, for one recording among several."""
+    motions = [event for event in report.events if event.kind in MOTIONS]
+    largest = max(motions, key=lambda e: e.moved.size_m if e.moved else 0.0)
+    when = f"{date(largest.onset.stamp_ns)} {clock_time(largest.onset.stamp_ns)}"
+    most = "" if len(motions) == 1 else ", farthest"
+    text = f"{report.robot} / {report.camera} moved {_times(len(motions))}{most} at {when}"
+    text += f" by {size(largest.moved)}" if largest.moved else ""
+    end = "" if report.at_end is None else f"; at the end its TCP is {millimetres(report.at_end.size_m)} off"
+    return f"{text}: {cause_words(largest)}{end}."
+
+
+def _times(number: int) -> str:
+    return {1: "once", 2: "twice"}.get(number, f"{number} times")
+
+
+def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
+    who = f"he camera of {report.robot} / {report.camera}"
+    when = period(report.start_ns, report.end_ns)
+    if not motions:
+        if report.last_measured_ns is None:
+            return f"Whether t{who} moved isn't known: in no frame ({when}) could it be measured."
+        return f"T{who} did not move ({when}): no motion was reported in {span(report.start_ns, report.end_ns)}."
+    shown = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MAX_SHOWN]
+    shown.sort(key=lambda e: e.onset.stamp_ns)
+    largest = " The largest:" if len(shown) < len(motions) else ""
+    sentences = " ".join(_motion(event, i == 0) for i, event in enumerate(shown))
+    return f"T{who} moved {_times(len(motions))} ({when}).{largest} {sentences}"
+
+
+def _motion(event: Event, first: bool) -> str:
+    how = {AlertKind.STEP: "it moved at once", AlertKind.CREEP: "it began to creep"}.get(
+        AlertKind(event.kind), "it began to drift"
+    )
+    uncertain_s = 1e-9 * (event.onset.latest_ns - event.onset.earliest_ns)
+    give_or_take = f" (within {duration(uncertain_s)})" if uncertain_s > 0.5 else ""
+    start = f"{'At' if first else 'Then, at'} {clock_time(event.onset.stamp_ns)}{give_or_take} {how}"
+    by = f", the TCP by {size(event.moved)}" if event.moved else ""
+    within = f", most of it within {duration(event.moved_in_s)}" if event.moved_in_s else ""
+    return f"{start}{by}{within}: {cause_words(event)}."
+
+
+def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
+    off = report.at_end
+    if off is None or (not motions and not any(a.what == "old_calibration" for a in report.affected)):
+        return ""
+    last = "" if report.last_measured_ns is None else clock_time(report.last_measured_ns)
+    measured = f"when last measured, at {last}"
+    if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
+        near = millimetres(off.size_m, off.sigma_m)
+        return f"It is not so any more: {measured}, the camera was back where it began, to within {near}."
+    far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
+    text = f"It is still so: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    now = report.at_end_against_reference
+    if len(report.references) < 2 or now is None:
+        return f"{text}, and there is no new reference."
+    reference = report.references[-1]
+    held = excess(now.size_m, now.rotation_rad or 0.0, report.limits) < 1.0
+    accepted = f"accepted by the {reference.accepted_by}, " if reference.accepted_by in _ACCEPTERS else ""
+    by = f"reference {reference.reference_id} ({accepted}in force from {clock_time(reference.in_force_ns)})"
+    return f"{text}; the monitor goes by {by}, which {'holds' if held else 'does not hold either'}."
+
+
+def _affected(report: RecordingReport) -> str:
+    old = [a for a in report.affected if a.what == "old_calibration"]
+    if not old:
+        return ""
+    text = f"Work that relied on the initial calibration is affected {_listed(old, report)}"
+    stale = [a for a in report.affected if a.what == "stale_reference"]
+    if stale:
+        text += f"; work that relied on the reference then in force, {_listed(stale, report)}"
+    return text + "."
+
+
+def _listed(ranges: Sequence[AffectedRange], report: RecordingReport) -> str:
+    worst = sorted(ranges, key=lambda a: a.start_ns - a.end_ns)[:_MAX_SHOWN]
+    worst.sort(key=lambda a: a.start_ns)
+    texts = []
+    for each in worst:
+        end = "the end of the recording" if each.ended_by == "end_of_recording" else clock_time(each.end_ns)
+        texts.append(f"from {clock_time(each.start_ns)} to {end} ({span(each.start_ns, each.end_ns)})")
+    more = f" and in {count(len(ranges) - len(worst), 'shorter time')}" if len(ranges) > len(worst) else ""
+    off = max((a.largest.size_m for a in ranges if a.largest), default=0.0)
+    return f"{_and(texts)}{more}, off by up to {millimetres(off)}"
+
+
+def _lost(report: RecordingReport) -> str:
+    running = report.running
+    total_s = {
+        what: sum(1e-9 * (a.end_ns - a.start_ns) for a in report.affected if a.what == what)
+        for what in ("unknown", "suspect")
+    }
+    parts = []
+    if total_s["unknown"]:
+        parts.append(f"for {duration(total_s['unknown'])} there was no transform")
+    if total_s["suspect"]:
+        parts.append(f"for {duration(total_s['suspect'])} it was only suspect")
+    if running.frames_dropped:
+        share = percent(running.frames_dropped / (running.frames + running.frames_dropped))
+        parts.append(f"{count(running.frames_dropped, 'frame')} ({share}) {_why_missing(report)}")
+    if running.gaps:
+        parts.append(f"{count(running.gaps, 'pause')} without frames, the longest {duration(running.longest_gap_s)}")
+    if not parts:
+        return "Nothing was lost: every frame has a valid transform." if _all_valid(report) else ""
+    return f"Lost: {_and(parts)}."
+
+
+def _why_missing(report: RecordingReport) -> str:
+    are = "is missing" if report.running.frames_dropped == 1 else "are missing"
+    known = ((report.running.monitor_dropped, "the monitor"), (report.running.recording_dropped, "the recorder"))
+    reasons = [f"{who} was too busy for {number}" for number, who in known if number]
+    return f"{are} ({_and(reasons)})" if reasons else are
+
+
+def _all_valid(report: RecordingReport) -> bool:
+    return [share.name for share in report.running.verdicts] == ["valid"]
+
+
+def _and(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

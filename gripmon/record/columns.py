@@ -1,0 +1,353 @@
+"""What all recordings share: rows, columns in a stream, colours, parts of a layout, and what happened beside frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from gripmon.model.records import (
+    Alert,
+    AlertEvent,
+    AlertRecord,
+    FrameRecord,
+    Limits,
+    Meta,
+    RecordedCommand,
+    Severity,
+    SpotRecord,
+    State,
+    StateRecord,
+    Verdict,
+    to_json,
+)
+from gripmon.record.recorder import Events, RecordingSettings, Scene, TraceNote
+
+APPLICATION_ID = "gripmon"
+_CLOCK_TOLERANCE_NS = 86_400_000_000_000  # between a frame and what belongs to none: a day
+_LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+
+Colour = tuple[int, int, int, int]
+
+
+class Palette:
+    """Colours (RGBA, 0..255) that the recording uses, the same meaning everywhere."""
+
+    GOOD: Colour = (70, 200, 110, 255)
+    DOUBTFUL: Colour = (245, 175, 50, 255)
+    BAD: Colour = (235, 75, 75, 255)
+    IDLE: Colour = (140, 145, 155, 255)
+    BUSY: Colour = (80, 150, 240, 255)
+    REPAIR: Colour = (180, 110, 240, 255)
+
+    PREDICTED: Colour = (60, 200, 255, 255)
+    EDGE_USED: Colour = (70, 235, 120, 255)
+    EDGE_REFUSED: Colour = (255, 70, 70, 255)
+    CORNER_USED: Colour = (255, 225, 60, 255)
+    CORNER_REFUSED: Colour = (255, 120, 60, 255)
+    GRIPPER_FACE: Colour = (150, 160, 175, 110)
+    REFERENCE: Colour = (255, 255, 255, 255)
+    BACKGROUND: Colour = (16, 18, 22, 255)  # also where the viewer is set to a light theme: the reference is white
+    WHOLE: Colour = (225, 228, 235, 255)  # a length or a share, beside its parts along the axes
+    SHIFT: Colour = (255, 90, 200, 255)
+    AXES: tuple[Colour, Colour, Colour] = ((240, 90, 90, 255), (90, 205, 105, 255), (95, 150, 255, 255))
+
+    STATES: ClassVar[dict[State, Colour]] = {
+        State.ACQUIRING: BUSY,
+        State.TRACKING: GOOD,
+        State.DRIFTING: DOUBTFUL,
+        State.RECALIBRATING: REPAIR,
+        State.OCCLUDED: (240, 130, 60, 255),
+        State.LOST: BAD,
+        State.STALE: IDLE,
+    }
+    VERDICTS: ClassVar[dict[Verdict, Colour]] = {
+        Verdict.VALID: GOOD, Verdict.SUSPECT: DOUBTFUL, Verdict.UNKNOWN: IDLE,
+    }  # fmt: skip
+
+
+def faded(colour: Colour, alpha: int) -> Colour:
+    return (*colour[:3], alpha)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An encoded image and what was measured on it (grey values 0..255)."""
+
+    blob: bytes
+    media_type: str
+    mean_grey: float
+    contrast_grey: float
+    saturated_percent: float
+    sharpness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A frame; its ``limits`` are the ones that were in force, as far as they are known."""
+
+    record: FrameRecord
+    picture: Picture | None
+    trace: TraceNote | None
+    truth_tcp_m: tuple[float, float, float] | None
+    jaw_reported_m: float | None = None
+    statistic_share: float | None = None
+    limits: Limits | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SpotRow:
+    """A pulse of a second camera's laser."""
+
+    record: SpotRecord
+    picture: Picture | None
+
+
+AnyRow = Row | SpotRow
+
+
+class Sender:
+    """Sends columns with both timelines."""
+
+    def __init__(self, stream: rr.RecordingStream):
+        self.stream = stream
+
+    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
+        for archetype in archetypes:
+            self.stream.log(path, archetype, static=True)
+
+    def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
+        """Without stamps they are on the timeline of frames only."""
+        indexes = [rr.TimeColumn("frame", sequence=seqs)]
+        if stamps_ns:
+            times = np.array(stamps_ns, np.int64).astype("datetime64[ns]")
+            indexes.insert(0, rr.TimeColumn("capture_time", timestamp=times))
+        self.stream.send_columns(path, indexes, columns)
+
+    def frames(self, path: str, rows: Sequence[AnyRow], columns: rr.ComponentColumnList) -> None:
+        self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)
+
+    def scalars(self, path: str, rows: Sequence[AnyRow], values: Sequence[Sequence[float]]) -> None:
+        """Several curves; a row without values leaves a gap in them."""
+        flat = np.array([v for some in values for v in some], dtype=np.float64)
+        self.frames(path, rows, rr.Scalars.columns(scalars=flat).partition([len(some) for some in values]))
+
+    def curve(self, path: str, rows: Sequence[AnyRow], values: Sequence[float | None]) -> None:
+        """One curve; None leaves a gap in it."""
+        self.scalars(path, rows, [() if value is None else (value,) for value in values])
+
+    def lines(self, path: str, names: Sequence[str] | str, colours: Sequence[Colour] | Colour, width: float) -> None:
+        """How the curves of an entity look."""
+        count = 1 if isinstance(names, str) else len(names)
+        self.static(path, rr.SeriesLines(names=names, colors=colours, widths=[width] * count))
+
+    def images(self, path: str, rows: Sequence[AnyRow]) -> None:
+        """The pictures of rows that have one."""
+        pictures = [row.picture for row in rows if row.picture is not None]
+        if pictures:
+            columns = rr.EncodedImage.columns(
+                blob=[np.frombuffer(p.blob, np.uint8) for p in pictures], media_type=[p.media_type for p in pictures]
+            )
+            self.frames(path, rows, columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of the log."""
+
+    stamp_ns: int
+    seq: int
+    level: str
+    text: str
+
+
+class EventWriter:
+    """Writes ``status/…`` where it changes, the log ``events`` for people, and ``alert``, ``command``, ``state``."""
+
+    def __init__(self, send: Sender, whose: str = ""):
+        """``whose`` begins each line of the log, where there are two."""
+        self._send = send
+        self._whose = f"{whose}: " if whose else ""
+        self._state = self._verdict = ""
+        self._newest_stamp_ns: int | None = None
+        send.static("status/state", _configuration(Palette.STATES))
+        send.static("status/verdict", _configuration(Palette.VERDICTS))
+
+    def repeat(self) -> None:
+        """Write state and verdict again with the next frame, changed or not."""
+        self._state = self._verdict = ""
+
+    def write(self, rows: Sequence[AnyRow], events: Events, more: Sequence[Line] = ()) -> None:
+        """``more`` are lines for the log that others have."""
+        if rows:
+            self._newest_stamp_ns = rows[-1].record.stamp_ns
+        lines = [*more, *self._status(rows)]
+        lines += [_of_alert(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in events.alerts]
+        lines += [_of_command(self._on_frames_clock(c.stamp_ns), c) for c in events.commands]
+        if lines:
+            columns = rr.TextLog.columns(text=[f"{self._whose}{e.text}" for e in lines], level=[e.level for e in lines])
+            self._send.columns("events", [e.stamp_ns for e in lines], [e.seq for e in lines], columns)
+        self._whole("alert", events.alerts)
+        self._whole("command", events.commands)
+        self._whole("state", events.states)
+        for state in events.states:
+            # Without frames it is the daemon that knows the state.
+            if state.state is State.STALE and self._newest_stamp_ns is not None:
+                self._change(self._on_frames_clock(state.stamp_ns), state.seq, state.state, state.verdict)
+
+    def _on_frames_clock(self, stamp_ns: int) -> int:
+        """Frames of old files have old stamps: among them an alert of today, which belongs to no frame, would stretch
+        the timeline over years.
+        """
+        if self._newest_stamp_ns is None or abs(stamp_ns - self._newest_stamp_ns) < _CLOCK_TOLERANCE_NS:
+            return stamp_ns
+        return self._newest_stamp_ns
+
+    def _whole(self, path: str, messages: Sequence[AlertRecord | RecordedCommand | StateRecord]) -> None:
+        """Messages as JSON; before the first frame they have no place on the timeline of captures."""
+        if not messages:
+            return
+        known = self._newest_stamp_ns is not None
+        stamps_ns = [self._on_frames_clock(message.stamp_ns) for message in messages] if known else []
+        whole = rr.AnyValues.columns(json=[to_json(message).decode() for message in messages])
+        self._send.columns(path, stamps_ns, [message.seq for message in messages], whole)
+
+    def _status(self, rows: Sequence[AnyRow]) -> list[Line]:
+        """State and verdict where they change, and what happened as text."""
+        lines = []
+        for record in (row.record for row in rows):
+            if record.state != self._state or record.verdict != self._verdict:
+                before = f"{self._state} ({self._verdict}) → " if self._state else ""
+                reason = f": {record.reason}" if record.reason else ""
+                text = f"{before}{record.state} ({record.verdict}){reason}"
+                lines.append(Line(record.stamp_ns, record.seq, "INFO", text))
+            self._change(record.stamp_ns, record.seq, record.state, record.verdict)
+            lines += [_of_alert(record.stamp_ns, record.seq, alert) for alert in record.alerts]
+        return lines
+
+    def _change(self, stamp_ns: int, seq: int, state: State, verdict: Verdict) -> None:
+        if state != self._state:
+            self._send.columns("status/state", [stamp_ns], [seq], rr.StateChange.columns(state=[state]))
+        if verdict != self._verdict:
+            self._send.columns("status/verdict", [stamp_ns], [seq], rr.StateChange.columns(state=[verdict]))
+        self._state, self._verdict = state, verdict
+
+
+def _of_alert(stamp_ns: int, seq: int, alert: Alert | AlertRecord) -> Line:
+    event = "" if alert.event is AlertEvent.NOTED else f" {alert.event}"
+    text = f"{alert.kind}{event} [{alert.cause}] {alert.text}"
+    return Line(stamp_ns, seq, _LEVELS[alert.severity], f"{text} ({alert.alert_id})" if alert.alert_id else text)
+
+
+def _of_command(stamp_ns: int, command: RecordedCommand) -> Line:
+    argument = f" {command.argument}" if command.argument else ""
+    text = f"command {command.name}{argument} {'done' if command.done else 'refused'}: {command.text}"
+    return Line(stamp_ns, command.seq, "INFO" if command.done else "WARN", text)
+
+
+def _configuration(colours: dict[State, Colour] | dict[Verdict, Colour]) -> rr.StateConfiguration:
+    return rr.StateConfiguration(values=[str(value) for value in colours], colors=list(colours.values()))
+
+
+class Writer:
+    """Writes the rows of its kind, a wrist camera's frames or a second camera's pulses, into one file."""
+
+    def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int, about: str):
+        """Writes what this file is, and what the monitor ran with: each file stands alone.  ``about`` is for people."""
+        self._send = Sender(stream)
+        self._events = EventWriter(self._send)
+        meta = Meta(
+            name=scene.name,
+            recording_id=scene.recording_id,
+            robot=scene.robot,
+            camera=scene.camera,
+            gripper="" if scene.gripper is None else scene.gripper.name,
+            version=scene.version,
+            file_number=file_number,
+            started_ns=time.time_ns(),
+            image_policy=_image_policy(scene.settings),
+            has_truth=scene.has_truth,
+            kind="frames" if scene.laser is None else "spots",
+        )
+        self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
+        if scene.configuration is not None:
+            self._send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
+        about = f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, {about}\n"
+        self._send.static("about", rr.TextDocument(about, media_type="text/markdown"))
+
+    def write(self, rows: Sequence[Any], events: Events) -> None:
+        """Send everything that was gathered since the last call."""
+        raise NotImplementedError
+
+    def write_pictures(self, rows: Sequence[Any]) -> None:
+        """Send the pictures of rows that were written before without them."""
+        raise NotImplementedError
+
+    def repeat(self) -> None:
+        """Write again, with the next row, what else is only written when it changes."""
+        self._events.repeat()
+
+    def finish(self) -> None:
+        """Nothing more comes into this file."""
+
+    def _write_records(self, rows: Sequence[AnyRow]) -> None:
+        self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
+
+
+def _image_policy(settings: RecordingSettings) -> str:
+    """Which images are kept, and how, in words."""
+    kind = "PNG" if settings.image_format == "png" else f"JPEG {settings.jpeg_quality} %"
+    rate = f"{settings.image_rate_hz:g} images/s" if settings.image_rate_hz > 0.0 else "no images but"
+    every = f", of every {settings.image_every}. frame" if settings.image_every > 0 else ""
+    around_s = settings.around_alert_s
+    around = f", all within {around_s:g} s of a warning or error" if around_s > 0.0 else ""
+    return f"{kind}, {rate}{every}, one at every alert and change{around}"
+
+
+AXIS = rrb.TimeAxis(link="LinkToGlobal")
+
+
+def plot(
+    origin: str,
+    contents: str | list[str],
+    name: str,
+    *,
+    legend: bool = True,
+    shown: tuple[float, float] | None = None,
+) -> rrb.TimeSeriesView:
+    """Curves over the time that all views share; ``shown`` is the range of the values, None: as they are."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        axis_x=AXIS,
+        axis_y=None if shown is None else rrb.ScalarAxis(range=shown),
+        plot_legend=None if legend else rrb.PlotLegend(visible=False),
+    )
+
+
+def image_view(scene: Scene, origin: str, image: str, legend: str) -> rrb.Spatial2DView:
+    """The image with its overlay."""
+    lens = scene.lens
+    bounds = rrb.VisualBounds2D(x_range=[-0.5, lens.width_px - 0.5], y_range=[-0.5, lens.height_px - 0.5])
+    name = f"{scene.robot} / {scene.camera} ({legend})"
+    return rrb.Spatial2DView(origin=origin, contents=f"{image}/**", name=name, visual_bounds=bounds)
+
+
+def log_view(origin: str = "events", contents: str | list[str] = "$origin/**", whose: str = "") -> rrb.TextLogView:
+    columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin=origin, contents=contents, name=f"Alerts and changes{whose}", columns=columns)
+
+
+def two_columns(left: list[rrb.View], left_shares: list[float], right: rrb.Container) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(*left, row_shares=left_shares), right, column_shares=[5, 4]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="capture_time"),
+    )

@@ -1,0 +1,229 @@
+"""What lies beside a recorded run: a replay with other limits in one recording with it, or its corrected track."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from gripmon.model.records import Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord
+from gripmon.record.columns import (
+    APPLICATION_ID,
+    AXIS,
+    EventWriter,
+    Palette,
+    Picture,
+    Row,
+    Sender,
+    faded,
+    log_view,
+    plot,
+    two_columns,
+)
+from gripmon.record.read import RecordedFrames
+from gripmon.record.recorder import Events, Notes, NullRecorder, Scene, Trace, pack_trace
+from gripmon.record.rows import CurveWriter, RowWriter
+from gripmon.record.scene import rig_view, wrist_image_view
+from gripmon.record.worker import measured_picture
+
+RECORDED, REPLAYED = "recorded", "replayed"
+_BATCH_ROWS = 32
+_FLUSH_TIMEOUT_S = 30.0
+_FREE_BYTES = 64_000_000
+"""rerun's files don't say that the disk is full, and writing on may wait for ever: this must be free."""
+_LOOKS = ((REPLAYED, "", 255, 1.5), (RECORDED, f"{RECORDED}/", 110, 5.0))  # whose, where, opacity, width of its lines
+
+_TRACK = "rig/corrected"
+_TRACK_ROWS_A_CHUNK = 65536
+
+
+class _Beside(Sender):
+    """Sends what was recorded, below its name."""
+
+    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
+        super().static(f"{RECORDED}/{path}", *archetypes)
+
+    def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
+        super().columns(f"{RECORDED}/{path}", stamps_ns, seqs, columns)
+
+
+class ComparedRecorder(NullRecorder):
+    """A recorder for a replay: takes each frame with what ``source``, which gave it last, has recorded of it.
+
+    The replay is the recording, with all its entities; what was recorded lies beside it below ``recorded``, with the
+    same names.  It writes in the caller's thread: a replay can wait.  The daemon's own alerts and state messages aren't
+    in it.
+    """
+
+    def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
+        """``recorded_limits`` are drawn beside the replay's; None where they are unknown.  OSError as for a file."""
+        path.open("wb").close()
+        self._path, self._source, self._recorded_limits = path, source, recorded_limits
+        self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
+        if self._has_space():
+            stream.set_sinks(rr.FileSink(path))
+        stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
+        stream.send_blueprint(_layout(scene), make_active=True, make_default=True)
+        self._writer = RowWriter(stream, scene, 1)
+        beside = _Beside(stream)
+        self._curves, self._status = CurveWriter(beside, self._writer.corner_ids), EventWriter(beside, RECORDED)
+        _name_both(Sender(stream))
+        self._rows: list[Row] = []
+        self._rows_then: list[Row] = []
+        self._events = Events.at_first(scene.reference)
+        self._commands_then = list(source.commands)
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """One frame, as it is judged now; what it was judged then comes from the source."""
+        then, shot = self._source.record, self._source.shot
+        assert then is not None, "every replayed frame has a record"
+        picture: Picture | None = None
+        if shot is not None and frame.image is not None:
+            picture = measured_picture(shot.blob, shot.media_type, frame.image)
+        newest, noted = trace(), None if notes is None else notes()
+        opening_m = frame.jaw_opening_m
+        share, limits = (None, None) if noted is None else (noted.statistic_share, noted.limits)
+        packed = None if newest is None else pack_trace(newest)
+        self._rows.append(Row(record, picture, packed, None, opening_m, share, limits))
+        self._rows_then.append(Row(then, None, None, None, opening_m, None, self._recorded_limits))
+        if len(self._rows) >= _BATCH_ROWS:
+            self._write()
+
+    def reference(self, reference: ReferenceRecord) -> None:
+        """A new reference of the replay."""
+        self._events += Events(references=[reference])
+
+    def command(self, command: RecordedCommand) -> None:
+        """A command, and what became of it now."""
+        self._events += Events(commands=[command])
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Finish the file."""
+        self._write()
+        if self.failure is not None:
+            return
+        self._writer.finish()
+        self._curves.finish()
+        try:
+            self._stream.flush(timeout_sec=max(timeout_s, _FLUSH_TIMEOUT_S))
+        except Exception as error:  # noqa: BLE001 - rerun raises its own kinds
+            self.failure = f"can't write {self._path}: {' '.join(str(error).split())}"
+        self._stream.disconnect()
+
+    def _has_space(self) -> bool:
+        if self.failure is None and shutil.disk_usage(self._path.parent).free < _FREE_BYTES:
+            self.failure = f"can't write {self._path}: less than {1e-6 * _FREE_BYTES:.0f} MB are free"
+        return self.failure is None
+
+    def _write(self) -> None:
+        rows, then, events = self._rows, self._rows_then, self._events
+        self._rows, self._rows_then, self._events = [], [], Events()
+        if not rows or not self._has_space():
+            return
+        self._writer.write(rows, events)
+        self._curves.write(then)
+        newest = rows[-1].record.seq
+        commands = [command for command in self._commands_then if command.seq <= newest]
+        self._commands_then = [command for command in self._commands_then if command.seq > newest]
+        self._status.write(then, Events(commands=commands))
+
+
+def _name_both(send: Sender) -> None:
+    """The same colours, what was recorded wide and pale below what is replayed."""
+    for whose, where, alpha, width in _LOOKS:
+        for path, names, colours in (
+            ("drift/tcp_shift_mm", ("x", "y", "z", "length"), (*Palette.AXES, Palette.WHOLE)),
+            ("drift/limits_mm", ("warning", "limit"), (Palette.DOUBTFUL, Palette.BAD)),
+            ("protection/level_mm", ("protection level",), (Palette.WHOLE,)),
+            ("protection/limit_mm", ("alert limit",), (Palette.BAD,)),
+        ):
+            pale = [faded(colour, alpha) for colour in colours]
+            send.lines(f"{where}{path}", [f"{whose} {name}" for name in names], pale, width)
+
+
+def _layout(scene: Scene) -> rrb.Blueprint:
+    """Left the image with the replay's overlay, and what happened in both; right both drifts and both limits in one
+    plot, the states of both.
+    """
+
+    def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
+        return plot("/", [f"{where}{path}" for where in (f"{RECORDED}/", "") for path in paths], name, legend=False)
+
+    drift = both(
+        ("drift/limits_mm", "drift/tcp_shift_mm"),
+        f"TCP drift (mm): x red, y green, z blue, length white; wide, pale: {RECORDED}, thin: {REPLAYED}",
+    )
+    turn = both(("drift/delta_deg", "drift/limits_deg"), "δ (°) and its limits, of both")
+    bounds = both(("protection/level_mm", "protection/limit_mm"), "Protection level (mm) and alert limit, of both")
+    states = [
+        rrb.StateTimelineView(origin=origin, name=f"State and verdict, {whose}", time_view=AXIS)
+        for origin, whose in ((f"{RECORDED}/status", RECORDED), ("status", REPLAYED))
+    ]
+    details = rrb.Tabs(rig_view(scene), turn, bounds, active_tab=0)
+    log = log_view("/", ["events", f"{RECORDED}/events"], f", {REPLAYED} and {RECORDED}")
+    judged = rrb.Vertical(drift, *states, details, row_shares=[4.5, 2, 2, 3])
+    return two_columns([wrist_image_view(scene), log], [6, 3], judged)
+
+
+def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:
+    """Write a run's frame table and its correction into a file; ``about`` is kept as JSON.
+
+    It carries the recording id of the original: a viewer that is given both shows them as one, on the same timelines.
+    Shifts of the TCP are against the first corrected frame, mm, camera axes; raw and smoothed are the live ones.
+    Raises OSError where the file can't be written.
+    """
+    stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
+    memory = stream.memory_recording()  # rerun's files don't say that the disk is full
+    send = Sender(stream)
+    for name, alpha, width, what in (
+        ("tcp_shift_mm", 255, 3.0, "corrected"), ("raw_shift_mm", 90, 0.7, "raw"),
+        ("smoothed_shift_mm", 150, 1.2, "smoothed"),
+    ):  # fmt: skip
+        colours = [faded(colour, alpha) for colour in Palette.AXES]
+        send.lines(f"corrected/{name}", [f"{what} {axis}" for axis in "xyz"], colours, width)
+    send.static(_TRACK, rr.TransformAxes3D(0.02))
+    send.static("corrected/provenance", rr.AnyValues(json=msgspec.json.encode(about).decode()))
+    for begin in range(0, len(correction.stamp_ns), _TRACK_ROWS_A_CHUNK):
+        _track_columns(send, frames, correction, slice(begin, begin + _TRACK_ROWS_A_CHUNK))
+    _track_events(send, frames, correction)
+    path.write_bytes(memory.drain_as_bytes())
+    stream.disconnect()
+
+
+def _track_columns(send: Sender, frames: Any, correction: Any, rows: slice) -> None:
+    from scipy.spatial.transform import Rotation
+
+    stamps_ns, seqs = frames.stamp_ns[rows].tolist(), frames.seq[rows].tolist()
+    poses = correction.cam_T_grip[rows]
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternions)
+    send.columns(_TRACK, stamps_ns, seqs, columns)
+    start_m = correction.cam_T_grip[0, :3, 3]
+    for name, values_m in (
+        ("tcp_shift_mm", poses[:, :3, 3] - start_m),
+        ("raw_shift_mm", frames.cam_T_grip[rows, :3] - start_m),
+        ("smoothed_shift_mm", frames.smoothed[rows, :3] - start_m),
+        ("tcp_sigma_mm", np.sqrt(np.einsum("nii->ni", correction.covariance[rows])[:, :3])),
+    ):
+        known = np.isfinite(values_m).all(axis=1)
+        columns = rr.Scalars.columns(scalars=1e3 * values_m[known].ravel()).partition(np.where(known, 3, 0))
+        send.columns(f"corrected/{name}", stamps_ns, seqs, columns)
+
+
+def _track_events(send: Sender, frames: Any, correction: Any) -> None:
+    points = correction.change_points
+    if not points:
+        return
+    rows = np.array([point.index for point in points])
+    texts = []
+    for point in points:
+        size_mm, turn_deg = 1e3 * np.linalg.norm(point.size[:3]), np.degrees(np.linalg.norm(point.size[3:]))
+        within_ms = 1e-6 * (point.latest_ns - point.earliest_ns)
+        texts.append(f"the pose changed by {size_mm:.3f} mm, {turn_deg:.3f}° (known to {within_ms:.0f} ms)")
+    columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+    send.columns("corrected/events", frames.stamp_ns[rows].tolist(), frames.seq[rows].tolist(), columns)

@@ -1,0 +1,330 @@
+"""What is kept: images around alerts, files that nothing deletes, the disk's budget, and files that were cut off."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import shutil
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity
+from gripmon.record.container import is_complete, whole_bytes
+
+if TYPE_CHECKING:
+    from gripmon.record.columns import AnyRow
+
+PIN_SUFFIX = ".pinned"
+_RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
+_MOMENTS_KEPT = 64
+_ALERTS_KEPT = 256
+_BUDGET_FREE_FRACTION = 0.1  # free when a file begins, or files would become ever smaller
+
+
+class Moments:
+    """Capture times that matter, and what lies around them; only the newest ones count."""
+
+    def __init__(self, around_ns: int) -> None:
+        self.around_ns = around_ns
+        self._stamps_ns: deque[int] = deque(maxlen=_MOMENTS_KEPT)
+
+    def add(self, stamp_ns: int) -> None:
+        self._stamps_ns.append(stamp_ns)
+
+    def near(self, first_ns: int, last_ns: int | None = None) -> bool:
+        """Whether any of the span, ends included, lies within ``around_ns`` of a moment."""
+        last_ns = first_ns if last_ns is None else last_ns
+        return any(first_ns - self.around_ns <= t <= last_ns + self.around_ns for t in self._stamps_ns)
+
+
+class Trigger:
+    """Which alerts are worth the images around them, and files that nothing deletes: warnings and errors, when they
+    are raised or become worse.
+
+    Not those about the recording itself: they are not about the camera, and a full budget must not pin more.
+    """
+
+    def __init__(self) -> None:
+        self._rank: dict[str, int] = {}
+
+    def by(self, alert: Alert | AlertRecord) -> bool:
+        rank = _RANK[alert.severity]
+        if alert.event is AlertEvent.CLEARED:
+            self._rank.pop(alert.alert_id, None)
+            return False
+        if rank == 0 or alert.kind is AlertKind.RECORDING:
+            return False
+        if alert.event is AlertEvent.NOTED:
+            return True
+        before = self._rank.get(alert.alert_id, 0)
+        if len(self._rank) >= _ALERTS_KEPT and alert.alert_id not in self._rank:
+            del self._rank[next(iter(self._rank))]
+        self._rank[alert.alert_id] = max(rank, before)
+        return rank > before
+
+
+class PictureRing:
+    """Rows with pictures of the last ``span_ns`` of capture time, at most ``limit_bytes``; the oldest give way."""
+
+    def __init__(self, span_ns: int, limit_bytes: int) -> None:
+        self._span_ns, self._limit_bytes = span_ns, limit_bytes
+        self._rows: deque[AnyRow] = deque()
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def push(self, row: AnyRow) -> None:
+        rows, stamp_ns = self._rows, row.record.stamp_ns
+        if rows and stamp_ns < rows[-1].record.stamp_ns:
+            rows.clear()  # a clock that was set back: the age of the others is unknown
+            self.bytes = 0
+        rows.append(row)
+        self.bytes += _size(row)
+        while rows and (self.bytes > self._limit_bytes or stamp_ns - rows[0].record.stamp_ns > self._span_ns):
+            self.bytes -= _size(rows.popleft())
+
+    def take(self, moments: Moments) -> list[AnyRow]:
+        """Remove and return what lies around the moments, in order."""
+        taken: list[AnyRow] = []
+        rest: deque[AnyRow] = deque()
+        for row in self._rows:
+            (taken if moments.near(row.record.stamp_ns) else rest).append(row)
+        self._rows = rest
+        self.bytes -= sum(map(_size, taken))
+        return taken
+
+
+def _size(row: AnyRow) -> int:
+    return 0 if row.picture is None else len(row.picture.blob)
+
+
+class PinnedBy(msgspec.Struct, frozen=True):
+    """The alert: ``stamp_ns`` its frame's capture time, or Unix time for one that belongs to no frame."""
+
+    alert_id: str
+    kind: AlertKind
+    cause: Cause
+    severity: Severity
+    stamp_ns: int
+    seq: int
+    text: str
+
+
+class Pinned(msgspec.Struct, frozen=True, tag="gripmon.pinned/1"):
+    """A ``.pinned`` file, as JSON: the alerts that keep ``name-0001.rrd`` in ``name-0001.rrd.pinned``, which a person
+    deletes to unpin the recording.
+    """
+
+    alerts: tuple[PinnedBy, ...]
+
+
+def pin_path(recording: Path) -> Path:
+    return recording.with_name(recording.name + PIN_SUFFIX)
+
+
+def is_pinned(recording: Path) -> bool:
+    return pin_path(recording).exists()
+
+
+def pinned_by(alert: Alert | AlertRecord, stamp_ns: int, seq: int) -> PinnedBy:
+    return PinnedBy(alert.alert_id, alert.kind, alert.cause, alert.severity, stamp_ns, seq, alert.text)
+
+
+class PinBoard:
+    """Pins of one process; those that could not be written yet count as well, and are tried again."""
+
+    def __init__(self) -> None:
+        self._pinned: dict[Path, tuple[PinnedBy, ...]] = {}
+        self._unwritten: set[Path] = set()
+
+    def pin(self, recording: Path, alerts: Sequence[PinnedBy]) -> None:
+        before = self._pinned.get(recording, ())
+        new = tuple(alert for alert in alerts if alert not in before)
+        if new:
+            self._pinned[recording] = before + new
+            self._unwritten.add(recording)
+
+    def holds(self, recording: Path) -> bool:
+        return recording in self._unwritten or is_pinned(recording)
+
+    def write(self) -> None:
+        """Write what is due.  OSError if that can't be; what is left is due still."""
+        for recording in sorted(self._unwritten):
+            if recording.exists():
+                pinned = Pinned(self._pinned[recording])
+                write_atomically(pin_path(recording), msgspec.json.format(msgspec.json.encode(pinned), indent=2))
+            self._unwritten.discard(recording)
+
+    def forget(self, recording: Path) -> None:
+        """No more alerts come to this one."""
+        if recording not in self._unwritten:
+            self._pinned.pop(recording, None)
+
+
+class _Entry(NamedTuple):
+    modified_ns: int
+    name: str
+    size: int
+    path: Path
+
+
+class DiskBudget:
+    """Keeps the recordings of one robot and camera in one directory within ``budget_bytes`` (0: no limit): the oldest
+    go first, pinned ones never.
+
+    Its files are those with the default name of robot and camera, whenever they were made, and those of the series
+    ``name``.  Files that another process is writing are left alone.
+    """
+
+    def __init__(self, directory: Path, robot: str, camera: str, name: str, budget_bytes: int) -> None:
+        self._directory = directory
+        self._budget_bytes = budget_bytes
+        usual = rf"{re.escape(f'{robot}-{camera}')}-\d{{8}}T\d{{6}}Z"
+        self._series = f"{name}-"
+        self._belongs = re.compile(rf"(?:{usual}|{re.escape(name)})-\d{{4,}}\.rrd").fullmatch
+        self._others_bytes = 0
+
+    def exceeded_by(self, current_bytes: int) -> bool:
+        """Whether a file that has grown to this size breaks the budget; asks the disk for nothing."""
+        return 0 < self._budget_bytes < self._others_bytes + current_bytes
+
+    def make_room(self, pinned: Callable[[Path], bool], current: Path | None = None) -> str:
+        """Delete what has to go, never ``current``; returns why there still is no room, empty if there is.
+
+        Without ``current``, before a file begins, a tenth of the budget is made free.  OSError if the directory can't
+        be read.
+        """
+        if self._budget_bytes == 0:
+            return ""
+        limit = self._budget_bytes * (1.0 if current is not None else 1.0 - _BUDGET_FREE_FRACTION)
+        entries = self.recordings()
+        total = sum(entry.size for entry in entries)
+        trouble = ""
+        for entry in entries:
+            if total <= limit:
+                break
+            if entry.path == current or pinned(entry.path) or is_being_written(entry.path):
+                continue
+            try:
+                entry.path.unlink(missing_ok=True)
+                total -= entry.size
+            except OSError as error:
+                trouble = f"; {entry.path} can't be deleted: {error.strerror}"
+        self._others_bytes = total - sum(entry.size for entry in entries if entry.path == current)
+        if total <= limit:
+            return ""
+        return (
+            f"pinned recordings in {self._directory} leave no room: {total / 1e6:.0f} MB, nine tenths of budget_bytes "
+            f"{self._budget_bytes / 1e6:.0f} MB or more; move them away or delete their .pinned files{trouble}"
+        )
+
+    def recordings(self) -> list[_Entry]:
+        """The oldest first."""
+        entries = []
+        for found in os.scandir(self._directory):
+            if self._belongs(found.name):
+                with contextlib.suppress(FileNotFoundError):
+                    about = found.stat()
+                    entries.append(_Entry(about.st_mtime_ns, found.name, about.st_size, Path(found.path)))
+        return sorted(entries)
+
+    def orphaned_pins(self) -> list[Path]:
+        """Pins of earlier runs whose recordings were deleted or moved.
+
+        Those of the series ``name`` stay: they keep its numbers from being used again.
+        """
+        orphaned = []
+        for pin in self._directory.glob(f"*{PIN_SUFFIX}"):
+            recording = pin.with_name(pin.name.removesuffix(PIN_SUFFIX))
+            ours = self._belongs(recording.name) and not recording.name.startswith(self._series)
+            if ours and not recording.exists():
+                orphaned.append(pin)
+        return orphaned
+
+
+def space_missing(directory: Path, wanted_bytes: int, factor: float = 1.0) -> str:
+    """Why the disk has no room for more, empty if it has."""
+    try:
+        free = shutil.disk_usage(directory).free
+    except OSError as error:
+        return f"{directory}: {error.strerror}"
+    if free >= wanted_bytes * factor:
+        return ""
+    return f"{directory} has {free / 1e6:.0f} MB free, min_free_bytes keeps {wanted_bytes / 1e6:.0f} MB"
+
+
+def claim(path: Path) -> int | None:
+    """Lock a file against other recorders, until the descriptor is closed or the process ends; None if that fails."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a recorder that lives has claimed it."""
+    descriptor = claim(path)
+    if descriptor is None:
+        return path.exists()
+    os.close(descriptor)
+    return False
+
+
+def repair(path: Path) -> int:
+    """Cut off a message that isn't whole, because its writer was killed: readers would refuse all the file for it.
+
+    Not of a file that is being written.  Returns the bytes cut off.  OSError.
+    """
+    lock = claim(path)
+    if lock is None:
+        return 0
+    try:
+        about, whole = path.stat(), whole_bytes(path)
+        if whole < about.st_size:
+            os.truncate(path, whole)
+            os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))  # its age decides when it is deleted
+        return about.st_size - whole
+    finally:
+        os.close(lock)
+
+
+def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whole: bool = True) -> None:
+    """Give a finished recording its name ``path``; what stood there before stays until then.
+
+    One that isn't ``whole``, lacks its footer, or went into several files because writing failed in between, is
+    removed: :class:`~gripmon.model.errors.NoResultError`.  ``failure`` is what the recorder reports.
+    """
+    reason = failure
+    try:
+        if whole and len(written) == 1 and is_complete(written[0]):
+            written[0].replace(path)
+            return
+    except OSError as error:
+        reason = error.strerror
+    # rerun only says that its thread has ended: the room there is explains the rest.
+    with contextlib.suppress(OSError):
+        reason = f"{_cause(reason)}; its disk has {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free"
+    for part in written:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    raise NoResultError(f"--recording {path}: writing failed ({_cause(reason)})")
+
+
+def _cause(failure: str | None) -> str:
+    """The last part: before it stands a path that the user has not named."""
+    return " ".join((failure or "it was not finished").rpartition(": ")[2].split())

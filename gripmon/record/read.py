@@ -1,0 +1,304 @@
+"""Reading recordings: what monitors wrote down, as columns, records and pictures, whatever state the files are in.
+
+``open_recordings(paths, progress)`` takes files and folders, of several runs and robots, in any order, and gives a
+:class:`Collection`: the recordings, each one run of one monitor, and the faults, one line each, of what could not be
+used.  No file is ever changed, and images stay in the files until they are asked for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
+from gripmon.record.container import MAGIC, RrdFile, UnreadableFileError
+from gripmon.record.contents import Contents, LineFile, read_contents, read_lines
+from gripmon.record.recordings import Picture, Recording, Shot, decode_image
+from gripmon.record.table import FrameTable
+
+__all__ = [
+    "Collection",
+    "FrameTable",
+    "Picture",
+    "RecordedFrames",
+    "Recording",
+    "SeveralRunsError",
+    "Shot",
+    "UnusableError",
+    "decode_image",
+    "is_rrd",
+    "needed_recordings",
+    "open_recordings",
+    "recording_files",
+    "recordings_below",
+]
+
+Progress = Callable[[int, int], None]
+_SUFFIX, _LINES_SUFFIX = ".rrd", ".jsonl"
+
+_NEVER_AS_IMAGE = frozenset({Refusal.NOT_AN_IMAGE, Refusal.WRONG_TYPE, Refusal.NOT_FINITE})
+"""What looks like another image, or like none, once it has been encoded with 8 bits."""
+_MAY_BE_TOO_LARGE = frozenset({*_NEVER_AS_IMAGE, Refusal.WRONG_SIZE})
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What was found, in order of time; ``faults`` are one line each, about files that could not be used at all."""
+
+    recordings: tuple[Recording, ...]
+    faults: tuple[str, ...]
+
+
+def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
+    """Everything but the images of the given files, and of all ``.rrd`` files in the given folders and below.
+
+    Files of several runs and robots may be mixed, in any order; those with one recording id become one recording.  An
+    ``estimates.jsonl`` that is named itself is a recording without images.  Whatever the files are, this raises
+    nothing: what could not be used is in ``faults``.  ``progress`` is called with bytes behind and bytes in all.
+    """
+    faults: list[str] = []
+    files = _distinct(_files(paths, faults), faults)
+    runs: dict[str, list[Contents]] = {}
+    behind, total = 0, sum(files.values())
+    for path, size in files.items():
+
+        def step(done: int, behind: int = behind) -> None:
+            if progress is not None:
+                progress(behind + done, total)
+
+        for contents in _read(path, faults, step):
+            runs.setdefault(contents.recording_id, []).append(contents)
+        behind += size
+        step(0, behind)
+    recordings = [Recording(run) for run in runs.values()]
+    recordings.sort(key=lambda r: (int(r.frames.stamp_ns[0]) if len(r.frames) else 0, r.robot, r.camera))
+    return Collection(tuple(recordings), tuple(faults))
+
+
+def needed_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
+    """As :func:`open_recordings`, for those who can do nothing without one.
+
+    Raises :class:`~gripmon.model.errors.InputError` for a file that is not there, or where none of them is a recording;
+    :class:`~gripmon.model.errors.NoResultError` where recordings can't be read: that isn't the user's mistake.
+    """
+    for path in paths:
+        if not path.exists():
+            right = "a recording (.rrd), a folder of them, or estimates.jsonl"
+            raise InputError(f"{path}: there is no such file; {right}")
+    found = open_recordings(paths, progress)
+    if not found.recordings:
+        named = any(path.suffix.lower() in (_SUFFIX, _LINES_SUFFIX) for path in paths)
+        raise (NoResultError if named else InputError)("; ".join(found.faults) or "no recording (.rrd) there")
+    return found
+
+
+def recording_files(paths: Sequence[Path]) -> list[Path]:
+    """The files that are meant, each once; a folder stands for the recordings in it and below.
+
+    Raises :class:`~gripmon.model.errors.InputError` for what isn't there, and for a folder without any.
+    """
+    files: list[Path] = []
+    for path in paths:
+        found = recordings_below(path) if path.is_dir() else [path] * path.is_file()
+        if not found:
+            wrong = f"no {_SUFFIX} file in it" if path.is_dir() else "there is no such file"
+            raise InputError(f"{path}: {wrong}; recordings of gripmon run, or their folder")
+        files += found
+    return list({file.resolve(): file for file in files}.values())
+
+
+def is_rrd(path: Path) -> bool:
+    """Whether a file begins as rerun's do.  OSError where it can't be read."""
+    with path.open("rb") as file:
+        return os.read(file.fileno(), len(MAGIC)) == MAGIC
+
+
+def recordings_below(folder: Path) -> list[Path]:
+    """All ``.rrd`` files in a folder and its folders, by name; but none in hidden ones, where files are being made.
+
+    OSError where the folder itself can't be read.
+    """
+    os.scandir(folder).close()
+    found = []
+    for where, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [Path(where, n) for n in names if not n.startswith(".") and Path(n).suffix.lower() == _SUFFIX]
+    return sorted(found)
+
+
+def _files(paths: Sequence[Path], faults: list[str]) -> Iterable[Path]:
+    for path in paths:
+        try:
+            found = recordings_below(path) if path.is_dir() else [path]
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror}; not used")
+            continue
+        if not found:
+            faults.append(f"{path}: holds no {_SUFFIX} file; name the folder that recordings were written to")
+        yield from found
+
+
+def _distinct(paths: Iterable[Path], faults: list[str]) -> dict[Path, int]:
+    """Each file once, whatever names it was given by, with its bytes."""
+    known: dict[tuple[int, int], Path] = {}
+    sizes = {}
+    for path in paths:
+        try:
+            status = path.stat()
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror}; not used")
+            continue
+        key = status.st_dev, status.st_ino
+        if key in known:
+            faults.append(f"{path}: is the same file as {known[key]}; read once")
+        elif known.setdefault(key, path) is path:
+            sizes[path] = status.st_size
+    return sizes
+
+
+def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Contents]:
+    """What a file holds of each recording; what it doesn't goes to ``faults``."""
+    try:
+        if path.suffix.lower() == _LINES_SUFFIX and not is_rrd(path):
+            return [read_lines(LineFile(path), step)]
+        file = RrdFile(path)
+        found = [read_contents(file, store, step) for store in file.stores]
+    except UnreadableFileError as error:
+        faults.append(f"{path}: {error}; not used")
+        return []
+    except OSError as error:
+        faults.append(f"{path}: {error.strerror or error}; not used")
+        return []
+    except Exception as error:  # noqa: BLE001 - a file from anywhere must not end the reading of the others
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        faults.append(f"{path}: can't be read ({what:.200}); not used")
+        return []
+    ours = [contents for contents in found if contents.is_ours and not contents.is_of_spots]
+    if not ours and any(contents.is_of_spots for contents in found):
+        faults.append(f"{path}: holds a second camera's laser spots, no frames; gripmon view shows them; not used")
+    elif not ours:
+        applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
+        what = f"is a recording of the application {applications} that holds no frames of a monitor's"
+        faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))
+    return ours
+
+
+class UnusableError(Exception):
+    """These files hold nothing to replay; ``str()`` is one line."""
+
+
+class SeveralRunsError(Exception):
+    """Frames of several runs have no order; ``str()`` is one line."""
+
+
+class RecordedFrames:
+    """A source of every frame of one run whose image is in these ``.rrd`` files of ours, in the order of ``seq``, for
+    replay through the same core: each with its stamp, its name and the jaw opening that was reported.
+
+    To the bit it only is what happened where every frame's image was kept without loss (``image_every: 1``,
+    ``image_format: png``); float images are recorded with 8 bits.  A recording holds fewer images by default, and as
+    JPEG: replaying it comes close.  A frame that was refused because it was no image, or none of this camera's, has no
+    image in the recording either.  It is given again as what its record says of it: without image, with the same
+    refusal in the same words.
+
+    Images are read when their turn comes.  ``faults`` says what of the files could not be used, one line each;
+    ``passed_over`` counts frames that could not be read when their turn came, ``images_damaged`` those whose pixels
+    can't be decoded.  Raises :class:`UnusableError` where there is no image at all, and :class:`SeveralRunsError`.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, paths: Path | Sequence[Path]) -> None:
+        self._run, self.faults = _one_run([paths] if isinstance(paths, Path) else list(paths))
+        run = self._run
+        self.paths: tuple[Path, ...] = run.files
+        self.configuration: RecordedConfiguration | None = run.configuration
+        self.reference: ReferenceRecord | None = run.references[0] if run.references else None
+        """The one in force when the first of these files began."""
+        self.commands: tuple[RecordedCommand, ...] = tuple(sorted(run.commands, key=attrgetter("seq", "stamp_ns")))
+        if not len(run.image_seqs):
+            no_images = f"{self.paths[0]}: holds no images; a recording made with image_rate_hz above 0"
+            raise UnusableError("; ".join([*[no_images] * bool(len(run.frames)), *self.faults]) or no_images)
+        with_image = np.isin(run.frames.seq, run.image_seqs)
+        refused = run.frames.seq[run.frames.refused & ~with_image]
+        stand_ins = [record.seq for record in run.records(refused) if _stands_in(record)] if len(refused) else []
+        # An image without a record, at the end of a recording that was cut off, was never judged.
+        self._seqs = run.frames.seq[with_image | np.isin(run.frames.seq, stand_ins)]
+        self.frames_without_image = len(run.frames) - len(self._seqs)
+        self.stand_ins = len(stand_ins)
+        self.passed_over = self.images_damaged = 0
+        self._given = self._frames()
+        self.shot: Shot | None = None
+        """The image of the frame that was read last, as it was recorded."""
+        self.record: FrameRecord | None = None
+        """What was decided about that frame when it was recorded."""
+
+    def __len__(self) -> int:
+        return len(self._seqs)
+
+    def read(self) -> Frame | None:
+        """The next frame, None after the last."""
+        return next(self._given, None)
+
+    def close(self) -> None:
+        """Nothing more is read."""
+        self._given.close()
+
+    def _frames(self) -> Generator[Frame]:
+        given = 0
+        for record in self._run.records(self._seqs):
+            shot = self._run.shot(record.seq)
+            if shot is None and not _stands_in(record):
+                continue
+            self.shot, self.record = shot, record
+            given += 1
+            yield self._frame(record, shot)
+        self.passed_over = len(self._seqs) - given
+
+    def _frame(self, record: FrameRecord, shot: Shot | None) -> Frame:
+        image, fault, refused = None, None, Refusal.NOT_AN_IMAGE
+        refusal = _refusal_of(record)
+        if refusal is not None and (shot is None or refusal[0] in _NEVER_AS_IMAGE):
+            refused, fault = refusal
+        else:
+            assert shot is not None, "only refused frames stand in"
+            image = decode_image(shot.blob)
+            fault = None if image is not None else "the recorded image is damaged"
+            self.images_damaged += image is None
+        jaw_m = self._run.jaw_reported_m(record.seq) if shot is None else shot.jaw_reported_m
+        return Frame(record.seq, record.stamp_ns, image, jaw_m, record.name, fault, refused)
+
+
+def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
+    """The run that all files are of, and what is wrong with them."""
+    found = open_recordings(paths)
+    if not found.recordings:
+        raise UnusableError("; ".join(found.faults) or "there is no recording; an .rrd file of gripmon's")
+    if len(found.recordings) > 1:
+        first = ", ".join(str(run.files[0]) for run in found.recordings[:4])
+        more = ", …" if len(found.recordings) > 4 else ""
+        raise SeveralRunsError(f"these are files of {len(found.recordings)} runs ({first}{more}); the files of one")
+    (run,) = found.recordings
+    return run, (*found.faults, *run.faults)
+
+
+def _stands_in(record: FrameRecord) -> bool:
+    """Whether a frame without image can be given again from its record alone."""
+    refusal = _refusal_of(record)
+    return refusal is not None and refusal[0] in _MAY_BE_TOO_LARGE
+
+
+def _refusal_of(record: FrameRecord) -> tuple[Refusal, str] | None:
+    """The refusal with its words; None for a frame that was measured, or at which measuring failed."""
+    kind, colon, words = (record.reason or "").partition(": ")
+    if not colon or kind not in set(Refusal):
+        return None
+    return Refusal(kind), words

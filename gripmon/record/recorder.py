@@ -1,0 +1,344 @@
+"""What a recording is made of, on both sides of the pipe: settings, the recorder's interface, and the messages.
+
+The loop's thread only appends to a bounded queue.  A thread of the daemon hands the queue over to a process of its own,
+which encodes the images, logs to rerun and looks after the files: neither JPEG, rerun nor a slow disk ever hold the
+interpreter that the loop runs in.  The daemon itself never imports rerun.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from typing import Annotated, Literal, Protocol
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon import __version__
+from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.model.camera import Camera, LensSettings
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import (
+    AlertRecord,
+    Frame,
+    FrameRecord,
+    Image,
+    Limits,
+    MeasurementTrace,
+    MonitorNotes,
+    RecordedCommand,
+    RecordedConfiguration,
+    ReferenceRecord,
+    SpotRecord,
+    StateRecord,
+)
+
+LOOPBACK = "127.0.0.1"
+
+Trace = Callable[[], MeasurementTrace | None]
+Notes = Callable[[], MonitorNotes]
+
+
+class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is recorded, how much of it, and what the disk must keep free."""
+
+    enabled: Annotated[bool, Meta(description="false: nothing is recorded")] = True
+    directory: Annotated[str, Meta(min_length=1, description="where the .rrd files go; made if it is missing")] = (
+        "recordings"
+    )
+    image_rate_hz: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1000.0,
+            description="images and overlays a second of capture time, besides those at alerts and state changes (Hz)",
+        ),
+    ] = 10.0
+    image_every: Annotated[
+        int, Meta(ge=0, description="besides, the image of every n-th frame; 1: of every frame; 0: none (frames)")
+    ] = 0
+    around_alert_s: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=600.0,
+            description="so long before and after an alert every image is kept; 0: none but the usual ones (s)",
+        ),
+    ] = 5.0
+    ring_bytes: Annotated[
+        int, Meta(ge=0, description="memory for the images before an alert; the oldest give way (bytes)")
+    ] = 100_000_000
+    image_format: Annotated[Literal["jpeg", "png"], Meta(description="png is lossless and about five times larger")] = (
+        "jpeg"
+    )
+    jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="JPEG quality (%)")] = 85
+    queue_frames: Annotated[
+        int, Meta(ge=1, le=100_000, description="frames that wait for a slow recording before frames are dropped")
+    ] = 512
+    queue_images: Annotated[
+        int, Meta(ge=1, le=256, description="images that wait for a slow recording before images are dropped")
+    ] = 8
+    flush_period_s: Annotated[
+        float, Meta(ge=0.05, le=10.0, description="how often the file is written: the most that a crash can lose (s)")
+    ] = 0.5
+    min_free_bytes: Annotated[
+        int, Meta(ge=0, description="space that the disk keeps; recording pauses below it (bytes)")
+    ] = 200_000_000
+    max_file_bytes: Annotated[
+        int, Meta(ge=100_000, description="a file this long is closed and the next begun (bytes)")
+    ] = 500_000_000
+    max_file_s: Annotated[
+        float, Meta(ge=1.0, description="a file this old is closed and the next begun once it holds frames (s)")
+    ] = 300.0
+    budget_bytes: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="all recordings of this robot and camera in the directory, earlier runs' too: beyond this the "
+            "oldest without a .pinned file are deleted; at least 4 * max_file_bytes; 0: no limit (bytes)",
+        ),
+    ] = 50_000_000_000
+
+    def __post_init__(self) -> None:
+        if 0 < self.budget_bytes < 4 * self.max_file_bytes:
+            raise ValueError(
+                f"budget_bytes {self.budget_bytes} is less than four files of max_file_bytes {self.max_file_bytes}; "
+                "a larger budget_bytes, a smaller max_file_bytes, or budget_bytes 0 for no limit"
+            )
+
+
+class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How ``gripmon run --view`` serves viewers: on this machine only."""
+
+    port: Annotated[int, Meta(ge=1, le=65535, description="TCP port on 127.0.0.1 for rerun viewers (no unit)")] = 9876
+    web_port: Annotated[
+        int, Meta(ge=1, le=65535, description="TCP port on 127.0.0.1 of the page with the web viewer (no unit)")
+    ] = 9090
+    memory_limit_bytes: Annotated[
+        int,
+        Meta(
+            ge=10_000_000,
+            le=64_000_000_000,
+            description="what is kept for viewers that join late or fall behind; the oldest goes (bytes)",
+        ),
+    ] = 300_000_000
+
+    @property
+    def stream_url(self) -> str:
+        """What a viewer connects to."""
+        return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
+
+
+class EventRecorder(Protocol):
+    """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.
+
+    ``dropped`` are frames that are not in the recording, ``images_dropped`` images that others lack; ``failure`` says
+    why nothing is being written, None when all is well.  ``has_room``: nothing would be dropped now, or waiting would
+    not help; a source that can wait does until then.
+    """
+
+    @property
+    def dropped(self) -> int: ...
+    @property
+    def images_dropped(self) -> int: ...
+    @property
+    def has_room(self) -> bool: ...
+    @property
+    def failure(self) -> str | None: ...
+
+    def alert(self, alert: AlertRecord) -> None: ...
+    def command(self, command: RecordedCommand) -> None: ...
+    def state(self, state: StateRecord) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> None: ...
+
+
+class Recorder(EventRecorder, Protocol):
+    """The recording of a wrist camera."""
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
+
+    def reference(self, reference: ReferenceRecord) -> None: ...
+
+
+class SpotRecorder(EventRecorder, Protocol):
+    """The recording of a second camera."""
+
+    def spot(self, record: SpotRecord, image: Image | None) -> None:
+        """What became of a pulse, with the image in which its spot was looked for."""
+
+
+class NullRecorder:
+    """Records nothing."""
+
+    dropped = images_dropped = 0
+    has_room = True
+    failure: str | None = None
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None: ...
+    def spot(self, record: SpotRecord, image: Image | None) -> None: ...
+    def alert(self, alert: AlertRecord) -> None: ...
+    def reference(self, reference: ReferenceRecord) -> None: ...
+    def command(self, command: RecordedCommand) -> None: ...
+    def state(self, state: StateRecord) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> None: ...
+
+
+class Scene(msgspec.Struct, frozen=True, kw_only=True):
+    """The first message: all that doesn't change while a recording runs.
+
+    A wrist camera has a gripper and a reference, a second camera a ``laser``.
+    """
+
+    name: str
+    recording_id: str
+    directory: str
+    settings: RecordingSettings
+    robot: str
+    camera: str
+    lens: LensSettings
+    gripper: GripperModel | None = None
+    reference: ReferenceRecord | None = None
+    laser: LaserCalibration | None = None
+    has_truth: bool = False
+    version: str = __version__
+    configuration: RecordedConfiguration | None = None
+    view: ViewSettings | None = None  # served live, too
+
+    @property
+    def tcp_m(self) -> NDArray[np.float64]:
+        """Where the reference has the TCP of a wrist camera's gripper, camera frame."""
+        assert self.reference is not None, "a wrist camera's"
+        return np.array(self.reference.cam_T_grip.translation_m)
+
+
+def make_scene(
+    settings: RecordingSettings,
+    directory: str,
+    name: str,
+    robot: str,
+    camera_name: str,
+    camera: Camera,
+    gripper: Gripper,
+    reference: ReferenceRecord,
+    has_truth: bool = False,
+    configuration: RecordedConfiguration | None = None,
+    view: ViewSettings | None = None,
+) -> Scene:
+    """That of a wrist camera."""
+    return Scene(
+        name=name,
+        recording_id=f"{name}-{uuid.uuid4()}",
+        directory=directory,
+        settings=settings,
+        robot=robot,
+        camera=camera_name,
+        lens=camera.settings,
+        gripper=gripper.model,
+        reference=reference,
+        has_truth=has_truth,
+        configuration=configuration,
+        view=view,
+    )
+
+
+class ImageNote(msgspec.Struct, frozen=True, array_like=True):
+    """An image in the shared memory."""
+
+    slot: int
+    shape: tuple[int, ...]
+    pixel_type: str
+
+
+class TraceNote(msgspec.Struct, frozen=True, array_like=True):
+    """A :class:`MeasurementTrace` in bytes: positions as float32 pairs, distances as float32, flags as uint8."""
+
+    edge_uv_px: bytes
+    edge_used: bytes
+    edge_residual_px: bytes
+    predicted_edges_uv_px: bytes
+    predicted_edge_lengths: list[int]
+    predicted_corners_uv_px: bytes
+
+
+class FrameNote(msgspec.Struct, frozen=True, array_like=True):
+    """``limits`` where they are others than those of the frame before; ``statistic_share`` as in
+    :class:`gripmon.model.records.MonitorNotes`.
+    """
+
+    record: FrameRecord | SpotRecord
+    image: ImageNote | None
+    trace: TraceNote | None
+    truth_tcp_m: tuple[float, float, float] | None
+    jaw_reported_m: float | None
+    statistic_share: float | None
+    limits: Limits | None
+    due: bool  # its image is written in any case, not only around an alert
+    lost: bool  # its image had no room
+
+
+class Events(msgspec.Struct, frozen=True, array_like=True):
+    """What happened beside the frames: alerts that are in no frame's record, and the rest as the daemon has it."""
+
+    alerts: list[AlertRecord] = []
+    references: list[ReferenceRecord] = []
+    commands: list[RecordedCommand] = []
+    states: list[StateRecord] = []
+
+    @staticmethod
+    def at_first(reference: ReferenceRecord | None) -> Events:
+        """What a file begins with: the reference in force, if there is one."""
+        return Events(references=[] if reference is None else [reference])
+
+    def __bool__(self) -> bool:
+        return bool(self.alerts or self.references or self.commands or self.states)
+
+    def __add__(self, later: Events) -> Events:
+        return Events(
+            self.alerts + later.alerts,
+            self.references + later.references,
+            self.commands + later.commands,
+            self.states + later.states,
+        )
+
+
+class Batch(msgspec.Struct, frozen=True, array_like=True):
+    """What goes over the pipe at once."""
+
+    frames: list[FrameNote]
+    events: Events
+
+
+class Status(msgspec.Struct, frozen=True):
+    """What the recording process reports; all counts are since it began.
+
+    ``failure`` says why nothing is being written at the moment, None when all is well.
+    """
+
+    path: str | None = None
+    failure: str | None = None
+    frames: int = 0
+    frames_lost: int = 0
+    images_done: int = 0
+    view_failure: str | None = None  # of the live view, which is no failure of the recording
+    notice: str | None = None  # what a person may want to do about earlier files
+    images_lost: int = 0  # around alerts, or with a disk that failed; those that were due never came here
+
+
+def pack_trace(trace: MeasurementTrace) -> TraceNote:
+    edges = trace.predicted_edges_uv_px
+    return TraceNote(
+        edge_uv_px=trace.edge_uv_px.astype(np.float32).tobytes(),
+        edge_used=trace.edge_used.astype(np.uint8).tobytes(),
+        edge_residual_px=trace.edge_residual_px.astype(np.float32).tobytes(),
+        predicted_edges_uv_px=b"".join([edge.astype(np.float32).tobytes() for edge in edges]),
+        predicted_edge_lengths=[len(edge) for edge in edges],
+        predicted_corners_uv_px=trace.predicted_corners_uv_px.astype(np.float32).tobytes(),
+    )
+
+
+def pairs(packed: bytes) -> NDArray[np.float32]:
+    """(n, 2) from the bytes of a :class:`TraceNote`."""
+    return np.frombuffer(packed, np.float32).reshape(-1, 2)

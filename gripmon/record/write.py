@@ -1,0 +1,466 @@
+"""The daemon's side of a recording: frames are taken without blocking and handed over to the recording process."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import math
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import (
+    AlertRecord,
+    Frame,
+    FrameRecord,
+    Image,
+    MeasurementTrace,
+    MonitorNotes,
+    RecordedCommand,
+    RecordedConfiguration,
+    ReferenceRecord,
+    SpotRecord,
+    State,
+    StateRecord,
+    Verdict,
+)
+from gripmon.record.process import Health, ImageRing, WorkerProcess
+from gripmon.record.recorder import (
+    EventRecorder,
+    Events,
+    FrameNote,
+    ImageNote,
+    Notes,
+    NullRecorder,
+    Recorder,
+    RecordingSettings,
+    Scene,
+    SpotRecorder,
+    Status,
+    Trace,
+    ViewSettings,
+    make_scene,
+    pack_trace,
+)
+
+__all__ = [
+    "EventRecorder",
+    "Notes",
+    "NullRecorder",
+    "ProcessRecorder",
+    "Recorder",
+    "RecordingSettings",
+    "SpotRecorder",
+    "Trace",
+    "ViewSettings",
+    "make_scene",
+    "open_recorder",
+    "open_spot_recorder",
+]
+
+_log = logging.getLogger(__name__)
+
+HANDOVER_PERIOD_S = 0.05
+LONGEST_RESTART_PAUSE_S = 30.0
+_BATCH_FRAMES = 16
+_FRAMES_A_TURN = 4  # before the interpreter lock is let go
+_ROOM_POLL_S = 0.002
+_STOPPED_TIMEOUT_S = 2.0
+_LOSSES_PERIOD_S = 60.0  # between two lines about them
+_EVENTS_KEPT = 4096  # while the process is away
+
+Truth = Callable[[int], tuple[float, float, float] | None]
+
+
+class _Waiting(NamedTuple):
+    """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert;
+    ``lost`` its image, for want of room.
+    """
+
+    record: FrameRecord | SpotRecord
+    counted: bool
+    image: Image | None
+    trace: MeasurementTrace | None
+    jaw_reported_m: float | None
+    notes: MonitorNotes | None
+    due: bool
+    lost: bool = False
+
+
+class ProcessRecorder:
+    """Records through a process of its own.
+
+    ``offer`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
+    afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread moves images into shared memory and
+    everything else, a batch at a time, into a pipe.  When the recording process can't follow, first images and then
+    frames are dropped and counted.  When it dies, it is started again and begins a new file.
+    """
+
+    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
+        self._scene, self._truth_tcp_m, self._patience_s = scene, truth_tcp_m, patience_s
+        self._settings = settings = scene.settings
+        self._keeps_before = settings.around_alert_s > 0.0
+        # Images that may only be wanted later leave room for those that are.
+        self._images_before = max(1, settings.queue_images - settings.queue_images // 4)
+        self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
+        # Written by the loop's thread only.
+        self._queued = self._not_queued = 0
+        self._images_offered = self._images_not_queued = 0
+        self._image_stamp_ns: int | None = None
+        self._shown: tuple[State, Verdict, str, int] | None = None
+        # Appended to by the loop's thread, emptied by the hand-over thread.
+        self._frames: deque[_Waiting] = deque()
+        self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
+        # Written by the hand-over thread only.
+        self._images_taken = self._images_without_slot = self._images_lost_earlier = 0
+        self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
+        self._slot_waited_from: float | None = None
+        self._lost_earlier = self._written_earlier = 0
+        self._left_writing = 0  # frames that a process still writes when this object is closed
+        self._newest_reference = scene.reference
+        self._own_failure: str | None = None
+        self._stopped: str | None = None
+        self._health = Health(time.monotonic())
+        self._restart_pause_s, self._restart_at = 1.0, 0.0
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._ring = ImageRing(scene.lens.width_px, scene.lens.height_px, settings.queue_images)
+        self._worker: WorkerProcess | None = WorkerProcess(scene, self._ring)
+        self._status = Status()
+        self._closing = threading.Event()
+        self._close_before = 0.0
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are not in the recording: the queue was full, the process died, or nothing could be written."""
+        return self._not_queued + self._lost_earlier + self._status.frames_lost
+
+    @property
+    def images_dropped(self) -> int:
+        """Images that were due, or around an alert, but had no room: their frames are recorded without."""
+        earlier = self._images_not_queued + self._images_without_slot + self._images_lost_earlier
+        return earlier + self._status.images_lost
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the next frame and its image would be taken; also true of a recording that fails."""
+        images = self._images_before if self._keeps_before else self._settings.queue_images
+        waiting = self._images_offered - self._images_taken
+        return self.failure is not None or (len(self._frames) < self._settings.queue_frames and waiting < images)
+
+    @property
+    def frames_written(self) -> int:
+        """Frames that are on disk."""
+        return self._written_earlier + self._status.frames
+
+    @property
+    def failure(self) -> str | None:
+        return self._own_failure or self._health.fault or self._status.failure
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written, None before the first and while recording fails."""
+        return None if self._status.path is None else Path(self._status.path)
+
+    @property
+    def process_id(self) -> int | None:
+        worker = self._worker
+        return None if worker is None else worker.pid
+
+    def spot(self, record: SpotRecord, image: Image | None) -> None:
+        """Record a pulse of a second camera's laser, from the loop's thread."""
+        self.offer(Frame(record.seq, record.stamp_ns, image), record, lambda: None)
+
+    def offer(self, frame: Frame, record: FrameRecord | SpotRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
+        if self._patience_s > 0.0:
+            self._wait_for_room()
+        if len(self._frames) >= self._settings.queue_frames:
+            self._not_queued += 1
+            return
+        shown = (record.state, record.verdict, record.reference_id, record.revision)
+        self._queued += 1
+        due = bool(self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown)
+        self._shown = shown
+        noted = None if notes is None else notes()
+        waiting = self._images_offered - self._images_taken
+        if due and waiting < self._settings.queue_images:
+            self._images_offered += 1
+            self._image_stamp_ns = record.stamp_ns
+            item = _Waiting(record, True, frame.image, trace(), frame.jaw_opening_m, noted, due)
+        elif self._keeps_before and not due and waiting < self._images_before:
+            # Kept in case of an alert.  Its trace would cost the loop more than all the rest of this.
+            self._images_offered += 1
+            item = _Waiting(record, True, frame.image, None, frame.jaw_opening_m, noted, due)
+        else:
+            has_image = frame.image is not None
+            self._images_not_queued += due and has_image
+            lost = has_image and (due or self._keeps_before)
+            item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, due, lost)
+        self._frames.append(item)
+
+    def alert(self, alert: AlertRecord) -> None:
+        """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
+        self._events.append(Events(alerts=[alert]))
+
+    def reference(self, reference: ReferenceRecord) -> None:
+        """Record a new reference; the first one was given at the start."""
+        self._events.append(Events(references=[reference]))
+
+    def command(self, command: RecordedCommand) -> None:
+        """Record a command and what became of it."""
+        self._events.append(Events(commands=[command]))
+
+    def state(self, state: StateRecord) -> None:
+        """Record a state message."""
+        self._events.append(Events(states=[state]))
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
+        if self._closing.is_set():
+            return
+        self._close_before = time.monotonic() + timeout_s
+        self._closing.set()
+        self._thread.join()
+        self._frames.clear()
+        self._lost_earlier = self._queued - self.frames_written - self._left_writing - self._status.frames_lost
+        self._log_losses()
+
+    def _wait_for_room(self) -> None:
+        end = time.monotonic() + self._patience_s
+        while not self.has_room and time.monotonic() < end:
+            time.sleep(_ROOM_POLL_S)
+
+    def _image_is_due(self, stamp_ns: int) -> bool:
+        every = self._settings.image_every
+        if every > 0 and (self._queued - 1) % every == 0:
+            return True
+        if self._image_interval_ns is None:
+            return False
+        # A capture time that jumps backwards starts a new count.
+        return self._image_stamp_ns is None or not 0 <= stamp_ns - self._image_stamp_ns < self._image_interval_ns
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.wait(HANDOVER_PERIOD_S if self._patience_s == 0.0 else _ROOM_POLL_S):
+                self._hand_over()
+            self._hand_over()
+            while self._frames and self._worker is not None and time.monotonic() < self._close_before:
+                time.sleep(_ROOM_POLL_S)
+                self._hand_over()
+        except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
+            _log.exception("recording stopped")
+            self._stopped = f"internal error: {error!r}"
+            self._close_before = time.monotonic() + _STOPPED_TIMEOUT_S
+        self._finish()
+
+    def _hand_over(self) -> None:
+        worker = self._running_worker()
+        if worker is None:
+            return
+        worker.pump()
+        worker.read_reports()
+        if worker.status.view_failure is not None and worker.status.view_failure != self._status.view_failure:
+            _log.warning("%s; the monitor and its recording go on", worker.status.view_failure)
+        if worker.status.notice is not None and self._status.notice is None:
+            _log.info("%s", worker.status.notice)
+        self._status = worker.status
+        while worker.ready:
+            frames, events = self._next_frames(worker), self._next_events()
+            if not (frames or events):
+                break
+            worker.send(self._encode((frames, events)))  # a Batch
+        if worker.gone:
+            ended = worker.reap(0.0) or "the recording process ended by itself"
+            self._count_dead(worker, (worker.status.failure or ended).removeprefix("recording failed: "))
+            return
+        now_s, explained = time.monotonic(), worker.status.failure is not None
+        losses = self.dropped, self.images_dropped
+        self._health.look(now_s, worker.heard_s, worker.heard, worker.pid, *losses, explained)
+        if now_s - self._losses_logged_s >= _LOSSES_PERIOD_S:
+            self._log_losses(now_s)
+
+    def _log_losses(self, now_s: float = math.inf) -> None:
+        """One line when something more is missing than was logged last."""
+        losses = (self.dropped, self.images_dropped)
+        if losses != self._losses_logged:
+            self._losses_logged, self._losses_logged_s = losses, now_s
+            _log.warning("missing in the recording so far: %d frames; %d images of others", *losses)
+
+    def _running_worker(self) -> WorkerProcess | None:
+        if self._worker is None and time.monotonic() >= self._restart_at:
+            scene = msgspec.structs.replace(self._scene, reference=self._newest_reference)
+            self._worker = WorkerProcess(scene, self._ring)
+        elif self._worker is not None and self._own_failure is not None and self._worker.status.frames > 0:
+            self._own_failure = None
+            self._restart_pause_s = 1.0
+            _log.warning("recording goes on: %s", self._worker.status.path)
+        return self._worker
+
+    def _count_dead(self, worker: WorkerProcess, failure: str) -> None:
+        """Count what a dead process took with it and plan the next one."""
+        self._lost_earlier += worker.frames_sent - worker.status.frames
+        self._written_earlier += worker.status.frames
+        self._images_lost_earlier += worker.status.images_lost
+        kept = worker.status.view_failure, worker.status.notice
+        self._status = Status(images_done=worker.status.images_done, view_failure=kept[0], notice=kept[1])
+        self._own_failure = failure
+        self._worker = None
+        self._restart_at = time.monotonic() + self._restart_pause_s
+        _log.error("recording failed: %s; next try in %.0f s", failure, self._restart_pause_s)
+        self._restart_pause_s = min(2.0 * self._restart_pause_s, LONGEST_RESTART_PAUSE_S)
+
+    def _next_events(self) -> Events:
+        events = Events()
+        while self._events:
+            events += self._events.popleft()
+        if events.references:
+            self._newest_reference = events.references[-1]
+        return events
+
+    def _next_frames(self, worker: WorkerProcess) -> list[msgspec.Raw]:
+        """Those of the next batch, each encoded on its own."""
+        frames: list[msgspec.Raw] = []
+        while self._frames and len(frames) < _BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0]):
+            record, counted, image, trace, jaw_reported_m, noted, due, lost = self._frames.popleft()
+            self._images_taken += counted
+            note = None
+            if image is not None and self._ring.takes(image):  # else a refused frame: its record says why
+                note = self._share(worker, image, due)
+                lost = note is None
+            packed = None if trace is None else pack_trace(trace)
+            truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
+            limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
+            worker.limits_sent = limits or worker.limits_sent
+            share = None if noted is None else noted.statistic_share
+            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
+            frames.append(msgspec.Raw(self._encode(whole)))
+            if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
+                time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
+        worker.frames_sent += len(frames)
+        return frames
+
+    def _wait_for_slot(self, worker: WorkerProcess, head: _Waiting) -> bool:
+        """Whether the next frame stays in the queue because its image has no room yet and patience is left."""
+        if self._patience_s == 0.0 or head.image is None or self._slot_free(worker, head.due):
+            self._slot_waited_from = None
+            return False
+        now = time.monotonic()
+        self._slot_waited_from = self._slot_waited_from or now
+        return now - self._slot_waited_from < self._patience_s
+
+    def _slot_free(self, worker: WorkerProcess, due: bool) -> bool:
+        slots = self._ring.slots if due else self._images_before
+        if worker.images_sent - worker.status.images_done >= slots:
+            worker.read_reports()
+        return worker.images_sent - worker.status.images_done < slots
+
+    def _share(self, worker: WorkerProcess, image: Image, due: bool) -> ImageNote | None:
+        if not self._slot_free(worker, due):
+            self._images_without_slot += due
+            return None
+        note = self._ring.put(worker.images_sent % self._ring.slots, image)
+        worker.images_sent += 1
+        return note
+
+    def _finish(self) -> None:
+        worker, self._worker = self._worker, None
+        if worker is not None and self._queued == 0 and not worker.heard:
+            worker.discard()  # it hasn't even begun, and there is nothing that it could record
+        elif worker is not None:
+            self._own_failure = failure = worker.finish(self._close_before)
+            self._status = worker.status
+            if worker.still_writes:
+                self._left_writing = worker.frames_sent - worker.status.frames - worker.status.frames_lost
+                _log.info("the recording process still writes the end of the last file, and ends by itself")
+            if failure is not None:
+                _log.error("recording incomplete: %s", failure)
+        self._own_failure = self._stopped or self._own_failure
+        self._health.fault = None
+        self._ring.close()
+
+
+def open_recorder(
+    settings: RecordingSettings,
+    *,
+    robot: str,
+    camera_name: str,
+    camera: Camera,
+    gripper: Gripper,
+    reference: ReferenceRecord,
+    directory: Path | None = None,
+    name: str | None = None,
+    truth_tcp_m: Truth | None = None,
+    patience_s: float = 0.0,
+    configuration: RecordedConfiguration | None = None,
+    view: ViewSettings | None = None,
+) -> Recorder:
+    """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
+
+    ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  ``truth_tcp_m``,
+    which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
+    the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  ``patience_s`` is
+    for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a frame.  A camera
+    can't wait: 0.  ``configuration`` is written into every file.  With ``view`` viewers may connect and see what is
+    recorded as it comes, also where nothing is recorded.  Raises OSError when the directory can't be made.
+    """
+    if not settings.enabled and view is None:
+        return NullRecorder()
+    where = _directory(settings, directory)
+    name = _name(robot, camera_name) if name is None else name
+    scene = make_scene(
+        settings, where, name, robot, camera_name, camera, gripper, reference, truth_tcp_m is not None, configuration,
+        view,
+    )  # fmt: skip
+    return ProcessRecorder(scene, truth_tcp_m, patience_s)
+
+
+def open_spot_recorder(
+    settings: RecordingSettings,
+    *,
+    robot: str,
+    camera_name: str,
+    calibration: LaserCalibration,
+    directory: Path | None = None,
+    patience_s: float = 0.0,
+    configuration: RecordedConfiguration | None = None,
+    view: ViewSettings | None = None,
+) -> SpotRecorder:
+    """The same for a second camera: every pulse with its image."""
+    if not settings.enabled and view is None:
+        return NullRecorder()
+    name = _name(robot, camera_name)
+    scene = Scene(
+        name=name,
+        recording_id=f"{name}-{uuid.uuid4()}",
+        directory=_directory(settings, directory),
+        settings=msgspec.structs.replace(settings, image_every=1),
+        robot=robot,
+        camera=camera_name,
+        lens=calibration.camera,
+        laser=calibration,
+        configuration=configuration,
+        view=view,
+    )
+    return ProcessRecorder(scene, None, patience_s)
+
+
+def _directory(settings: RecordingSettings, directory: Path | None) -> str:
+    folder = Path(settings.directory) if directory is None else directory
+    if settings.enabled:
+        folder.mkdir(parents=True, exist_ok=True)
+    return str(folder.resolve())
+
+
+def _name(robot: str, camera_name: str) -> str:
+    return f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"

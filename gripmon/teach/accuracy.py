@@ -1,0 +1,235 @@
+"""Accuracy forecast: how certain a frame's transform will be, what the view can't separate, which alert limits hold.
+
+The monitor's own measurement and update are run on edge points where the model puts them, each with the same assumed
+standard deviation: what comes out is the covariance that the geometry gives, without any image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.judge.policy import PolicySettings
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record, invert
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image, Protection, ReferenceRecord
+from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
+from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind, see
+from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.track.edges.consensus import Consensus
+from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Candidates, Votes
+from gripmon.track.edges.uncertainty import Uncertainty, assess
+
+EDGE_POINT_SIGMA_PX = 0.05
+"""Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
+
+CLUTTER_PX = 0.1
+"""What the background is assumed to shift a stretch of an edge by, beside that, for the protection level: with it the
+bound is that of the usual frame before clutter; one in twenty has up to four times as much (tools/bench integrity).
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownOpening:
+    """What an unknown jaw opening does, the seventh unknown of the fit.
+
+    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when the robot doesn't report it.  ``pose_per_m`` (6,): by
+    how much the pose is wrong for each metre by which an opening that is taken as exact is wrong.  ``correlation`` of
+    the opening with the pose's weakest direction when it is unknown, 0 to 1: near 1 the image can't separate them.
+    """
+
+    sigma: Array
+    sigma_m: float
+    pose_per_m: Array
+    correlation: float
+
+    @property
+    def growth(self) -> float:
+        """By what factor the weakest direction is less certain than with an exactly known opening."""
+        return float(1.0 / np.sqrt(max(1.0 - self.correlation**2, 1e-12)))
+
+
+@dataclass(frozen=True, slots=True)
+class AccuracyForecast:
+    """Expected of one frame in which all visible edges are seen; vectors are (position, rotation), m and rad.
+
+    ``covariance`` (6, 6) as it would be published.  ``edges``: how many can be sampled; with fewer than
+    ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
+    distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``protection``: the
+    level before clutter.  ``jaw``: with an unknown opening; None for a gripper without jaw, or where not asked for.
+    """
+
+    covariance: Array
+    edges: int
+    corners: NDArray[np.bool_]
+    lever_m: float
+    protection: Protection
+    jaw: UnknownOpening | None
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviations."""
+        return np.asarray(np.sqrt(self.covariance.diagonal()))
+
+    @property
+    def weakest(self) -> Array:
+        """(6,) one standard deviation along the least certain direction, a radian counting as ``lever_m``."""
+        return weakest_direction(self.covariance, self.lever_m)
+
+    @property
+    def tcp_sigma_m(self) -> float:
+        """Standard deviation of the TCP along its least certain direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def enough(self) -> bool:
+        """Whether anything can be measured at all."""
+        return self.edges >= FEWEST_EDGES
+
+
+def forecast_accuracy(
+    camera: Camera,
+    gripper: Gripper,
+    settings: MonitorSettings,
+    reference: ReferenceRecord,
+    jaw_opening_m: float | None,
+    taught: TaughtEdges | None = None,
+) -> AccuracyForecast:
+    """What a frame at the reference's pose and an opening (nominal if None) may give."""
+    rig = Rig(camera, gripper, settings, taught)
+    return forecast_frame(rig, from_record(reference.cam_T_grip), jaw_opening_m, with_jaw=gripper.has_jaw)
+
+
+def forecast_frame(
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, with_jaw: bool = False
+) -> AccuracyForecast:
+    """What a frame at a pose and a reported opening (nominal if None) gives; ``with_jaw``: with an unknown one, too."""
+    gripper, settings = rig.gripper, rig.settings
+    opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+    meter = ForecastMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
+    tracker = Tracker(rig.camera, gripper, settings, rig.taught)
+    given = meter.forecast(cam_T_grip, opening_m, jaw_reported=True)
+    covariance = tracker.update(given)[1]
+    levers_m = given.prediction.corners.cam_m - given.prediction.cam_T_grip[:3, 3]
+    lever_m = float(np.sqrt((levers_m**2).sum(axis=1).mean()))
+    jaw = None
+    if with_jaw:
+        free = meter.forecast(cam_T_grip, opening_m, jaw_reported=False)
+        jaw = _unknown_opening(tracker.update(free)[1], free.covariance, lever_m)
+    seen = np.bincount(given.prediction.layout.edge[given.candidates.sample], minlength=1) >= FEWEST_SAMPLES
+    protection = foresee_protection(tracker, gripper, settings, given)
+    return AccuracyForecast(covariance, int(np.count_nonzero(seen)), given.corners.usable, lever_m, protection, jaw)
+
+
+def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tuple[float, AccuracyForecast | None]]:
+    """At ``count`` openings (m) over the jaw's travel: what a frame gives, None where too little is visible."""
+    openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count).tolist()
+    return [(m, forecast_frame(rig, cam_T_grip, m) if see(rig, cam_T_grip, m).enough else None) for m in openings_m]
+
+
+def weakest_direction(covariance: Array, lever_m: float) -> Array:
+    """(6,) one standard deviation along the least certain direction of a covariance (6, 6), a radian counting as
+    ``lever_m``.
+    """
+    scale = np.array([1.0] * 3 + [lever_m] * 3)
+    variances, directions = np.linalg.eigh(covariance * np.outer(scale, scale))
+    weakest = directions[:, -1] * np.sqrt(variances[-1]) / scale
+    return np.asarray(weakest * (1.0 if weakest[np.abs(weakest * scale).argmax()] > 0.0 else -1.0))
+
+
+def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) -> UnknownOpening:
+    """``covariance`` (7, 7) of the fit itself, ``pose_covariance`` (6, 6) as it would be published."""
+    weakest = weakest_direction(covariance[:6, :6], lever_m)
+    scale = np.array([1.0] * 3 + [lever_m] * 3)
+    # Its length is one standard deviation, so that projecting on it twice takes the scale out.
+    with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
+    variance = float(covariance[6, 6])
+    sigma_m = float(np.sqrt(variance))
+    return UnknownOpening(
+        np.sqrt(pose_covariance.diagonal()), sigma_m, covariance[:6, 6] / variance, abs(with_jaw) / sigma_m
+    )
+
+
+class ForecastMeter(FingertipMeter):
+    """Reads no image: finds an edge point on every profile that no other finger hides, where it was predicted."""
+
+    def forecast(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
+        """What the edge points alone give at a pose and an opening."""
+        nothing = np.zeros((1, 1), np.uint8)
+        here = Patience(when_doubtful=False, when_lost=False)
+        return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
+
+    def _look(self, image: Image, prediction: Prediction) -> Votes:
+        gripper, eye_grip_m = self._gripper, invert(prediction.cam_T_grip)[:3, 3]
+        points_grip_m = gripper.points_grip_m(prediction.jaw_opening_m)
+        hidden = samples_behind(gripper, prediction.layout, points_grip_m, eye_grip_m)
+        sample = np.flatnonzero(prediction.ok & ~hidden)
+        zero, one = np.zeros(len(sample)), np.ones(len(sample))
+        # Steps of 40 grey levels of 255 in noise of 1.5, in focus.
+        step = np.where(self._polarity[prediction.layout.edge[sample]] < 0, -40.0, 40.0)
+        return self._votes(Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0), prediction)
+
+    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
+        """As assumed: nothing scatters here."""
+        scatters = assess(votes, consensus, self._prior, CLUTTER_PX)
+        normal = consensus.information + np.diag(self._prior)
+        return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """``protection`` of a transform in which all visible edges are seen, and the alert limits that it is compared with:
+    whether a view's transforms can be valid, before there is any image.
+    """
+
+    protection: Protection
+    alert_limit_m: float
+    alert_limit_rad: float
+
+    @classmethod
+    def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
+        return cls(protection, policy.alert_limit_m, policy.alert_limit_rad)
+
+    @property
+    def reachable(self) -> bool:
+        """Whether a transform of this view can be valid."""
+        return self.excess <= 1.0
+
+    @property
+    def excess(self) -> float:
+        """The larger of both bounds over its limit: above 1, no transform can be valid."""
+        bound = self.protection
+        return max(bound.position_m / self.alert_limit_m, bound.rotation_rad / self.alert_limit_rad)
+
+    @property
+    def needed(self) -> str:
+        """The alert limits that this view could keep, where the present ones are too tight; else empty."""
+        bound, parts = self.protection, []
+        if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
+            return "more of the fingers in view: no limit would do"
+        if bound.position_m > self.alert_limit_m:
+            needed_m = _rounded_up(bound.position_m)
+            parts.append(f"alert_limit_m of at least {needed_m:g} ({1e3 * needed_m:g} mm)")
+        if bound.rotation_rad > self.alert_limit_rad:
+            needed_rad = _rounded_up(bound.rotation_rad)
+            parts.append(f"alert_limit_rad of at least {needed_rad:g} ({math.degrees(needed_rad):.2g} degrees)")
+        return " and ".join(parts)
+
+    def text(self) -> str:
+        """One line for a person."""
+        bound = self.protection
+        good = f"good to {1e3 * bound.position_m:.2g} mm and {math.degrees(bound.rotation_rad):.2g} degrees"
+        limits = f"{1e3 * self.alert_limit_m:g} mm, {math.degrees(self.alert_limit_rad):.2g} degrees"
+        reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
+        return f"a transform of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+
+
+def _rounded_up(value: float) -> float:
+    """To two digits, never below."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit

@@ -1,0 +1,343 @@
+"""``cam_T_grip`` from the corners of one image, without a hand/eye calibration.
+
+It is the pose of on-line recalibration, with everything in its covariance that one image can't average out: the
+corners, the jaw opening, the camera's calibration, and how exactly the gripper was made.  A plate under the fingertips
+(``gripmon calibrate plane``) gives the distance far better than the fingertips' own small extent does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.calibrate.intrinsics import lens_vector, model_of
+from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, refusal, rivals, solutions
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, ReferenceRecord
+from gripmon.track.edges import Measurement
+
+BY_HAND_PX = 1.0
+"""Standard deviation of a corner that a person set by hand where it wasn't measured, or against what was."""
+
+MADE_TO_M = 2e-5
+"""How exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
+
+_LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
+_STEP = 0.3  # of a standard deviation, for central differences
+
+
+@dataclass(frozen=True, slots=True)
+class SnappedCorner:
+    """One corner: ``model_px`` (2,) where the pose puts it, NaN beyond the lens; ``uv_px`` (2,) where its edges meet,
+    with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused and ``reason`` says why;
+    ``inliers``: part of the profiles on its edges that agree, None without any.
+    """
+
+    name: str
+    model_px: Array
+    uv_px: Array | None
+    covariance_px: Array | None
+    sigma_px: float | None
+    inliers: float | None
+    reason: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Snapped:
+    """What the image shows near corners put by hand.
+
+    ``refused``: why nothing was found, in words; ``cam_T_grip`` (4, 4) then is the rough pose, else the measured one.
+    ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2) that agree;
+    ``share`` of the profiles that do.  ``jaw_opening_m`` with ``jaw_sigma_m``: as given, or as seen where it wasn't.
+    """
+
+    cam_T_grip: Array
+    corners: tuple[SnappedCorner, ...]
+    outlines_px: dict[str, Array]
+    edge_points_px: Array
+    share: float
+    jaw_opening_m: float | None
+    jaw_sigma_m: float | None
+    refused: str | None
+    measurement: Measurement | None
+
+
+class PoseRefused(ValueError):
+    """These corners give no pose; the text is ``what is wrong; what would be right``."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraError:
+    """How uncertain a camera is: ``covariance`` (n, n) of its ``parameters``, named as in its calibration's file."""
+
+    parameters: tuple[str, ...]
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CornerPose:
+    """``cam_T_grip`` (4, 4), the covariance (6, 6) of its error, the ``corners`` it rests on, and the weighted root
+    mean square of their residuals, 1 where their covariances hold.  ``rival``: another pose fits them as well.  Without
+    ``corners`` it rests on the edges' joint fit: too few corners are seen for a pose of their own.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    corners: tuple[str, ...]
+    weighted_rms: float
+    rival: bool
+
+
+def pose_from_corners(
+    camera: Camera,
+    gripper: Gripper,
+    snapped: Snapped,
+    by_hand_px: Mapping[str, Array],
+    camera_error: CameraError | None = None,
+) -> CornerPose:
+    """Pose of the gripper by the corners that were measured, or set by hand.  Raises :class:`PoseRefused`."""
+    found = snapped.measurement
+    if found is None:
+        raise PoseRefused(f"no pose: {snapped.refused}")
+    measured = [i for i, c in enumerate(snapped.corners) if c.uv_px is not None and c.name not in by_hand_px]
+    hand = [i for i, c in enumerate(snapped.corners) if c.name in by_hand_px]
+    for name in (snapped.corners[i].name for i in hand):
+        if not np.isfinite(camera.undistort(np.reshape(by_hand_px[name], (1, 2)))).all():
+            raise PoseRefused(f"{name} was put where the lens shows nothing; inside the lens's view, or not by hand")
+    every = [*measured, *hand]
+    taken = np.isin(np.arange(len(snapped.corners)), measured)
+    uv_px = np.array([snapped.corners[i].uv_px for i in measured] + [by_hand_px[snapped.corners[i].name] for i in hand])
+    joint: Array = found.corners.joint_covariance_xy(taken)
+    of_edges: Array = np.zeros((6, 6))
+    by_edges = refusal(gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]) is not None
+    if by_edges:
+        # All corners where the edges' joint fit has them: its covariance is the measurement's.
+        every = [i for i, c in enumerate(snapped.corners) if np.isfinite(c.model_px).all()]
+        uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
+        joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
+    covariance_xy = _covariance(camera, uv_px, joint, found.cam_T_grip[2, 3])
+
+    def solve(camera: Camera, jaw_opening_m: float | None) -> Recalibration:
+        points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[every]]
+        return recalibrate(points_m, camera.undistort(uv_px), covariance_xy, found.cam_T_grip)
+
+    try:
+        pose = solve(camera, snapped.jaw_opening_m)
+        slopes = [
+            perturbation_between(solve(*low).cam_T_grip, solve(*high).cam_T_grip) / (2.0 * _STEP)
+            for low, high in _error_sources(camera, gripper, snapped, camera_error)
+        ]
+    except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
+        raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
+    # Corners that contradict each other are at least as wrong as their residuals.
+    covariance = pose.covariance * max(pose.weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
+    points_m = gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]
+    alike = rivals(solutions(points_m, camera.undistort(uv_px), covariance_xy), len(every))
+    names = () if by_edges else tuple(snapped.corners[i].name for i in every)
+    symmetric = 0.5 * (covariance + covariance.T)
+    return CornerPose(pose.cam_T_grip, symmetric, names, pose.weighted_rms, len(alike) > 1)
+
+
+def _covariance(camera: Camera, uv_px: Array, measured: Array, depth_m: float) -> Array:
+    """(2n, 2n) of ideal coordinates: measured corners together, those by hand alone, and how the gripper was made."""
+    count = len(uv_px)
+    out = np.zeros((2 * count, 2 * count))
+    out[: len(measured), : len(measured)] = measured
+    _, slopes = camera.undistort_with_jacobian(uv_px)
+    for i in range(len(measured) // 2, count):
+        block = slice(2 * i, 2 * i + 2)
+        out[block, block] = BY_HAND_PX**2 * slopes[i] @ slopes[i].T
+    return np.asarray(out + (MADE_TO_M / depth_m) ** 2 * np.eye(2 * count))
+
+
+_Seen = tuple[Camera, float | None]
+"""A camera, and a jaw opening."""
+
+
+def _error_sources(
+    camera: Camera, gripper: Gripper, snapped: Snapped, error: CameraError | None
+) -> list[tuple[_Seen, _Seen]]:
+    """What else may be wrong, by independent standard deviations: each by a part of one less and more."""
+    opening_m = snapped.jaw_opening_m
+    sources: list[tuple[_Seen, _Seen]] = []
+    if snapped.jaw_sigma_m and opening_m is not None:
+        step_m = _STEP * snapped.jaw_sigma_m
+        low_m, high_m = (float(np.clip(opening_m + s, gripper.jaw_min_m, gripper.jaw_max_m)) for s in (-step_m, step_m))
+        sources.append(((camera, low_m), (camera, high_m)))
+    if error is not None and error.parameters:
+        lens = camera.settings
+        model = LensModel(model_of(lens), lens.width_px, lens.height_px)
+        vector = lens_vector(lens)
+        places = [parameter_names(model.name).index(name) for name in error.parameters]
+        for root in np.linalg.cholesky(error.covariance).T:
+            step = np.zeros(len(vector))
+            step[places] = _STEP * root
+            if "fx_px" in error.parameters and "fy_px" not in error.parameters:
+                step[1] = step[0] * vector[1] / vector[0]
+            sources.append(((model.camera(vector - step), opening_m), (model.camera(vector + step), opening_m)))
+    return sources
+
+
+ROUGH_SHARE = 0.006
+"""How exactly corners are put by hand: standard deviation, as a part of the image's width."""
+
+_TILT_RAD = 0.4  # a wrist camera looks at the fingertips from beside the gripper
+_FILLS = 0.4  # part of the image that the gripper's corners then span
+_ROUNDS = 40
+_TURNS = 4
+_SAME_RAD, _SAME_SHARE = 0.02, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """A pose (4, 4) and the covariance (6, 6) of its error, before any corner is placed."""
+
+    cam_T_grip: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A pose that hand-placed corners and the prior allow: ``covariance`` (6, 6), ``cost`` the weighted squares of what
+    is left, ``left_px`` for each placed corner how far the pose leaves it from where it was put; infinite where the
+    lens maps it nowhere.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    cost: float
+    left_px: dict[str, float]
+
+
+def prior_of(reference: ReferenceRecord) -> Prior:
+    """The reference as the prior."""
+    return Prior(from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6)))
+
+
+def usual_view(camera: Camera, gripper: Gripper, jaw_opening_m: float | None) -> Prior:
+    """A camera that looks at the fingertips from the gripper's near side (-y), near enough for them to fill a good
+    part of the image; it may be turned about its own axis in any way.
+    """
+    corners_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
+    extent_m = float(np.ptp(corners_m, axis=0).max())
+    depth_m = extent_m * camera.fx_px / (_FILLS * camera.width_px)
+    cam_T_grip = make_transform(exp_rotation(np.array([_TILT_RAD, 0.0, 0.0])), np.array([0.0, 0.0, depth_m]))
+    sigma = [0.3 * depth_m, 0.3 * depth_m, 0.4 * depth_m, 0.4, 0.4, 2.0]
+    return Prior(cam_T_grip, np.diag(np.square(sigma)))
+
+
+def rough_sigma_px(camera: Camera) -> float:
+    """Standard deviation of a corner put by hand (px)."""
+    return max(ROUGH_SHARE * camera.width_px, 2.0)
+
+
+def place(
+    camera: Camera, gripper: Gripper, jaw_opening_m: float | None, put_px: Mapping[str, Array], prior: Prior
+) -> list[Placed]:
+    """Poses that explain where corners were ``put_px`` (name: (2,)), the likeliest first; several where corners in one
+    plane allow two.
+
+    Corners that lie outside of what the lens maps count as not put.  Without any corner the prior itself.
+    """
+    names = [name for name in gripper.corner_ids if name in put_px]
+    uv_px = np.array([put_px[name] for name in names], dtype=float).reshape(-1, 2)
+    xy = camera.undistort(uv_px) if len(uv_px) else uv_px
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
+    names, xy = [name for name, inside in zip(names, known.tolist(), strict=True) if inside], xy[known]
+    points = gripper.corner_points[np.array([gripper.corner_ids.index(name) for name in names], dtype=np.intp)]
+    points_m = gripper.points_grip_m(jaw_opening_m)[points].reshape(-1, 3)
+    weight = (0.5 * (camera.fx_px + camera.fy_px) / rough_sigma_px(camera)) ** 2
+    found: list[Placed] = []
+    for start in _starts(points_m, xy, prior, weight):
+        settled = _settle(start, points_m, xy, weight, prior)
+        if settled is None or any(_same(settled[0], other.cam_T_grip) for other in found):
+            continue
+        cam_T_grip, covariance, cost = settled
+        seen_px = camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+        away = np.nan_to_num(np.linalg.norm(seen_px - uv_px[known], axis=1), nan=np.inf).tolist()
+        found.append(Placed(cam_T_grip, covariance, cost, dict(zip(names, away, strict=True))))
+    found.sort(key=lambda pose: pose.cost)
+    return found or [Placed(prior.cam_T_grip, prior.covariance, 0.0, {})]
+
+
+def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator[Array]:
+    """The prior, the prior turned about the optical axis, and what closed forms give."""
+    yield prior.cam_T_grip
+    if len(xy) > 1 and math.sqrt(prior.covariance[5, 5]) > 1.0:
+        for quarter in range(1, _TURNS):
+            turned = prior.cam_T_grip.copy()
+            turned[:3, :3] = exp_rotation(np.array([0.0, 0.0, 2.0 * math.pi * quarter / _TURNS])) @ turned[:3, :3]
+            yield turned
+    try:
+        found = solutions(points_m, xy, np.broadcast_to(np.eye(2) / weight, (len(xy), 2, 2)))
+    except (RecalibrationRefused, np.linalg.LinAlgError):
+        return
+    yield from (pose.cam_T_grip for pose in found)
+
+
+def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
+    """Levenberg-Marquardt on the weighted image error and the prior; None where it leads behind the camera.
+
+    Its damping falls more slowly than :func:`gripmon.model.least_squares.minimise`'s: that one's longer steps take
+    corners which lie anywhere to poses next to the camera's plane, where nothing is determined.
+    """
+    information = np.linalg.inv(prior.covariance)
+    pose, damping = start, 1e-3
+    normal, side, current = _linearised(pose, points_m, xy, weight, prior, information)
+    if not math.isfinite(current):
+        return None
+    for _ in range(_ROUNDS):
+        tried = perturb(pose, np.linalg.solve(normal + damping * np.diag(normal.diagonal()), side))
+        there = _linearised(tried, points_m, xy, weight, prior, information)
+        if there[2] < current:
+            settled = current - there[2] < 1e-6 * (1.0 + there[2])
+            pose, (normal, side, current), damping = tried, there, 0.2 * damping
+            if settled:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e8:
+                break
+    return pose, np.linalg.inv(normal), current
+
+
+def _linearised(
+    pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array
+) -> tuple[Array, Array, float]:
+    """Normal matrix (6, 6), right-hand side (6,) and cost at a pose; infinite behind the camera."""
+    levers = points_m @ pose[:3, :3].T
+    seen = levers + pose[:3, 3]
+    if not pose[2, 3] > 0.0 or (seen[:, 2] <= 0.0).any():
+        return information, np.zeros(6), math.inf
+    away = perturbation_between(prior.cam_T_grip, pose)
+    shown = seen[:, :2] / seen[:, 2:]
+    slopes = np.zeros((len(seen), 2, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / seen[:, 2]
+    slopes[:, :, 2] = -shown / seen[:, 2:]
+    jacobian = np.concatenate([slopes, -slopes @ skew(levers)], axis=2).reshape(-1, 6)
+    residual = (xy - shown).ravel()
+    normal = information + weight * jacobian.T @ jacobian
+    side = weight * jacobian.T @ residual - information @ away
+    return normal, side, float(weight * residual @ residual + away @ information @ away)
+
+
+def _same(one: Array, other: Array) -> bool:
+    xi = perturbation_between(one, other)
+    return bool(np.linalg.norm(xi[3:]) < _SAME_RAD and np.linalg.norm(xi[:3]) < _SAME_SHARE * one[2, 3])
+
+
+def corners_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
+    """Key, what is wrong, what would be right, of corners in a file or a request; None if nothing is."""
+    for name, uv_px in corners.items():
+        if name not in gripper.corner_ids:
+            return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"
+        if not all(np.isfinite(v) and abs(v) <= _LARGEST_PX for v in uv_px):
+            return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
+    return None

@@ -1,0 +1,239 @@
+"""Pictures of what was taught or measured, drawn over an enlarged image: places in its pixels, lines in parts of a
+pixel, letters that stay readable.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+
+from gripmon.calibrate.plane import Coincidence
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
+from gripmon.teach.views import TeachingImage
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import TaughtEdges, TaughtModel
+
+Colour = tuple[int, int, int]
+"""Blue, green, red."""
+
+_SHIFT = 4  # binary digits of a pixel in OpenCV's drawing
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+class Canvas:
+    """An image ``zoom`` times as large: ``picture`` (h, w, 3), BGR of 8 bits."""
+
+    def __init__(self, image: Image, zoom: int) -> None:
+        scaled = image.astype(np.float32) * (255.0 / full_scale(image))
+        grey = cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.ndim == 3 else scaled
+        large = cv2.resize(np.clip(grey, 0.0, 255.0).astype(np.uint8), None, fx=zoom, fy=zoom)
+        self.picture: Image = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
+        self.zoom = zoom
+
+    def circle(self, at_px: Array, radius_px: float, colour: Colour) -> None:
+        """``radius_px`` in the picture's own pixels."""
+        (centre,) = self._fixed(at_px).tolist()
+        cv2.circle(self.picture, centre, round(radius_px * (1 << _SHIFT)), colour, 1, cv2.LINE_AA, _SHIFT)
+
+    def line(self, points_px: Array, colour: Colour, thickness: int = 1) -> None:
+        """Through points (n, 2)."""
+        cv2.polylines(self.picture, [self._fixed(points_px)], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+    def pixel(self, at_px: Array) -> tuple[int, int]:
+        """The place in the picture's own pixels."""
+        u, v = np.rint((np.asarray(at_px) + 0.5) * self.zoom - 0.5).astype(int).tolist()
+        return u, v
+
+    def _fixed(self, points_px: Array) -> Array:
+        """(n, 2) in OpenCV's fixed-point coordinates of the picture."""
+        own = (np.reshape(points_px, (-1, 2)) + 0.5) * self.zoom - 0.5
+        return np.rint(own * (1 << _SHIFT)).astype(np.int32)
+
+
+def write(picture: Image, text: str, at: tuple[int, int], colour: Colour, size: float) -> None:
+    """With a dark outline, of the same weight: thicker letters are wider.  OpenCV's font knows ASCII only."""
+    plain = text.encode("ascii", "replace").decode()
+    for right, down in (*itertools.product((-1, 0, 1), repeat=2), (0, 0)):
+        paint = colour if right == down == 0 else (0, 0, 0)
+        cv2.putText(picture, plain, (at[0] + right, at[1] + down), _FONT, size, paint, 1, cv2.LINE_AA)
+
+
+def text_size(text: str, size: float) -> tuple[int, int]:
+    """Width and height, px."""
+    (across, up), _ = cv2.getTextSize(text, _FONT, size, 1)
+    return int(across), int(up)
+
+
+def enlargement(largest_px: float, to_px: float) -> int:
+    """A round number by which to enlarge what is to be seen: the largest is then at most ``to_px`` long."""
+    return max((k for k in (1, 2, 5, 10, 20, 50, 100, 200, 500) if k * largest_px <= to_px), default=1)
+
+
+_ENLARGED_TO_PX = 12.0  # the largest offset is drawn at most so long
+_SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
+_TEXT_BGR = (255, 255, 255)
+_TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
+_MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
+_ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # lines above and below its place that a label may stand in
+_SMALLEST_PX = 1200  # pictures are enlarged to at least this width
+
+
+def draw_taught(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, image: TeachingImage, taught: TaughtEdges, model: TaughtModel
+) -> Image:
+    """The teaching image, BGR, with the sharp model's edges, the taught ones, and the taught corners by name."""
+    zoom = max(1, -(-_SMALLEST_PX // camera.width_px))
+    canvas = Canvas(image.image, zoom)
+    points_grip_m = gripper.points_grip_m(image.jaw_opening_m if gripper.has_jaw else None)
+    known = np.flatnonzero(taught.known).tolist()
+    lines = {edge: _line(camera, gripper, cam_T_grip, points_grip_m, taught, edge) for edge in known}
+    largest_px = max((float(np.nanmax(np.abs(shift))) for _, shift in lines.values()), default=0.0)
+    enlarged = enlargement(largest_px, _ENLARGED_TO_PX)
+    for edge, (uv_px, shift_px) in lines.items():
+        colour = _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR
+        canvas.line(uv_px, _SHARP_BGR)
+        canvas.line(uv_px + enlarged * shift_px, colour)
+        middle, shift = uv_px[len(uv_px) // 2], shift_px[len(uv_px) // 2]
+        canvas.line(np.array([middle, middle + enlarged * shift]), colour)
+    labels = Labels(canvas.picture)
+    labels.title(
+        f"{gripper.name}: sharp model (blue), taught outlines (orange), creases (green)",
+        f"offsets in px, drawn {enlarged} times as large",
+    )
+    for name, corner in model.corners.items():
+        canvas.circle(np.array(corner.uv_px), 5.0, _CORNER_BGR)
+        labels.put(name, canvas.pixel(np.array(corner.uv_px)), _CORNER_BGR)
+    for edge, (uv_px, shift_px) in lines.items():
+        text = f"{gripper.edge_ids[edge]} {np.linalg.norm(shift_px[len(uv_px) // 2]):.2f}"
+        labels.put(text, canvas.pixel(uv_px[len(uv_px) // 2]), _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR)
+    return canvas.picture
+
+
+def _line(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, points_grip_m: Array, taught: TaughtEdges, edge: int
+) -> tuple[Array, Array]:
+    """The sharp edge's taught part (n, 2), px, and by how much it is shifted across itself (n, 2)."""
+    start, end = points_grip_m[gripper.edge_points[edge]]
+    fraction = np.linspace(taught.share[edge, 0], taught.share[edge, 1], 33)
+    sharp = start + fraction[:, None] * (end - start)
+    real = sharp + taught.shift_at_m(np.full(len(fraction), edge), fraction)
+    uv_px, real_px = (camera.project(p @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]) for p in (sharp, real))
+    seen = np.isfinite(uv_px).all(axis=1)
+    uv_px, shift_px = uv_px[seen], (real_px - uv_px)[seen]
+    along = np.gradient(uv_px, axis=0)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    return uv_px, shift_px - np.einsum("ni,ni->n", shift_px, along)[:, None] * along
+
+
+class Labels:
+    """Texts in a picture, none over another and all of them inside; one that had to give way is tied to its place."""
+
+    def __init__(self, picture: Image) -> None:
+        self._picture = picture
+        self.boxes: list[tuple[int, int, int, int]] = []
+
+    def title(self, *lines: str) -> None:
+        """At the top, as large as fits."""
+        width, top = self._picture.shape[1] - 2 * _MARGIN_PX, _MARGIN_PX
+        for line in lines:
+            scale = min(_TITLE, _TITLE * width / text_size(line, _TITLE)[0])
+            across, up = text_size(line, scale)
+            write(self._picture, line, (_MARGIN_PX, top + up), _TEXT_BGR, scale)
+            self.boxes.append((_MARGIN_PX, top, _MARGIN_PX + across, top + up + _GAP_PX))
+            top += up + 2 * _GAP_PX
+
+    def put(self, text: str, at: tuple[int, int], colour: Colour) -> None:
+        """Beside a place (x, y), as near as there is room; nowhere free: right of it."""
+        across, up = text_size(text, _LABEL)
+        height, width = self._picture.shape[:2]
+        step = up + _GAP_PX
+        beside = ((at[0] + _ASIDE_PX, at[1] - _GAP_PX + k * step) for k in _ROWS)
+        before = ((at[0] - _ASIDE_PX - across, at[1] - _GAP_PX + k * step) for k in _ROWS)
+        places = [place for pair in zip(beside, before, strict=True) for place in pair]
+        for x, y in places:
+            box = x - _GAP_PX, y - up - _GAP_PX, x + across + _GAP_PX, y + _GAP_PX
+            inside = box[0] >= 0 and box[1] >= 0 and box[2] <= width and box[3] <= height
+            if inside and not any(_overlap(box, other) for other in self.boxes):
+                break
+        else:
+            (x, y), *_ = places
+            box = x, y - up, x + across, y
+        self.boxes.append(box)
+        if abs(y - at[1]) > step:
+            end = x if x > at[0] else x + across
+            cv2.line(self._picture, at, (end, y - up // 2), colour, 1, cv2.LINE_AA)
+        write(self._picture, text, (x, y), colour, _LABEL)
+
+
+def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+_WIDTH_PX = 1400
+_LARGEST_ZOOM = 4
+_RESIDUALS_TO_PX = 25.0
+_USED: Colour = (120, 220, 90)
+_UNUSED: Colour = (70, 70, 250)
+_MEASURED_BGR: Colour = (40, 220, 250)
+_AXES: tuple[tuple[str, Colour], ...] = (("x", (80, 80, 255)), ("y", (80, 230, 80)))
+_STRIP = 24
+_SIZE = 0.8
+
+
+def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image:
+    """The image, BGR and enlarged, with the plate's points (green, red if left out), the gripper's corners by name
+    (yellow), and arrows from where the calibration has each of them to where it was measured, enlarged as it says; the
+    gripper's axes at the TCP.
+    """
+    zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, _LARGEST_ZOOM))
+    canvas = Canvas(image, zoom)
+    residuals, used = found.plate.residuals_px[0], found.plate.used[0]
+    sizes = np.linalg.norm(residuals[used], axis=1)
+    largest_px = max(float(np.quantile(sizes, 0.95)), float(np.linalg.norm(found.residuals_px, axis=1).max()), 1e-6)
+    enlarged = enlargement(largest_px, _RESIDUALS_TO_PX)
+    for uv_px, residual, good in zip(found.sighting.uv_px, residuals, used.tolist(), strict=True):
+        colour = _USED if good else _UNUSED
+        canvas.circle(uv_px, 3.0, colour)
+        if good:
+            canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), colour)
+    _axes(canvas, lens, found)
+    for name, uv_px, residual in zip(found.corners.names, found.corners.uv_px, found.residuals_px, strict=True):
+        canvas.circle(uv_px, 5.0, _MEASURED_BGR)
+        canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), _MEASURED_BGR)
+        # Away from the middle, where the plate's points are: the fingers are darker, and of one shade.
+        width, height = text_size(name, _SIZE)
+        u, v = canvas.pixel(uv_px)
+        aside = -width - 12 if uv_px[0] < 0.5 * lens.width_px else 12
+        write(canvas.picture, name, (u + aside, v + round(1.6 * height)), _MEASURED_BGR, _SIZE)
+    left_out = int(np.count_nonzero(~used))
+    legend = (
+        f"{int(used.sum())} points of the plate (green), {left_out} left out (red), "
+        f"{len(found.corners.names)} corners (yellow); residuals x {enlarged}"
+    )
+    return _with_caption(canvas.picture, legend)
+
+
+def _axes(canvas: Canvas, lens: LensSettings, found: Coincidence) -> None:
+    """A third of the corners' reach along x and y."""
+    reach_m = 0.33 * float(np.abs(found.corners_m[:, :2]).max())
+    ends_m = np.vstack([np.zeros(3), reach_m * np.eye(3)[:2]])
+    uv_px = make_camera(lens).project(ends_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3])
+    if not np.isfinite(uv_px).all():
+        return
+    for k, (name, colour) in enumerate(_AXES, start=1):
+        canvas.line(uv_px[[0, k]], colour, thickness=2)
+        write(canvas.picture, name, canvas.pixel(uv_px[k]), colour, _SIZE)
+
+
+def _with_caption(picture: Image, text: str) -> Image:
+    """The words below, on a strip of their own, as large as the width allows."""
+    width, height = text_size(text, 1.0)
+    size = min(1.2 * _SIZE, 0.96 * picture.shape[1] / width)
+    strip = np.full((round(2.4 * size * height) + 8, picture.shape[1], 3), _STRIP, np.uint8)
+    place = (round(0.01 * picture.shape[1]), round(0.5 * (len(strip) + size * height)))
+    write(strip, text, place, _TEXT_BGR, size)
+    return np.vstack([picture, strip])

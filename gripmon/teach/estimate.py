@@ -1,0 +1,353 @@
+"""From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that
+refuse images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
+
+Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images is its part of what is common to all (the
+reference, or the reported opening, is off by a little; bevels make every outline lie inside of the sharp one) plus what
+is its own, plus noise, which clutter behind an outline can make large.  How much edges have of their own is estimated
+from all of them, and what of an offset their noise explains is taken back: a gripper with sharp edges isn't taught the
+clutter of its images.
+
+Depth (:func:`~gripmon.teach.lines.slopes`): images at one pose can't show it, but the shape of a bevel does.  A bevel
+or a rounding cuts an edge off; what shows instead is its rim, which lies on one of the two faces that would have met in
+the sharp edge.  So an offset across the line of sight goes with one along it: the rim lies in the face.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from gripmon.judge.smoothing import GATE
+from gripmon.model.records import Array
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, Pooled, find_line, pool, slopes
+from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Viewer, sampled
+from gripmon.track.edges.taught import TaughtEdge, sight_axes
+
+SHAPE_M = 5e-4
+"""How far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""
+
+INSET_SIGMA_M = 0.5 * SHAPE_M
+"""Of what bevels shift all outlines by alike, to the finger's side (standard deviation)."""
+
+PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
+"""How much bevels differ from edge to edge (standard deviation)."""
+
+SINGLE_SIGMA_PX = 0.03
+"""How far the background and the pixel grid move a whole edge in one image (standard deviation)."""
+
+GRID_SIGMA_PX = 0.01
+"""What of that is the pixel grid's, and the same in all images of a standing camera."""
+
+BACKGROUND_SHARE = 0.3
+"""A bevel at an outline is blurred into the background: by this part of it, as a standard deviation, what it shifts the
+outline by depends on the background's shade (bevels of the simulator before grey levels of 60 to 230)."""
+
+_SMALLEST_DEPTH_M = 1e-6
+_NOTHING_M = 1.0  # standard deviation of an offset that isn't seen: what all edges together show of it remains
+
+_SHRINKAGE = 2  # images of each edge that the usual scatter of all edges counts as
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeLines:
+    """One edge in all images: the ``line`` through all of them, ``ends_px`` (s, 2) those in the images that show it,
+    numbers ``images`` (s,), and ``within_px2`` (2,) the ends' mean variance by the scatter of the points.
+
+    Without a line (``line`` None, no images) it is an outline in view that too little is seen of.
+    """
+
+    sampled: Sampled
+    line: Line | None
+    images: tuple[int, ...]
+    ends_px: Array
+    within_px2: Array
+
+    @property
+    def mean_px(self) -> Array:
+        """(2,) over the images; zero without any."""
+        return np.asarray(self.ends_px.mean(axis=0)) if self.images else np.zeros(2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """Arrays of all edges with lines: ``indices`` (e,) in the gripper, ``outline`` (e,), ``ends_m`` one (s, 2) each,
+    carried over to the mean jaw opening by the depths ``depth_m`` (e,) known so far; ``turned`` as in the viewer, one
+    (s,) each; ``noise_m2`` (e, 2) variance of their means; ``rows`` (e, 2, 8) metres by the unknowns of the
+    measurement and by an inset of all outlines.
+    """
+
+    indices: list[int]
+    edges: list[EdgeLines]
+    outline: NDArray[np.bool_]
+    ends_m: list[Array]
+    turned: list[Array]
+    depth_m: Array
+    noise_m2: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, viewer: Viewer, lines: Mapping[int, EdgeLines], before: Mapping[str, TaughtEdge] | None) -> _Measured:
+        indices, edges = list(lines), list(lines.values())
+        outline = ~viewer.crease[indices]
+        turned = [viewer.turned[list(edge.images), index] for index, edge in lines.items()]
+        ids = [viewer.gripper.edge_ids[index] for index in indices]
+        depth_m = np.array([before[name].depth_m if before and name in before else 0.0 for name in ids])
+        per_m = np.array([edge.sampled.per_m for edge in edges])
+        ends_m = [
+            edge.ends_px / scale - (angle * depth)[:, None]
+            for edge, scale, angle, depth in zip(edges, per_m, turned, depth_m, strict=True)
+        ]
+        noise_m2 = _noise_m2(ends_m, np.array([edge.within_px2 for edge in edges]), per_m)
+        # Bevels and roundings put all outlines to the finger's side: common to them, like a motion.
+        inset = np.repeat((viewer.inside[indices] * outline)[:, None, None], 2, axis=1)
+        rows = np.concatenate([np.array([edge.sampled.rows for edge in edges]), inset], axis=2)
+        return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows)
+
+    def pooled(self, motion_covariance: Array) -> Pooled:
+        """All edges together, with a prior (7, 7) of pose and opening."""
+        prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
+        return pool(
+            self.means_m, self.noise_m2[:, :, None] * np.eye(2), self.rows, (~self.outline).astype(np.intp), prior
+        )
+
+    @property
+    def means_m(self) -> Array:
+        """(e, 2) over the images."""
+        return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
+
+
+def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
+    """What reference and opening are off by (``common``, the first 7) to the outlines, from a prior (7, 7) about zero.
+
+    Bevels of all outlines alike and each outline's own offset are allowed for, :data:`PLAUSIBLE_OWN_M` at least, since
+    what happens to look like a motion doesn't show as their own; creases have more of it.
+    """
+    measured = _Measured.of(viewer, lines, None)
+    seen = np.array([len(ends_m) > 0 for ends_m in measured.ends_m])
+    which = np.flatnonzero(measured.outline & seen)
+    return pool(
+        measured.means_m[which],
+        (measured.noise_m2[which][:, :, None] + PLAUSIBLE_OWN_M**2) * np.eye(2),
+        measured.rows[which],
+        np.zeros(len(which), dtype=np.intp),
+        block_diag(prior_covariance, INSET_SIGMA_M**2),
+    )
+
+
+def estimate_edges(
+    viewer: Viewer, lines: Mapping[int, EdgeLines], before: Mapping[str, TaughtEdge] | None
+) -> dict[str, TaughtEdge]:
+    """Means over the images, their noise from the scatter between them, pooled over all edges; an outline that too
+    little is seen of is expected where the others put it, with what edges have of their own as its deviation.
+
+    ``before``: the edges as known so far, whose depths carry the lines of images with other jaw openings over.
+    """
+    measured = _Measured.of(viewer, lines, before)
+    pooled = measured.pooled(viewer.prior_covariance)
+    # An edge's own, and what bevels shift all outlines by; the rest the reference and the opening are off by.
+    shape_m = pooled.own_m + pooled.common[-1] * measured.rows[:, :, -1]
+    depth_m, depth_sigma_m = _depths(viewer, measured, pooled.ends_m.mean(axis=1), shape_m.mean(axis=1))
+    sigma_m = np.sqrt(np.einsum("eii->ei", pooled.covariance_m2))
+    sigma_m = np.hypot(sigma_m, _changing_m(measured, shape_m))
+    return {
+        viewer.gripper.edge_ids[index]: TaughtEdge(
+            share=(round(edge.sampled.share[0], 6), round(edge.sampled.share[1], 6)),
+            offset_m=_nanometres(pooled.ends_m[i]),
+            sigma_m=_nanometres(sigma_m[i]),
+            depth_m=round(float(depth_m[i]), 9),
+            depth_sigma_m=round(float(depth_sigma_m[i]), 9),
+            crease=not measured.outline[i],
+            rms_px=round(edge.line.rms_px, 4) if edge.line else 0.0,
+            seen=round(edge.line.seen, 4) if edge.line else 0.0,
+        )
+        for i, (index, edge) in enumerate(zip(measured.indices, measured.edges, strict=True))
+    }
+
+
+def _nanometres(ends_m: Array) -> tuple[float, float]:
+    """Rounded, so that people can read the file."""
+    return round(float(ends_m[0]), 9), round(float(ends_m[1]), 9)
+
+
+def _changing_m(measured: _Measured, shape_m: Array) -> Array:
+    """(e, 2) standard deviation of what an offset has more or less in one image than in another, beyond the scatter of
+    its points: no average makes that less for a single frame.
+    """
+    out = np.zeros_like(shape_m)
+    for i, (edge, ends_m) in enumerate(zip(measured.edges, measured.ends_m, strict=True)):
+        if len(ends_m) > 1:
+            beyond_m2 = ends_m.var(axis=0, ddof=1) - edge.within_px2 / edge.sampled.per_m**2
+            out[i] = np.sqrt(np.maximum(beyond_m2, 0.0))
+        elif len(ends_m) and measured.outline[i]:
+            out[i] = BACKGROUND_SHARE * np.abs(shape_m[i])
+    return out
+
+
+def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array:
+    """(e, 2) variance of each edge's mean ends: the scatter between its images, or within them if that is more.
+
+    The usual scatter of all edges counts as some more images of each; in a single image it is what usually moves a
+    whole edge.
+    """
+    between_px2 = [np.var(m * ends, axis=0, ddof=1) for m, ends in zip(per_m, ends_m, strict=True) if len(ends) > 1]
+    usual_px2 = np.median(between_px2, axis=0) if between_px2 else np.full(2, SINGLE_SIGMA_PX**2)
+    noise = []
+    for scale, ends, within in zip(per_m, ends_m, within_px2, strict=True):
+        if not len(ends):
+            noise.append(np.full(2, _NOTHING_M**2))
+            continue
+        own_px2 = np.square(scale * (ends - ends.mean(axis=0))).sum(axis=0)
+        scatter_px2 = (own_px2 + _SHRINKAGE * usual_px2) / (len(ends) - 1 + _SHRINKAGE)
+        noise.append((np.maximum(scatter_px2, within) / len(ends) + GRID_SIGMA_PX**2) / scale**2)
+    return np.array(noise)
+
+
+def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array) -> tuple[Array, Array]:
+    """Depth (e,) and its standard deviation (e,): as a bevel of that shape has it, and as images with different jaw
+    openings show it, in which the line of sight has turned.
+    """
+    gripper, indices = viewer.gripper, measured.indices
+    offset_of_all_m = np.zeros(len(gripper.edge_ids))
+    offset_of_all_m[indices] = shape_m
+    axes = sight_axes(gripper, viewer.points_grip_m, viewer.ref_cam_T_grip)
+    slope = slopes(gripper, viewer.points_grip_m, viewer.crease, axes, offset_of_all_m)[indices]
+    known = np.isfinite(slope)
+    wished_m = np.where(known, slope, 0.0) * shape_m
+    unsure_m = np.where(known, SLOPE_SHARE * np.abs(wished_m), UNKNOWN_SLOPE * np.abs(shape_m))
+    information = 1.0 / (np.square(unsure_m) + np.square(offset_m) + _SMALLEST_DEPTH_M**2)
+    moment = information * wished_m
+    for i, (angle, ends_m) in enumerate(zip(measured.turned, measured.ends_m, strict=True)):
+        if not len(ends_m):
+            continue
+        away, seen_m = angle - angle.mean(), ends_m.mean(axis=1) + angle * measured.depth_m[i]
+        per_image_m2 = len(angle) * measured.noise_m2[i].mean()
+        information[i] += np.square(away).sum() / per_image_m2
+        moment[i] += float(away @ seen_m) / per_image_m2
+    return moment / information, 1.0 / np.sqrt(information)
+
+
+REFERENCE_SIGMAS = 3.0
+"""Standard deviations of the reference and of the reported opening that are allowed on top."""
+
+JAW_SIGMAS = 5.0
+"""Standard deviations that the seen opening may be from the reported one, as in the monitor."""
+
+NOTED_PX = 1.0
+"""A reference that is off by more than this is worth a note: a view turned by 3° makes a twentieth of it an error."""
+
+TAUGHT_SHARE = 0.5
+"""Part of the outlines in view, by profiles, that must be seen: with fewer, something hides the gripper."""
+
+LOST_SHARE = 0.25
+"""With a smaller part the gripper, or a finger, isn't there."""
+
+AGREEING_PX = 0.5
+"""How far the edges of an image may lie from where all images show them, in the median; else something has moved."""
+
+_FEWEST_SHARED = 4
+
+
+def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
+    """Refuse a gripper of which too little is seen, on the whole or of one finger."""
+    profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
+    seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
+    share = seen.sum() / max(profiles.sum(), 1)
+    if share < TAUGHT_SHARE:
+        found = "the gripper isn't found: " if share < LOST_SHARE else ""
+        raise TeachingRefused(
+            f"{found}only {100.0 * share:.0f} % of the outlines in view are seen as lines; at least "
+            f"{100.0 * TAUGHT_SHARE:.0f} %: images in focus, at the reference and their jaw openings, the fingers free"
+        )
+    for finger, name in enumerate(viewer.gripper.finger_ids):
+        own = viewer.gripper.edge_finger == finger
+        if profiles[own].sum() and seen[own].sum() < LOST_SHARE * profiles[own].sum():
+            raise TeachingRefused(f"finger {name} isn't seen; images in focus, all fingers free")
+
+
+def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
+    """Refuse the image in which the gripper stands farthest from where the others show it: most of its ``edges`` then
+    show elsewhere, each looked for in every image by itself.  A few that differ are clutter, or bevels before another
+    background.
+    """
+    if len(views) < 2:
+        return
+    places_px = np.full((len(views), len(edges)), np.nan)
+    for number, view in enumerate(views):
+        for k, edge in enumerate(edges):
+            seen = sampled([view], edge)
+            line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
+            if line is not None:
+                places_px[number, k] = line.ends_px.mean()
+    # By edges that most images show.
+    places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
+    enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
+    if not enough.any():
+        return
+    off_px = np.zeros(len(views))
+    off_px[enough] = np.nanmedian(np.abs(places_px[enough] - np.nanmedian(places_px, axis=0)), axis=1)
+    worst = int(off_px.argmax())
+    if off_px[worst] > AGREEING_PX:
+        raise ImageRefused(
+            views[worst].image,
+            f"the gripper shows {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
+            "px: images without motion of the camera, each with its own jaw opening",
+        )
+
+
+def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> str | None:
+    """Refuse a gripper that stands elsewhere, or opens its jaw otherwise, than the stated deviations allow.
+
+    Each is tried with the other one taken as stated, since together they can hardly be separated; what leaves less of
+    their own to the edges is named first.  What is allowed, but more than a pixel, is returned in words.
+    """
+    stated = viewer.prior_covariance
+    free_pose, free_jaw = stated.copy(), stated.copy()
+    free_pose[:6, :6] = np.diag(np.square([0.01] * 3 + [0.1] * 3))
+    free_jaw[6, 6] = 0.01**2
+    moved, opened = (motion_off(viewer, lines, prior) for prior in (free_pose, free_jaw))
+    pose = moved.common[:6]
+    pose_square = pose @ np.linalg.solve((moved.common_covariance[:7, :7] + stated)[:6, :6], pose)
+    jaw_m, jaw_sigma_m = float(opened.common[6]), float(np.sqrt(opened.common_covariance[6, 6] + stated[6, 6]))
+    # Bevels on the inner sides alone look like a wider opening.
+    allowed_m = JAW_SIGMAS * jaw_sigma_m + SHAPE_M
+    faults = []
+    if pose_square > GATE:
+        faults.append(
+            f"the gripper is off the reference, {viewer.distance(pose)}, {np.sqrt(pose_square / GATE):.1f} times what "
+            f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose)}"
+        )
+    if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:
+        faults.append(
+            f"the jaw shows an opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m is "
+            f"reported, at most {1e3 * allowed_m:.3f} mm may be between them: the opening corrected "
+            "(timestamps.csv, --jaw-opening), or a larger monitor.jaw_sigma_m"
+        )
+    if faults:
+        likelier_first = faults if moved.usual_own_m[0] <= opened.usual_own_m[0] else faults[::-1]
+        raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}")
+    away_px = max(float(np.abs(e.sampled.rows[:, :6] @ pose).max()) * e.sampled.per_m for e in lines.values())
+    if away_px <= NOTED_PX:
+        return None
+    return (
+        f"the reference is taken at its word, though the gripper shows up to {away_px:.1f} px beside it, "
+        f"{viewer.distance(pose)}; taught there it holds over a wider range: {viewer.pose(pose)}"
+    )
+
+
+def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
+    """Refuse edges that lie farther from the reference than a bevel and the stated deviations explain."""
+    for index, edge in lines.items():
+        if not edge.images:
+            continue
+        allowed_px = viewer.allowed_px(views[edge.images[0]], index, SHAPE_M, REFERENCE_SIGMAS)
+        away_px = float(np.abs(edge.mean_px).max())
+        if away_px > allowed_px:
+            raise TeachingRefused(
+                f"edge {viewer.gripper.edge_ids[index]} shows {away_px:.1f} px "
+                f"({1e3 * away_px / edge.sampled.per_m:.2f} mm) from the reference; at most {allowed_px:.1f} px, which "
+                "a bevel and the standard deviations of reference and jaw explain: correct the gripper file"
+            )

@@ -1,0 +1,356 @@
+"""What a gripper's edges look like in images at the reference calibration: the measuring half of ``gripmon teach``.
+
+By definition the gripper stands in the teaching images at the reference, its jaws open as reported.  So the
+taught offsets hold everything by which the images differ from the sharp model there: bevels, shading and blur, but
+also what the reference and the reported opening are off by.  All of it cancels later, as it does for the method's own
+reference corners, which are measured in the reference image.  A reference or an opening that is off by more than its
+stated deviation and a plausible bevel allow is refused: it would be carried along, and the offsets' part along the
+line of sight, which can't be seen, would grow with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.judge.smoothing import GATE
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.records import Array, ReferenceRecord
+from gripmon.teach.estimate import (
+    SHAPE_M,
+    EdgeLines,
+    check_edges,
+    check_enough,
+    check_reference,
+    check_standing,
+    estimate_edges,
+)
+from gripmon.teach.lines import find_line, of_image, settle_line
+from gripmon.teach.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import Measurement
+from gripmon.track.edges.prediction import STEP_PX
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdges
+
+T = TypeVar("T")
+
+SEEN_SHARE = 0.6
+"""Part of an edge's profiles that must show its line, in at least half of the images."""
+
+CLOSED_PX = 0.3
+"""How far the gripper may show from the reference when the images are measured again with what was taught; farther only
+if that measurement is as uncertain."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """What was learnt.  ``untaught``: for each other edge in view why not; ``notes``: what a person should know.
+
+    ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most.
+    ``left_out``: the images that contradict the others, by their numbers, and why.
+    """
+
+    edges: dict[str, TaughtEdge]
+    corners: dict[str, TaughtCorner]
+    untaught: dict[str, str]
+    notes: tuple[str, ...]
+    closure_px: float
+    left_out: dict[int, str]
+
+    def used(self, images: Sequence[T]) -> list[T]:
+        """Of what belongs to the images given that of those taught from."""
+        return [one for number, one in enumerate(images) if number not in self.left_out]
+
+
+def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> Taught:
+    """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
+
+    Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
+    image alone a straight line of the background beside an outline may be taken for it.  An image that contradicts the
+    others is left out while most of them remain.
+    """
+    assert images, "nothing to teach from"
+    viewer = Viewer(rig, reference, images)
+    fits = {number: viewer.fitted(image) for number, image in enumerate(images)}
+    left_out: dict[int, str] = {}
+    while True:
+        used = [images[number] for number in fits]
+        try:
+            viewer = Viewer(rig, reference, used)
+            return replace(_teach_or_locate(viewer, used, list(fits.values())), left_out=left_out)
+        except ImageRefused as refused:
+            number = next(n for n in fits if images[n] is refused.image)
+            if 2 * (len(fits) - 1) <= len(images):
+                raise _with_reasons(refused, left_out) from None
+            del fits[number]
+            left_out[number] = str(refused)
+        except TeachingRefused as refused:
+            raise _with_reasons(refused, left_out) from None
+
+
+def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
+    """The refusal, with the images that were left out before, each with its reason."""
+    if not left_out:
+        return refused
+    return TeachingRefused(f"{refused}; and left out before: {'; '.join(left_out.values())}")
+
+
+def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
+    """What these images teach; where that fails, an image that shows the gripper elsewhere is the likelier reason."""
+    try:
+        return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
+    except ImageRefused:
+        raise
+    except TeachingRefused:
+        for image, fit in zip(images, fits, strict=True):
+            if fit is None:
+                viewer.check_elsewhere(image)
+        raise
+
+
+def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
+    gripper, images = viewer.gripper, [view.image for view in views]
+    lines, untaught = _lines(viewer, views, search=True)
+    check_standing(views, list(lines))
+    check_enough(viewer, views, lines)
+    doubt = check_reference(viewer, images[0].name, lines)
+    check_edges(viewer, views, lines)
+    notes = _notes(viewer, lines, len(images), doubt)
+    edges = estimate_edges(viewer, lines, None)
+    arrays = viewer.arrays(edges)
+    # Once more from where the edges really are: the profiles then lie even to both sides of them.
+    views = [viewer.view(view.image, None, arrays, view.candidates.zoom) for view in views]
+    lines, lost = _lines(viewer, views, search=False)
+    seen = {gripper.edge_ids[index]: one._asdict() for index, one in _appearances(viewer, views, lines).items()}
+    edges = estimate_edges(viewer, lines, edges)
+    edges = {name: msgspec.structs.replace(edge, **seen.get(name, {})) for name, edge in edges.items()}
+    arrays = viewer.arrays(edges)
+    return Taught(
+        edges,
+        _corners(viewer, arrays, images[0].jaw_opening_m),
+        {**untaught, **lost},
+        notes,
+        round(_closure_px(viewer, images, arrays), 4),
+        {},
+    )
+
+
+def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:
+    """Lines of all edges that some image samples, and why creases have none: outlines then come without a line."""
+    lines, untaught = {}, {}
+    for edge in sorted({e for view in views for e in view.prediction.layout.edges.tolist()}):
+        seen = sampled(views, edge)
+        found = "out of view" if seen is None else _lines_of(seen, len(views), search)
+        if isinstance(found, EdgeLines):
+            lines[edge] = found
+        elif seen is None or viewer.crease[edge]:
+            untaught[viewer.gripper.edge_ids[edge]] = found
+        else:
+            lines[edge] = EdgeLines(seen, None, (), np.zeros((0, 2)), np.zeros(2))
+    return lines, untaught
+
+
+def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
+    """An edge's line in all images together and in each, or why there is none."""
+    points, expected_px = seen.points, seen.expected_px
+    line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)
+    if line is None:
+        return "no line is seen"
+    shown = {}
+    for number in range(images):
+        own = settle_line(of_image(points, number), line.ends_px)
+        if own is not None and own.seen >= SEEN_SHARE:
+            shown[number] = own
+    if 2 * len(shown) < images:
+        return f"its line shows along {100.0 * line.seen:.0f} % of it"
+    ends_px = np.array([own.ends_px for own in shown.values()])
+    within_px2 = np.mean([own.covariance_px2.diagonal() for own in shown.values()], axis=0)
+    return EdgeLines(seen, line, tuple(shown), ends_px, within_px2)
+
+
+def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
+    """How far the gripper shows from the reference in images that are measured with what they taught, px at most."""
+    worst_px, refused_px = 0.0, 0.0
+    refused: ImageRefused | None = None
+    for image in images:
+        found = viewer.measured(image, arrays)
+        xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
+        away_px = found.prediction.moved_px(xi) if found.trusted else math.inf
+        explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE
+        worst_px = max(worst_px, away_px)
+        if away_px > max(CLOSED_PX, refused_px) and not (found.trusted and explained):
+            shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"
+            why = f"measured with what was taught the gripper {shows}; at most {CLOSED_PX:g} px: images in focus, "
+            refused, refused_px = ImageRefused(image, f"{why}without motion, the fingers free"), away_px
+    if refused is not None:
+        raise refused
+    return worst_px
+
+
+def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[str, TaughtCorner]:
+    """Where taught edges meet in the image: least squares of their offsets at the corner, weighted."""
+    gripper, camera = viewer.gripper, viewer.rig.camera
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    points_cam_m = points_grip_m @ viewer.ref_cam_T_grip[:3, :3].T + viewer.ref_cam_T_grip[:3, 3]
+    uv_px, d_uv = camera.project_with_jacobian(points_cam_m)
+    corners = {}
+    for number, point in enumerate(gripper.corner_points.tolist()):
+        edges = gripper.edges_at_corner(number)
+        edges = edges[arrays.known[edges]]
+        if len(edges) < 2:
+            continue
+        ends = gripper.edge_points[edges]
+        gradient = d_uv[point] @ viewer.ref_cam_T_grip[:3, :3]
+        tangent = (points_grip_m[ends[:, 1]] - points_grip_m[ends[:, 0]]) @ gradient.T
+        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.linalg.norm(tangent, axis=1)[:, None]
+        per_m = np.linalg.norm(normal @ gradient, axis=1)
+        shift_m = arrays.shift_at_m(edges, (ends[:, 1] == point).astype(float))
+        offset_px = np.einsum("ei,ei->e", normal @ gradient, shift_m)
+        weighted = normal.T / np.square(per_m * arrays.sigma_m[edges])
+        if np.linalg.cond(weighted @ normal) > _LARGEST_CONDITION:
+            continue
+        covariance = np.linalg.inv(weighted @ normal)
+        u, v = (uv_px[point] + covariance @ weighted @ offset_px).tolist()
+        corners[gripper.corner_ids[number]] = TaughtCorner(
+            uv_px=(round(u, 4), round(v, 4)),
+            sigma_px=round(float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])), 4),
+        )
+    return corners
+
+
+_LARGEST_CONDITION = 100.0  # edges that meet at less than some 10° make no corner
+
+
+def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: str | None) -> tuple[str, ...]:
+    """What can be doubted about what was taught."""
+    notes = [] if doubt is None else [doubt]
+    found = {index: edge.line for index, edge in lines.items() if edge.line is not None and not viewer.crease[index]}
+    rivals = {index: line.rival_px for index, line in found.items() if line.rival_px is not None}
+    if rivals and images == 1:
+        named = ", ".join(f"{viewer.gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())
+        notes.append(f"another line runs beside {named}: teach from several images with different backgrounds")
+    return tuple(notes)
+
+
+NEAR_PX, FAR_PX = 1.5, 3.0
+"""Where a side's grey level is taken: beyond the edge's blur, before the next feature (px, times the zoom)."""
+
+AGREEING_SHARE = 0.95
+"""Part of the edge points of all images that must have the same side brighter."""
+
+FEWEST_BACKGROUNDS = 3
+"""Images that an outline's brighter side must be seen in: it depends on the background."""
+
+DIFFERENT_SHARE = 0.1
+"""Backgrounds differ clearly if their levels beside an edge span at least this part of the full scale."""
+
+Side = Literal["left", "right", "any"]
+
+
+class _Appearance(NamedTuple):
+    """``brighter`` side, and the appearance of those sides that are the finger's."""
+
+    brighter: Side
+    left: Look | None
+    right: Look | None
+
+
+class _Sides(NamedTuple):
+    """Grey levels (k,) to the left and to the right of an edge's points, their steps (k,) and images (k,)."""
+
+    left: Array
+    right: Array
+    step: Array
+    image: NDArray[np.intp]
+
+
+def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> dict[int, _Appearance]:
+    """The appearance of all edges that have lines.
+
+    Levels count relative to the median over all edges of an image, which takes exposure out.
+    """
+    sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
+    gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
+    scale = full_scale(views[0].image.image)
+    found = {}
+    for index, side in sides.items():
+        gain = np.array(gains)[side.image]
+        inside, crease = viewer.inside[index], viewer.crease[index]
+        left = _look(side.left / gain) if crease or inside < 0.0 else None
+        right = _look(side.right / gain) if crease or inside > 0.0 else None
+        sure = crease or (inside != 0.0 and _shows_on_any_background(side, inside, scale))
+        found[index] = _Appearance(_brighter(side.step) if sure else "any", left, right)
+    return found
+
+
+def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:
+    assert edge.line is not None
+    points, inlier = edge.sampled.points, edge.line.inlier
+    parts = []
+    for number, view in enumerate(views):
+        candidate = points.candidate[inlier & (points.image == number)]
+        found, grey = view.candidates, view.profiles
+        sample, step = found.sample[candidate], found.step[candidate]
+        # Samples lie farther apart where the image is measured on a coarser scale, and edges are wider there.
+        middle = grey.shape[1] // 2 + found.offset_px[candidate] / (STEP_PX * found.zoom)
+        near, far = NEAR_PX / STEP_PX, FAR_PX / STEP_PX
+        levels = [_level(grey[sample], middle + side * near, middle + side * far) for side in (-1.0, 1.0)]
+        parts.append((*levels, step, np.full(len(sample), number)))
+    return _Sides(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _level(grey: NDArray[np.float32], start: Array, end: Array) -> Array:
+    """(k,) mean of each row of ``grey`` (k, s) between two places on it, samples; NaN where they leave it."""
+    places = np.linspace(start, end, 4)
+    low = np.floor(places).astype(int)
+    outside = (low < 0) | (low + 1 >= grey.shape[1])
+    low = np.clip(low, 0, grey.shape[1] - 2)
+    rows = np.arange(len(grey))
+    values = grey[rows, low] + (places - low) * (grey[rows, low + 1] - grey[rows, low])
+    return np.asarray(np.where(outside, np.nan, values).mean(axis=0))
+
+
+def _usual_level(viewer: Viewer, sides: Mapping[int, _Sides], image: int) -> float:
+    """Median over all edges of the finger's level beside them, in one image."""
+    levels = []
+    for index, side in sides.items():
+        for sign, grey in ((-1.0, side.left), (1.0, side.right)):
+            own = grey[(side.image == image) & np.isfinite(grey)]
+            if len(own) and (viewer.crease[index] or viewer.inside[index] == sign):
+                levels.append(float(np.median(own)))
+    return max(float(np.median(levels)), 1e-9) if levels else 1.0
+
+
+def _look(relative: Array) -> Look | None:
+    relative = relative[np.isfinite(relative)]
+    if not len(relative):
+        return None
+    level = float(np.median(relative))
+    spread = 1.4826 * float(np.median(np.abs(relative - level)))
+    return Look(level=round(max(level, 0.0), 4), spread=round(spread, 4))
+
+
+def _brighter(step: Array) -> Side:
+    right = float(np.mean(step > 0.0))
+    return "right" if right >= AGREEING_SHARE else "left" if right <= 1.0 - AGREEING_SHARE else "any"
+
+
+def _shows_on_any_background(side: _Sides, inside: float, scale: float) -> bool:
+    """Whether an outline's polarity can be relied on: several clearly different backgrounds, all of them on one side of
+    the finger's level and farther from it than they differ among themselves.
+    """
+    finger, beyond = (side.right, side.left) if inside > 0.0 else (side.left, side.right)
+    images = np.unique(side.image)
+    if len(images) < FEWEST_BACKGROUNDS:
+        return False
+    levels = np.array([np.nanmedian(beyond[side.image == number]) for number in images])
+    span = float(levels.max() - levels.min())
+    nearest = float(np.nanpercentile(np.abs(beyond - finger), 100.0 * (1.0 - AGREEING_SHARE)))
+    return span >= DIFFERENT_SHARE * scale and nearest >= span

@@ -1,0 +1,169 @@
+"""What the teaching page and its server send each other: JSON, typed on the server's side.  Lengths in metres, angles
+in radians, image coordinates in px (centre of the first pixel: 0, 0), as everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.model.records import Image
+
+Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
+Place = tuple[Pixel, Pixel]
+Key = Annotated[str, Meta(pattern=r"^[^/*$#?@\s][^/*$#?\s]*$", max_length=100)]
+Opening = Annotated[float, Meta(ge=0.0, le=0.5)]
+
+
+class BadRequest(ValueError):
+    """A request that can't be met; one line says why."""
+
+
+class SavingRefused(Exception):
+    """Nothing was written; one line says why."""
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of what the page asks."""
+
+
+class Put(Request, frozen=True):
+    """Corners put by hand in one image; those ``by_hand`` count as they stand.  ``image`` None: what is live now."""
+
+    corners: Annotated[dict[str, Place], Meta(max_length=1000)]
+    by_hand: Annotated[tuple[str, ...], Meta(max_length=1000)] = ()
+    image: Annotated[int, Meta(ge=0)] | None = None
+    jaw_opening_m: Opening | None = None
+
+
+class SaveOrder(Request, frozen=True):
+    """What is to be written.  ``replace``: the person has agreed that files which are there are replaced."""
+
+    put: Put
+    robot: Key
+    camera_name: Key
+    taught: bool = True
+    config: bool = True
+    corners: bool = True
+    replace: bool = False
+
+
+class Nothing(Request, frozen=True):
+    """An order without particulars."""
+
+
+class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
+    number: int
+    name: str
+    jaw_opening_m: float | None
+
+
+class State(msgspec.Struct, frozen=True, kw_only=True):
+    """What the page begins with.  ``corners_only``: there is no gripper, nothing snaps."""
+
+    version: str
+    width_px: int
+    height_px: int
+    corners: tuple[str, ...]
+    fingers: dict[str, str]
+    places: dict[str, Place | None]
+    pictures: tuple[PictureInfo, ...]
+    live: str | None
+    has_jaw: bool
+    jaw_m: tuple[float, float, float]
+    gripper: str
+    reference: str | None
+    needed: int
+    robot: str
+    camera_name: str
+    fixed_names: bool
+    folder: str
+    files: dict[str, str]
+    corners_only: bool = False
+
+
+class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
+    """``model_px``: where the pose has it; the rest as in :class:`gripmon.teach.snapping.SnappedCorner`."""
+
+    name: str
+    model_px: Place | None
+    uv_px: Place | None
+    covariance_px2: tuple[float, float, float] | None
+    sigma_px: float | None
+    inliers: float | None
+    reason: str | None
+
+
+class Expectation(msgspec.Struct, frozen=True, kw_only=True):
+    """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
+    ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
+    drift test notices; ``promise``: bounds on its error beside the alert limits, in words, ``reachable``: it keeps
+    them.  ``delay_frames``: after how many frames it notices a step of the TCP by 0.1 mm along x, y and z, None for
+    never.  ``recalibration``: why the corners in view give no new pose, None if they do.
+    """
+
+    edges: int
+    sigma: tuple[float, ...]
+    weakest: tuple[float, ...]
+    smallest: tuple[float, ...]
+    promise: str
+    reachable: bool
+    delay_frames: tuple[int | None, ...]
+    recalibration: str | None
+
+
+class ReferenceReply(msgspec.Struct, frozen=True, kw_only=True):
+    """``id`` with ``translation_m``, the angle between camera and gripper, and standard deviations (6,)."""
+
+    id: str
+    translation_m: tuple[float, float, float]
+    turn_rad: float
+    sigma: tuple[float, ...]
+    corners: int | None
+    weighted_rms: float | None
+    rival: bool
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
+    """What follows from corners put by hand."""
+
+    corners: tuple[CornerReply, ...]
+    outlines_px: dict[str, tuple[Place, ...]]
+    edge_points_px: tuple[Place, ...]
+    share: float
+    refused: str | None
+    jaw_opening_m: float | None
+    jaw_sigma_m: float | None
+    reference: ReferenceReply | None
+    no_reference: str | None
+    expected: Expectation | None
+
+
+class Saved(msgspec.Struct, frozen=True, kw_only=True):
+    """``refused``: why nothing was written; ``exists``: files in the way, nothing was written then either; else
+    ``written`` (path: what it is, in words), ``notes`` and the command that comes ``next``.
+    """
+
+    refused: str | None = None
+    exists: tuple[str, ...] = ()
+    written: dict[str, str] = {}
+    notes: tuple[str, ...] = ()
+    next: str | None = None
+
+
+class Failure(msgspec.Struct, frozen=True, kw_only=True):
+    error: str
+
+
+def encoded(image: Image, ending: str) -> bytes:
+    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
+    grey = image
+    if image.dtype != np.uint8:
+        low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()
+        grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1e-6)), 0.0, 255.0).astype(np.uint8)
+    _, data = cv2.imencode(ending, grey, [cv2.IMWRITE_JPEG_QUALITY, 85] if ending == ".jpg" else [])
+    return bytes(data.tobytes())

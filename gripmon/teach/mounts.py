@@ -1,0 +1,299 @@
+"""Camera mounts by numbers that a person with a drill can set (distance, tilt, side, roll), and what the monitor would
+see from each of a grid of them: before a hole is drilled.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gripmon.judge.drift import foresee
+from gripmon.judge.recalibrate import refusal
+from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
+from gripmon.monitor import CORNER_COUNTS
+from gripmon.teach.accuracy import AccuracyForecast, Promise, forecast_frame
+from gripmon.teach.visibility import Rig, Sight, border, moved_camera, see, sideways_m
+
+OPENINGS = 25
+"""Openings over the jaw's travel at which a mount's view is checked."""
+
+ACCURACY_OPENINGS = 3
+"""Of them those at which accuracy and shifts are computed, beside the usual one."""
+
+
+class Mount(NamedTuple):
+    """Where a camera is against the gripper.
+
+    ``distance_m`` from the camera's centre to the TCP.  ``tilt_rad`` (0 to pi) between the camera's optical axis and
+    the gripper's z axis: 0 looks along the fingers.  ``side_rad``: on which side of the gripper the camera sits,
+    counted about the gripper's z axis: 0 at -y, +pi/2 at +x; without tilt it has no meaning and is 0.  ``roll_rad``
+    about the optical axis: by how much the picture is turned clockwise.
+
+    The rotation is ``cam_R_grip = Rz(roll) Rx(tilt) Rz(-side)``.
+    """
+
+    distance_m: float
+    tilt_rad: float
+    side_rad: float
+    roll_rad: float
+
+    @classmethod
+    def of(cls, cam_T_grip: Array) -> Mount:
+        """The mount that a pose (4, 4) is; what it leaves out is where in the image the TCP shows."""
+        rotation = cam_T_grip[:3, :3]
+        tilt = math.atan2(math.hypot(rotation[2, 0], rotation[2, 1]), rotation[2, 2])
+        if math.sin(tilt) < 1e-6:
+            side, roll = 0.0, math.atan2(rotation[1, 0], rotation[0, 0])
+        else:
+            roll, tilt, turn = Rotation.from_matrix(rotation).as_euler("ZXZ")
+            side = -turn
+        return cls(float(np.linalg.norm(cam_T_grip[:3, 3])), float(tilt), float(side), float(roll))
+
+    def cam_T_grip(self, towards: Array) -> Array:
+        """The pose (4, 4) with the TCP in the direction ``towards`` (3,) of the camera frame."""
+        rotation = Rotation.from_euler("ZXZ", [self.roll_rad, self.tilt_rad, -self.side_rad]).as_matrix()
+        return make_transform(rotation, self.distance_m * towards / np.linalg.norm(towards))
+
+
+def towards(camera: Camera, uv_px: tuple[float, float]) -> Array:
+    """Direction (3,) in the camera frame of an image point.  ValueError where the lens maps nothing."""
+    xy = camera.undistort(np.array([uv_px], dtype=float))[0]
+    if not np.isfinite(xy).all():
+        raise ValueError(f"({uv_px[0]:g}, {uv_px[1]:g}) px: the lens maps nothing there; a point of the image")
+    direction = np.array([xy[0], xy[1], 1.0])
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def with_focal(camera: Camera, focal_px: float) -> Camera:
+    """The same sensor behind a lens of another focal length, without distortion: that of a lens that isn't calibrated
+    isn't known.  (A fisheye stays one: its ideal form has all coefficients zero.)  At the focal length that the camera
+    has it is the calibrated lens.  ValueError for an impossible focal length.
+    """
+    settings = camera.settings
+    if math.isclose(focal_px, settings.fx_px, rel_tol=1e-9):
+        return camera
+    changes: dict[str, object] = {"fx_px": focal_px, "fy_px": focal_px * settings.fy_px / settings.fx_px}
+    match settings:
+        case PaperLens():
+            changes["kappa_per_px2"] = 0.0
+        case BrownConradyLens() | FisheyeLens():
+            changes["coefficients"] = (0.0, 0.0, 0.0, 0.0)
+    other: LensSettings = msgspec.structs.replace(settings, **changes)
+    return make_camera(other)
+
+
+def field_of_view_rad(camera: Camera) -> float:
+    """The angle that the image's middle row spans, with the lens's distortion; NaN where the lens ends before."""
+    row = 0.5 * (camera.height_px - 1.0)
+    ends = camera.undistort(np.array([[0.0, row], [camera.width_px - 1.0, row]]))
+    left, right = np.column_stack([ends, np.ones(2)])
+    return math.atan2(float(np.linalg.norm(np.cross(left, right))), float(left @ right))
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """All combinations are tried.  ``rigs`` differ in their lens; ``towards`` (one for each): where the TCP shows."""
+
+    distances_m: tuple[float, ...]
+    tilts_rad: tuple[float, ...]
+    sides_rad: tuple[float, ...]
+    rolls_rad: tuple[float, ...]
+    rigs: tuple[Rig, ...]
+    towards: tuple[Array, ...]
+
+    def __len__(self) -> int:
+        axes = (self.distances_m, self.tilts_rad, self.sides_rad, self.rolls_rad, self.rigs)
+        return math.prod(map(len, axes))
+
+    def mounts(self) -> Iterator[tuple[Mount, int]]:
+        """Mount and number of its lens."""
+        lenses = range(len(self.rigs))
+        for k, *angles, distance_m in itertools.product(
+            lenses, self.rolls_rad, self.sides_rad, self.tilts_rad, self.distances_m
+        ):
+            yield Mount(distance_m, *reversed(angles)), k
+
+
+class Fault(NamedTuple):
+    """Why a mount would not work: ``kind`` in general, ``text`` with its numbers."""
+
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Measurable:
+    """Of a mount from which the monitor can measure at the usual opening, all there unless stated otherwise.
+
+    ``frame``: the accuracy of one.  ``worst_sigma_m``: standard deviation of the TCP along its least certain direction,
+    the largest at some openings, ``worst_at_m``.  ``promise`` of a frame; ``smallest`` (6,) steps that are noticed,
+    ``delay_frames`` for a step of the TCP by the policy's ``warn_m`` along the worst axis (None: never noticed);
+    ``margin_px`` of the visible corners from the border; ``shift_m`` that the camera may shift sideways until the
+    monitor can't measure, infinite for any.
+    """
+
+    frame: AccuracyForecast
+    worst_sigma_m: float
+    worst_at_m: float
+    promise: Promise
+    smallest: Array
+    delay_frames: int | None
+    margin_px: float
+    shift_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What the monitor would see from one mount.
+
+    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,) at ``openings_m`` (n,), ``share`` of these openings at
+    which the monitor can measure; ``measurable`` None where it can't at the usual one.  ``faults``: why this mount
+    would not work, the gravest first; none if it would.
+    """
+
+    mount: Mount
+    lens: int
+    cam_T_grip: Array
+    openings_m: Array
+    corners: NDArray[np.intp]
+    edges: NDArray[np.intp]
+    share: float
+    sight: Sight
+    measurable: Measurable | None
+    faults: tuple[Fault, ...]
+
+    @property
+    def works(self) -> bool:
+        return not self.faults
+
+    @property
+    def noticed_m(self) -> float:
+        """The smallest step of the TCP that is noticed along every axis; infinite where nothing can be measured."""
+        return float("inf") if self.measurable is None else float(self.measurable.smallest[:3].max())
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Smaller is better: first what works, then what has more of the jaw's travel, then what notices more."""
+        return (0.0, 0.0, self.noticed_m) if self.works else (1.0, -self.share, self.noticed_m)
+
+
+def try_mount(
+    rig: Rig,
+    mount: Mount,
+    lens: int,
+    cam_T_grip: Array,
+    jaw_opening_m: float | None,
+    travel_m: tuple[float, float] | None = None,
+) -> Trial:
+    """The view from one mount; ``jaw_opening_m`` is the usual one, None for a gripper without jaw.  ``travel_m``: the
+    jaw's travel that counts, all of it if None.
+    """
+    gripper = rig.gripper
+    usual_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+    low_m, high_m = travel_m or (gripper.jaw_min_m, gripper.jaw_max_m)
+    openings_m, chosen = np.array([usual_m]), []
+    if high_m > low_m:
+        openings_m = np.linspace(low_m, high_m, OPENINGS)
+        chosen = np.linspace(0, OPENINGS - 1, ACCURACY_OPENINGS).round().astype(int).tolist()
+    sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m.tolist()]
+    sight = see(rig, cam_T_grip, usual_m)
+    some_m = [float(openings_m[k]) for k in chosen if sights[k].enough]
+    measurable = _measurable(rig, cam_T_grip, usual_m, sight, some_m) if sight.enough else None
+    return Trial(
+        mount,
+        lens,
+        cam_T_grip,
+        openings_m,
+        np.array([s.corners for s in sights], dtype=np.intp),
+        np.array([s.edges for s in sights], dtype=np.intp),
+        float(np.mean([s.enough for s in sights])),
+        sight,
+        measurable,
+        (
+            *_too_little_in_view(openings_m, sights, sight),
+            *_after_a_shift(rig, cam_T_grip, [usual_m] * sight.enough + some_m),
+            *(() if measurable is None else _inexact(rig, measurable, usual_m)),
+        ),
+    )
+
+
+def tried(grid: Grid, jaw_opening_m: float | None, travel_m: tuple[float, float] | None = None) -> Iterator[Trial]:
+    """Every mount of a grid, one after the other."""
+    for mount, k in grid.mounts():
+        yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m, travel_m)
+
+
+def _measurable(rig: Rig, cam_T_grip: Array, usual_m: float, sight: Sight, openings_m: list[float]) -> Measurable:
+    """With the worst standard deviation of the usual and more ``openings_m``."""
+    policy = rig.settings.policy
+    frame, nearest = forecast_frame(rig, cam_T_grip, usual_m), border(rig, sight)
+    assert nearest is not None, "enough in view has corners in view"
+    each = [(usual_m, frame), *((m, forecast_frame(rig, cam_T_grip, m)) for m in openings_m)]
+    sigma_m, at_m = max((f.tcp_sigma_m, m) for m, f in each)
+    detectable = foresee(frame.covariance, rig.settings.drift)
+    delays = [detectable.delay_frames(policy.warn_m, axis) for axis in range(3)]
+    known = [d for d in delays if d is not None]
+    return Measurable(
+        frame,
+        sigma_m,
+        at_m,
+        Promise.of(frame.protection, policy),
+        detectable.smallest,
+        max(known) if len(known) == len(delays) else None,
+        nearest.smallest_px,
+        sideways_m(rig, cam_T_grip, usual_m),
+    )
+
+
+def _too_little_in_view(openings_m: Array, sights: list[Sight], sight: Sight) -> tuple[Fault, ...]:
+    failed = [k for k, s in enumerate(sights) if not s.enough]
+    if len(failed) == len(sights) and sight.reason is not None:
+        return (Fault("nowhere enough in view", f"nowhere enough to measure: {sight.reason}"),)
+    faults = []
+    if sight.reason is not None:
+        faults.append(Fault("too little in view at the usual opening", f"at the usual opening {sight.reason}"))
+    if failed:
+        first_mm, last_mm = 1e3 * openings_m[failed[0]], 1e3 * openings_m[failed[-1]]
+        what = "some of " if failed[-1] - failed[0] >= len(failed) else ""
+        where = f"{what}{first_mm:.1f} to {last_mm:.1f} mm" if len(failed) > 1 else f"{first_mm:.1f} mm"
+        text = f"at {where} of opening {sights[failed[len(failed) // 2]].reason}"
+        faults.append(Fault("too little in view in a part of the jaw's travel", text))
+    return tuple(faults)
+
+
+def _after_a_shift(rig: Rig, cam_T_grip: Array, openings_m: list[float]) -> tuple[Fault, ...]:
+    """Whether a camera that has shifted sideways by the policy's limit, either way, sees too little."""
+    limit_m = rig.settings.policy.limit_m
+    for axis in (*np.eye(6)[:2], *-np.eye(6)[:2]):
+        moved = moved_camera(cam_T_grip, limit_m * axis)
+        for opening_m in openings_m:
+            if (reason := see(rig, moved, opening_m).reason) is not None:
+                where = f"by {1e3 * limit_m:g} mm, at {1e3 * opening_m:.1f} mm of opening"
+                kind = "too little in view after a sideways shift that the policy allows"
+                return (Fault(kind, f"after a sideways shift of the camera {where}, {reason}"),)
+    return ()
+
+
+def _inexact(rig: Rig, found: Measurable, usual_m: float) -> tuple[Fault, ...]:
+    """Whether what is measured would never be valid, or leave no way back past the limit."""
+    faults, settings, gripper = [], rig.settings, rig.gripper
+    if not found.promise.reachable:
+        where = f" at {1e3 * usual_m:.1f} mm of opening" if gripper.has_jaw else ""
+        bound_mm = 1e3 * found.promise.protection.position_m
+        text = f"bound on the TCP's error {bound_mm:.2g} mm{where}: needs {found.promise.needed}"
+        faults.append(Fault("no transform would be valid: the bound on its error is above the alert limit", text))
+    if settings.recalibration.mode != "off":
+        taken = gripper.innermost_corners(found.frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
+        if (why := refusal(gripper.points_grip_m(None)[gripper.corner_points][taken])) is not None:
+            faults.append(Fault("its corners give no new pose past the limit", f"no new pose past the limit: {why}"))
+    return tuple(faults)

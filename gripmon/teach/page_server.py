@@ -1,0 +1,332 @@
+"""The page's web server: this machine only, and only for who knows the address with its token.
+
+A page of another site that is open in the same browser can send requests here, too, or have its name resolve to
+127.0.0.1 (DNS rebinding).  So every request must name this very host, carry the token in its path, and come from this
+page where the browser names an origin; no header allows other sites anything.
+
+By the standard library: with starlette and uvicorn these checks, which are most of this file, would stay the same, and
+five more packages would be installed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.resources
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from socketserver import TCPServer
+from typing import Any, TypeVar
+
+import msgspec
+
+from gripmon import __version__
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.model.atomic import write_atomically
+from gripmon.teach.api import Picture
+from gripmon.teach.messages import (
+    BadRequest,
+    Failure,
+    Nothing,
+    PictureInfo,
+    Place,
+    Put,
+    Reply,
+    Saved,
+    SaveOrder,
+    State,
+    encoded,
+)
+from gripmon.teach.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
+from gripmon.teach.session import TeachSession
+
+_log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+ADDRESS = "127.0.0.1"
+LONGEST_REQUEST = 1_000_000
+_SILENT_S = 30.0
+_TOKEN_BYTES = 24
+_FILES = {
+    "": ("index.html", "text/html; charset=utf-8"),
+    "style.css": ("style.css", "text/css; charset=utf-8"),
+    "icon.svg": ("icon.svg", "image/svg+xml"),
+    **{
+        name: (name, "text/javascript; charset=utf-8")
+        for name in ("main.js", "stage.js", "panel.js", "history.js", "server.js")
+    },
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class PageServer:
+    """Serves one session until it is done.  OSError from the constructor if the port is taken."""
+
+    def __init__(self, session: TeachSession | OutlineSession, port: int = 0):
+        self._http = _Http(session, port)
+        self.done, self.port, self.url = self._http.done, self._http.server_port, self._http.url
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-teach-page")
+        self._thread.start()
+
+    def close(self) -> None:
+        """No more requests are taken; may be called twice."""
+        self._http.shutdown()
+        self._http.server_close()
+        self._thread.join()
+
+
+class _Http(ThreadingHTTPServer):
+    """With what the handlers share."""
+
+    daemon_threads = True
+    request_queue_size = 32
+
+    def __init__(self, session: TeachSession | OutlineSession, port: int):
+        self.session, self.done = session, threading.Event()
+        self.token = secrets.token_urlsafe(_TOKEN_BYTES)
+        self.encode = msgspec.json.Encoder().encode
+        folder = importlib.resources.files("gripmon.teach") / "web"
+        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
+        super().__init__((ADDRESS, port), _Handler)
+        self.hosts = frozenset({f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"})
+        self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
+
+    def server_bind(self) -> None:
+        """Without the look-up of the host's name that the base class makes: it may take seconds."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = ADDRESS, int(self.server_address[1])
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away in the middle is nothing to report."""
+        _log.debug("request of %s failed", client_address, exc_info=True)
+
+
+class _Refused(Exception):
+    def __init__(self, status: HTTPStatus, text: str):
+        super().__init__(text)
+        self.status = status
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "gripmon", ""
+    timeout = _SILENT_S
+    server: _Http
+    _last = False
+
+    def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, act: Callable[[str], tuple[bytes, str]]) -> None:
+        """Every request ends with an answer in one line."""
+        status, kind = HTTPStatus.OK, "application/json"
+        try:
+            data, kind = act(self._checked_path())
+        except _Refused as refused:
+            status, data = refused.status, self._failure(str(refused))
+        except BadRequest as refused:
+            status, data = HTTPStatus.BAD_REQUEST, self._failure(str(refused))
+        except (ConnectionError, TimeoutError):
+            self.close_connection = True
+            return
+        except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
+            _log.debug("request failed", exc_info=True)
+            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(f"{type(error).__name__}: {error}")
+        if status is not HTTPStatus.OK:
+            self.close_connection = True  # what is left of its body is not read
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self._send(status, data, kind)
+        if self._last:
+            self.server.done.set()
+
+    def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def _failure(self, text: str) -> bytes:
+        return self.server.encode(Failure(error=" ".join(text.split())))
+
+    def _checked_path(self) -> str:
+        """What is asked for, below the token."""
+        server = self.server
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1 or hosts[0] not in server.hosts:
+            raise _Refused(HTTPStatus.FORBIDDEN, "this is not the host that was asked for")
+        origin = self.headers.get("Origin")
+        if origin is not None and origin not in {f"http://{host}" for host in server.hosts}:
+            raise _Refused(HTTPStatus.FORBIDDEN, "asked by another site")
+        _, _, path = self.path.partition("/")
+        token, slash, rest = path.partition("/")
+        if not slash or not secrets.compare_digest(token.encode(), server.token.encode()):
+            raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon teach printed")
+        return rest
+
+    def _get(self, path: str) -> tuple[bytes, str]:
+        server, session = self.server, self.server.session
+        if path in server.files:
+            return server.files[path]
+        if path == "state":
+            return server.encode(session.state()), "application/json"
+        if path.partition("?")[0] == "live.jpg":
+            return session.live(), "image/jpeg"
+        number = path.removeprefix("image/").removesuffix(".png")
+        if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
+            return session.still(int(number)), "image/png"
+        raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+
+    def _post(self, path: str) -> tuple[bytes, str]:
+        session = self.server.session
+        actions: dict[str, Callable[[], object]] = {
+            "look": lambda: session.look(self._body(Put)),
+            "take": lambda: self._body(Nothing) and session.take(),
+            "save": lambda: session.save(self._body(SaveOrder)),
+            "done": lambda: self._end(self._body(Nothing)),
+        }
+        if path not in actions:
+            raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+        return self.server.encode(actions[path]()), "application/json"
+
+    def _end(self, _order: Nothing) -> None:
+        """The process ends once this has been answered."""
+        self._last = self.close_connection = True
+
+    def _body(self, kind: type[_T]) -> _T:
+        if self.headers.get_content_type() != "application/json":
+            raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "application/json is understood")
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdecimal()):
+            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "a request states its length")
+        if len(length) > 9 or int(length) > LONGEST_REQUEST:
+            raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {LONGEST_REQUEST} bytes")
+        try:
+            return msgspec.json.decode(self.rfile.read(int(length)), type=kind)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise _Refused(HTTPStatus.BAD_REQUEST, f"not understood: {error}") from None
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """The token stands in every address: nothing of it goes to a log."""
+
+
+_NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)
+_COLUMNS = {"left": 0.06, "right": 0.8}
+
+
+class OutlineSession:
+    """As :class:`gripmon.teach.session.TeachSession`, without a gripper: one image, whose corners go to ``path``.
+
+    ``follows``: the command that reads that file, ``note``: a remark on it; ``saved``: what was last written,
+    None before.
+    """
+
+    def __init__(self, picture: Picture, path: Path, follows: str, note: str):
+        self._picture, self._path, self._follows, self._note = picture, path, follows, note
+        self._lock = threading.Lock()
+        self.saved: Saved | None = None
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def dark(self) -> tuple[float, str]:
+        """There is no camera that could show nothing."""
+        return 0.0, ""
+
+    def state(self) -> State:
+        height_px, width_px = self._picture.image.shape[:2]
+        return State(
+            version=__version__,
+            width_px=width_px,
+            height_px=height_px,
+            corners=_NAMES,
+            fingers={name: name.partition("_")[0] for name in _NAMES},
+            places=_columns(width_px, height_px),
+            pictures=(PictureInfo(number=0, name=self._picture.name, jaw_opening_m=None),),
+            live=None,
+            has_jaw=False,
+            jaw_m=(0.0, 0.0, 0.0),
+            gripper="no gripper file yet",
+            reference=None,
+            needed=2 * len(INNERMOST),
+            robot="robot",  # neither name is asked for, nor written
+            camera_name="camera",
+            fixed_names=True,
+            folder=str(self._path.parent.resolve()),
+            files={"corners": str(self._path), "config": "", "taught": ""},
+            corners_only=True,
+        )
+
+    def look(self, put: Put) -> Reply:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("nothing snaps without a gripper file; corners are put and saved")
+
+    def take(self) -> tuple[PictureInfo, ...]:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("there is no live camera here")
+
+    def live(self) -> bytes:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("there is no live camera here")
+
+    def still(self, number: int) -> bytes:
+        """The image as PNG.  Raises :class:`BadRequest`."""
+        if number != 0:
+            raise BadRequest(f"there is no image {number}; 1 is there")
+        return encoded(self._picture.image, ".png")
+
+    def save(self, order: SaveOrder) -> Saved:
+        """Write the corners that were put, if ``calibrate plane --infer`` can use them; else say why not."""
+        corners = order.put.corners
+        try:
+            outlines_of(corners)
+        except CalibrationError as error:
+            return Saved(refused=str(error))
+        with self._lock:
+            if self._path.exists() and not order.replace:
+                return Saved(exists=(str(self._path),))
+            try:
+                write_atomically(self._path, self._text(corners).encode())
+            except OSError as error:
+                return Saved(refused=f"{self._path}: can't be written ({error.strerror or error})")
+            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(self._note,), next=self._follows)
+            return self.saved
+
+    def _text(self, corners: Mapping[str, Place]) -> str:
+        image = " ".join(ascii(self._picture.name)[1:-1].split())
+        lines = [
+            f"# Rough fingertip corners in {image}, put by hand (gripmon teach --page, gripmon {__version__})",
+            "# For gripmon calibrate plane --infer --corners; name: [column, row] in the image (px)",
+            "corners:",
+        ]
+        lines += [f"  {name}: [{corners[name][0]:.2f}, {corners[name][1]:.2f}]" for name in _NAMES if name in corners]
+        return "\n".join(lines) + "\n"
+
+
+def _columns(width_px: int, height_px: int) -> dict[str, Place | None]:
+    """Where the handles wait: a column for each finger, in the order of its outline."""
+    order = [f"{point}_near" for point in reversed(POINTS)] + [f"{point}_far" for point in POINTS]
+    return {
+        f"{finger}_{point}": (round(share * width_px, 1), round((k + 0.7) / (len(order) + 0.8) * height_px, 1))
+        for finger, share in _COLUMNS.items()
+        for k, point in enumerate(order)
+    }

@@ -1,0 +1,400 @@
+"""One gripper before one camera while a person teaches it: images, corners put by hand, what follows from them down to
+the accuracy to expect, and the session behind the page's requests.  Nothing here knows HTTP.
+
+Corners put by hand stay with the page, so that two pages that are open don't disturb each other; images that were
+taken from a live camera belong to all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+
+from gripmon import __version__
+from gripmon.io.sources import Source, Waiting
+from gripmon.judge.drift import foresee
+from gripmon.judge.inspection import inspect
+from gripmon.judge.recalibrate import refusal
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record, rotation_angle, to_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.monitor import CORNER_COUNTS, MonitorSettings
+from gripmon.teach.accuracy import Promise, forecast_accuracy
+from gripmon.teach.api import Picture
+from gripmon.teach.corner_pose import (
+    CameraError,
+    CornerPose,
+    PoseRefused,
+    Prior,
+    Snapped,
+    SnappedCorner,
+    corners_fault,
+    place,
+    pose_from_corners,
+    prior_of,
+    usual_view,
+)
+from gripmon.teach.measure import Taught, teach
+from gripmon.teach.messages import (
+    BadRequest,
+    CornerReply,
+    Expectation,
+    PictureInfo,
+    Place,
+    Put,
+    ReferenceReply,
+    Reply,
+    Saved,
+    SaveOrder,
+    SavingRefused,
+    State,
+    encoded,
+)
+from gripmon.teach.snapping import FEWEST_PUT, Snapper
+from gripmon.teach.views import TeachingImage, TeachingRefused
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtEdges
+
+_MOST_PICTURES = 50
+_LIVE_WAIT_S = 10.0
+_STEP_M = 1e-4  # of the TCP, for which the delay is given
+
+
+class Evaluation(NamedTuple):
+    """Everything that follows from corners put by hand in one image: the reference that it gives (or is known), None
+    with a reason in words; ``expected`` None where too few edges are in view to measure anything.
+    """
+
+    snapped: Snapped
+    pose: CornerPose | None
+    reference: ReferenceRecord | None
+    no_reference: str | None
+    expected: Expectation | None
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is known before teaching; ``reference`` None before the hand/eye calibration."""
+
+    camera: Camera
+    gripper: Gripper
+    settings: MonitorSettings
+    reference: ReferenceRecord | None
+    camera_error: CameraError | None = None
+
+    def prior(self, jaw_opening_m: float | None) -> Prior:
+        """Where the gripper is before any corner is put."""
+        if self.reference is not None:
+            return prior_of(self.reference)
+        return usual_view(self.camera, self.gripper, jaw_opening_m)
+
+    def first_places(self, jaw_opening_m: float | None) -> dict[str, Array]:
+        """Where a person finds the corners before any is put, px."""
+        here = place(self.camera, self.gripper, jaw_opening_m, {}, self.prior(jaw_opening_m))[0].cam_T_grip
+        points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]
+        uv_px = self.camera.project(points_m @ here[:3, :3].T + here[:3, 3])
+        return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
+
+    def evaluate(
+        self, image: Image, put_px: Mapping[str, Array], by_hand: Sequence[str], jaw_opening_m: float | None
+    ) -> Evaluation:
+        """Snap, then the reference, then what may be expected.
+
+        ``put_px`` (name: (2,)): corners put by hand; those of them that are ``by_hand`` count as they stand, the others
+        are only where the search begins.
+        """
+        known = self.reference is not None
+        snapper = Snapper(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m)
+        snapped = snapper.snap(image, put_px, jaw_opening_m, self.prior(jaw_opening_m), known)
+        pose, reference, why, expected = None, self.reference, None, None
+        if reference is None:
+            try:
+                fixed = {name: put_px[name] for name in by_hand if name in put_px}
+                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error)
+                reference = _reference_of(pose)
+            except PoseRefused as refused:
+                why = str(refused)
+        if reference is not None:
+            expected = self._expected(image, reference, snapped.jaw_opening_m)
+        return Evaluation(snapped, pose, reference, why, expected)
+
+    def _expected(self, image: Image, reference: ReferenceRecord, jaw_opening_m: float | None) -> Expectation | None:
+        """The numbers that ``gripmon check`` prints, with what this image alone would teach."""
+        gripper, settings, taught = self.gripper, self.settings, None
+        opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+        with contextlib.suppress(TeachingRefused):
+            taught = self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
+        frame = forecast_accuracy(self.camera, gripper, settings, reference, jaw_opening_m, taught)
+        if not frame.enough:
+            return None
+        detectable = foresee(frame.covariance, settings.drift)
+        taken = gripper.innermost_corners(frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
+        promise = Promise.of(frame.protection, settings.policy)
+        return Expectation(
+            edges=frame.edges,
+            sigma=tuple(frame.sigma.tolist()),
+            weakest=tuple(frame.weakest.tolist()),
+            smallest=tuple(detectable.smallest.tolist()),
+            promise=promise.text(),
+            reachable=promise.reachable,
+            delay_frames=tuple(detectable.delay_frames(_STEP_M, axis) for axis in range(3)),
+            recalibration=refusal(gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]),
+        )
+
+    def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
+        """What the images show of every edge.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
+        found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
+        opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
+        return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
+
+
+def _reference_of(pose: CornerPose) -> ReferenceRecord:
+    """A pose by corners as the reference; numbers as a file holds them."""
+    transform = to_record(pose.cam_T_grip)
+    rounded = msgspec.structs.replace(
+        transform,
+        translation_m=tuple(round(v, 9) for v in transform.translation_m),
+        rotation_xyzw=tuple(round(v, 10) for v in transform.rotation_xyzw),
+    )
+    digest = hashlib.sha256(msgspec.json.encode(rounded)).hexdigest()[:8]
+    flat = tuple(float(f"{v:.6e}") for v in pose.covariance.ravel().tolist())
+    return ReferenceRecord(f"corners-{digest}", 0, 0, "configuration", rounded, flat)
+
+
+class Saving(Protocol):
+    """Writes what was taught."""
+
+    def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
+        """Raises :class:`SavingRefused`; a file in the way is reported, not replaced, unless that was agreed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the page shows beside the image."""
+
+    robot: str
+    camera_name: str
+    fixed_names: bool
+    folder: str
+    files: dict[str, str]
+    reference: str | None
+    live: str | None
+
+
+class TeachSession:
+    """Images, corners and files of one person's teaching; every method may be called from any thread."""
+
+    def __init__(
+        self, setup: Setup, pictures: Sequence[Picture], labels: Labels, saving: Saving, live: Source | None = None
+    ):
+        self._setup, self._labels, self._saving, self._live = setup, labels, saving, live
+        self._pictures = list(pictures)
+        self._newest: Picture | None = None
+        self._why_dark: str | None = None
+        self._seen_s = time.monotonic()
+        self._lock = threading.Lock()  # one computes at a time: OpenCV and NumPy would only hinder each other
+        self._arrived = threading.Condition()
+        self._ended = False
+        self._reader: threading.Thread | None = None
+        if live is not None:
+            self._reader = threading.Thread(target=self._read, args=(live,), name="gripmon-teach-camera", daemon=True)
+            self._reader.start()
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        with self._arrived:
+            self._ended = True
+            self._arrived.notify_all()
+        if self._live is not None:
+            self._live.close()
+        if self._reader is not None:
+            self._reader.join(10.0)
+
+    def state(self) -> State:
+        setup, gripper, labels = self._setup, self._setup.gripper, self._labels
+        opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
+        finger = gripper.point_finger[gripper.corner_points].tolist()
+        return State(
+            version=__version__,
+            width_px=setup.camera.width_px,
+            height_px=setup.camera.height_px,
+            corners=gripper.corner_ids,
+            fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
+            places={name: _place(at) for name, at in setup.first_places(opening_m).items()},
+            pictures=self._infos(),
+            live=labels.live,
+            has_jaw=gripper.has_jaw,
+            jaw_m=(gripper.jaw_min_m, gripper.jaw_nominal_m, gripper.jaw_max_m),
+            gripper=gripper.name,
+            reference=labels.reference,
+            needed=0 if setup.reference is not None else FEWEST_PUT,
+            robot=labels.robot,
+            camera_name=labels.camera_name,
+            fixed_names=labels.fixed_names,
+            folder=labels.folder,
+            files=labels.files,
+        )
+
+    def look(self, put: Put) -> Reply:
+        """Snap.  Raises :class:`BadRequest`."""
+        return reply(self._evaluated(put, self._picture(put.image)))
+
+    def take(self) -> tuple[PictureInfo, ...]:
+        """Keep the live image.  Raises :class:`BadRequest`."""
+        picture = self._picture(None)
+        with self._arrived:
+            if len(self._pictures) >= _MOST_PICTURES:
+                raise BadRequest(f"{_MOST_PICTURES} images are enough")
+            name = f"live-{len(self._pictures):03d}.png"
+            self._pictures.append(Picture(name, picture.image, picture.jaw_opening_m, None))
+        return self._infos()
+
+    def save(self, order: SaveOrder) -> Saved:
+        """Write what was taught, or say why not.  Raises :class:`BadRequest`."""
+        if not self._pictures:
+            self.take()
+        number = order.put.image if order.put.image is not None else len(self._pictures) - 1
+        found = self._evaluated(order.put, self._picture(number))
+        with self._lock:
+            try:
+                return self._saving.save(order, found, number, tuple(self._pictures))
+            except SavingRefused as refused:
+                return Saved(refused=str(refused))
+
+    def still(self, number: int) -> bytes:
+        """An image as PNG.  Raises :class:`BadRequest`."""
+        return encoded(self._picture(number).image, ".png")
+
+    def live(self) -> bytes:
+        """The live image as JPEG.  Raises :class:`BadRequest`."""
+        return encoded(self._picture(None).image, ".jpg")
+
+    def dark(self) -> tuple[float, str]:
+        """For how long the live camera has shown nothing that can be used (s), and why; 0 without one."""
+        with self._arrived:
+            if self._live is None or self._newest is not None:
+                return 0.0, ""
+            return time.monotonic() - self._seen_s, self._why_dark or "the camera has sent nothing yet"
+
+    def _evaluated(self, put: Put, picture: Picture) -> Evaluation:
+        gripper = self._setup.gripper
+        fault = corners_fault(put.corners, gripper)
+        if fault is not None:
+            raise BadRequest("{}: {}; {}".format(*fault))
+        opening_m = put.jaw_opening_m if gripper.has_jaw else None
+        if opening_m is not None and not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+            low_mm, high_mm = 1e3 * gripper.jaw_min_m, 1e3 * gripper.jaw_max_m
+            raise BadRequest(f"jaw opening {1e3 * opening_m:g} mm; the gripper's {low_mm:g} to {high_mm:g} mm")
+        corners = {name: np.array(at) for name, at in put.corners.items()}
+        with self._lock:
+            return self._setup.evaluate(picture.image, corners, put.by_hand, opening_m)
+
+    def _picture(self, number: int | None) -> Picture:
+        if number is not None:
+            if number >= len(self._pictures):
+                raise BadRequest(f"there is no image {number}; {len(self._pictures)} are there")
+            return self._pictures[number]
+        if self._live is None:
+            raise BadRequest("there is no live camera here; the number of an image")
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._newest or self._why_dark or self._ended, _LIVE_WAIT_S)
+            if self._newest is None:
+                raise BadRequest(self._why_dark or "the camera has sent nothing yet")
+            return self._newest
+
+    def _infos(self) -> tuple[PictureInfo, ...]:
+        return tuple(
+            PictureInfo(number=number, name=picture.name, jaw_opening_m=picture.jaw_opening_m)
+            for number, picture in enumerate(self._pictures)
+        )
+
+    def _read(self, live: Source) -> None:
+        while not self._ended:
+            try:
+                frame = live.read()
+            except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
+                frame = Waiting(f"{self._labels.live}: {error}; start gripmon teach again")
+                self._ended = True
+            if frame is None:
+                break
+            with self._arrived:
+                # An old image would look like a camera that stands still.
+                self._newest = None
+                if isinstance(frame, Waiting):
+                    self._why_dark = frame.reason
+                else:
+                    self._newest = self._usable(frame)
+                if self._newest is not None:
+                    self._seen_s = time.monotonic()
+                self._arrived.notify_all()
+
+    def _usable(self, frame: Frame) -> Picture | None:
+        frame = in_full_scale(frame, self._setup.settings.bit_depth)
+        fault = inspect(frame, self._setup.camera, self._setup.gripper)
+        self._why_dark = None if fault is None else f"{self._labels.live}: {fault[1]}"
+        if fault is not None:
+            return None
+        assert frame.image is not None
+        return Picture("live", frame.image, frame.jaw_opening_m, None)
+
+
+def reply(found: Evaluation) -> Reply:
+    """As JSON has it."""
+    snapped = found.snapped
+    return Reply(
+        corners=tuple(_corner(corner) for corner in snapped.corners),
+        outlines_px={name: _places(line) for name, line in snapped.outlines_px.items()},
+        edge_points_px=_places(snapped.edge_points_px),
+        share=snapped.share,
+        refused=snapped.refused,
+        jaw_opening_m=snapped.jaw_opening_m,
+        jaw_sigma_m=snapped.jaw_sigma_m,
+        reference=None if found.reference is None else _reference_reply(found.reference, found.pose),
+        no_reference=found.no_reference,
+        expected=found.expected,
+    )
+
+
+def _reference_reply(reference: ReferenceRecord, pose: CornerPose | None) -> ReferenceReply:
+    return ReferenceReply(
+        id=reference.reference_id,
+        translation_m=reference.cam_T_grip.translation_m,
+        turn_rad=rotation_angle(from_record(reference.cam_T_grip)[:3, :3]),
+        sigma=tuple(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()).tolist()),
+        corners=None if pose is None else len(pose.corners),
+        weighted_rms=None if pose is None else pose.weighted_rms,
+        rival=pose is not None and pose.rival,
+    )
+
+
+def _corner(corner: SnappedCorner) -> CornerReply:
+    covariance = None if corner.covariance_px is None else corner.covariance_px.ravel().tolist()
+    return CornerReply(
+        name=corner.name,
+        model_px=_place(corner.model_px),
+        uv_px=None if corner.uv_px is None else _place(corner.uv_px),
+        covariance_px2=None if covariance is None else (covariance[0], covariance[1], covariance[3]),
+        sigma_px=corner.sigma_px,
+        inliers=corner.inliers,
+        reason=corner.reason,
+    )
+
+
+def _place(at: Array) -> Place | None:
+    u, v = np.asarray(at, dtype=float).tolist()
+    return (round(u, 4), round(v, 4)) if np.isfinite(at).all() else None
+
+
+def _places(points: Array) -> tuple[Place, ...]:
+    return tuple((u, v) for u, v in np.round(points, 3).tolist())

@@ -1,0 +1,294 @@
+"""From corners put by hand to the edges and corners that the image really shows, with what is wrong where it isn't.
+
+The corners are only rough; many poses that agree with them are tried, coarsely first, and what is
+measured at the best one is what the monitor itself would measure there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturb
+from gripmon.model.gripper import Gripper, on_a_line
+from gripmon.model.records import Array, CornerFault, Image
+from gripmon.teach.corner_pose import Placed, Prior, Snapped, SnappedCorner, place, rough_sigma_px
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.settling import ZOOMS, Expected
+
+FEWEST_PUT = 4
+"""Corners that must be put by hand before edges are looked for, where there is no reference."""
+
+SURE_SHARE = 0.8
+"""Share of agreeing profiles from which no other pose is tried."""
+
+FARTHEST_SIGMAS = 6.0
+"""How far the gripper may show from the corners put by hand, in their standard deviations (root mean square)."""
+
+MISFIT_SIGMAS = (4.0, 12.0)
+"""Distance of a corner from where all together put it, in its standard deviations: from which it is named where nothing
+is found, and from which it must have another one's name.
+"""
+
+CLEARLY = 1.25
+"""How many times more has to agree with mirrored corners before they are reported as exchanged."""
+
+_SPREAD = 24  # poses about that of the corners
+_KEPT = (6, 3)  # of them, that are followed to the next finer zoom
+_USUAL_SHARE = 0.6
+_OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; the gain in χ² from which another is taken
+_ALIKE = 0.25  # of the smallest distance between two corners
+_NARROW = Patience(when_doubtful=False, when_lost=False)
+
+ON_A_LINE = (
+    "the corners lie on a line, which leaves open how the gripper is turned about it; one more beside it, or "
+    "a calibration of hand and eye (--reference FILE)"
+)
+MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
+NOTHING_SEEN = "no fingers are seen here; corners nearer to the tips"
+"""Why nothing was found, and what would help."""
+
+REASONS = {
+    CornerFault.OUTSIDE: "outside of the image",
+    CornerFault.SELF_HIDDEN: "hidden by its own finger",
+    CornerFault.FEW_POINTS: "fewer than two edges in view",
+    CornerFault.HIDDEN: "its edges aren't visible close to it",
+    CornerFault.PARALLEL: "its edges are nearly parallel",
+    CornerFault.UNCERTAIN: "too uncertain",
+    CornerFault.NO_FIT: "no edges found",
+}
+
+
+class Snapper:
+    """Finds one gripper in the images of one camera from corners put by hand."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
+        self.camera, self.gripper, self._settings, self._jaw_sigma_m = camera, gripper, settings, jaw_sigma_m
+
+    def snap(
+        self, image: Image, put_px: Mapping[str, Array], jaw_opening_m: float | None, prior: Prior, known: bool
+    ) -> Snapped:
+        """Look for the gripper.
+
+        ``put_px`` (name: (2,)) the corners put by hand; ``jaw_opening_m`` None where it isn't reported; ``known``: the
+        prior is a calibration, so that no corner need be put.  Never raises for what the image shows or doesn't.
+        """
+        start_m = self._opening(put_px, prior) if jaw_opening_m is None else jaw_opening_m
+        placed = place(self.camera, self.gripper, start_m, put_px, prior)
+        if not known and len(put_px) < FEWEST_PUT:
+            left = FEWEST_PUT - len(put_px)
+            return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
+        if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
+            return self._rough(placed[0], start_m, misfit)
+        # Only the edges can show how the gripper is turned about such a line; where they don't, that is why.
+        line = None if known or not self._on_a_line(put_px) else ON_A_LINE
+        found = self._found(image, placed, start_m, jaw_opening_m is not None)
+        if not known and self._mirrored_fits(image, put_px, start_m, jaw_opening_m is not None, prior, found):
+            return self._rough(placed[0], start_m, line or MIRRORED)
+        if found is None or not found.trusted:
+            why = self._misfit(placed[0], MISFIT_SIGMAS[0]) or line or NOTHING_SEEN
+            return self._rough(placed[0], start_m, why)
+        away_px = self._away_px(found, put_px)
+        if away_px > FARTHEST_SIGMAS * rough_sigma_px(self.camera):
+            far = f"{away_px:.0f} px from your corners" if np.isfinite(away_px) else "out of the lens's view"
+            why = f"the edges found lie {far}; corners nearer to the fingertips"
+            return self._rough(placed[0], start_m, line or why)
+        return self._measured(found, jaw_opening_m)
+
+    def _found(
+        self, image: Image, placed: Sequence[Placed], jaw_opening_m: float, reported: bool
+    ) -> Measurement | None:
+        """The best of what is measured from each of the poses."""
+        best: Measurement | None = None
+        for pose in placed[:2]:
+            if reported and best is None:
+                best = self._measure(image, pose.cam_T_grip, jaw_opening_m, reported)
+                if best.consensus.share >= SURE_SHARE:
+                    return best
+            meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
+            near = meter.followed(image, pose, jaw_opening_m, reported)
+            tried = self._measure(image, near.cam_T_grip, near.jaw_opening_m, reported)
+            if best is None or _worth(tried) > _worth(best):
+                best = tried
+            if best.consensus.share >= SURE_SHARE:
+                break
+        return best
+
+    def _opening(self, put_px: Mapping[str, Array], prior: Prior) -> float:
+        """The jaw opening that the corners put by hand fit best, where it differs clearly from the nominal one."""
+        gripper = self.gripper
+        if not gripper.has_jaw or len(put_px) < FEWEST_PUT:
+            return gripper.jaw_nominal_m
+        tried = [gripper.jaw_nominal_m, *np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, _OPENINGS).tolist()]
+        costs = [place(self.camera, gripper, opening_m, put_px, prior)[0].cost for opening_m in tried]
+        best = int(np.argmin(costs))
+        return tried[best] if costs[best] < costs[0] - _OPENING_CHI2 else tried[0]
+
+    def _mirrored_fits(
+        self,
+        image: Image,
+        put_px: Mapping[str, Array],
+        opening_m: float,
+        reported: bool,
+        prior: Prior,
+        found: Measurement | None,
+    ) -> bool:
+        """Whether clearly more agrees with the corners of both fingers exchanged: four corners in a plane also have a
+        pose that sees them from behind.
+        """
+        worth = 0.0 if found is None else _worth(found)
+        twins = _twins(self.gripper, opening_m)
+        if worth >= SURE_SHARE or twins is None:
+            return False
+        placed = place(self.camera, self.gripper, opening_m, {twins[name]: at for name, at in put_px.items()}, prior)
+        if self._misfit(placed[0], MISFIT_SIGMAS[0]) is not None:
+            return False
+        other = self._found(image, placed, opening_m, reported)
+        return other is not None and other.trusted and _worth(other) > CLEARLY * worth
+
+    def _measure(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, reported: bool) -> Measurement:
+        meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
+        return meter.measure(image, cam_T_grip, jaw_opening_m, _USUAL_SHARE, _NARROW, reported)
+
+    def _misfit(self, placed: Placed, sigmas: float) -> str | None:
+        """The corner that fits the others least, in words, where it is farther from them than that."""
+        name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
+        if away_px <= sigmas * rough_sigma_px(self.camera):
+            return None
+        beside = f"{away_px:.0f} px from where the others put it"
+        where = beside if np.isfinite(away_px) else "put out of the lens's view by the others"
+        return f"{name} is {where}; another corner, or another jaw opening?"
+
+    def _on_a_line(self, put_px: Mapping[str, Array]) -> bool:
+        """Whether the corners put by hand lie on one line of the gripper."""
+        put = [name in put_px for name in self.gripper.corner_ids]
+        return on_a_line(self.gripper.points_grip_m()[self.gripper.corner_points[put]])
+
+    def _away_px(self, found: Measurement, put_px: Mapping[str, Array]) -> float:
+        """Root mean square distance between the corners put by hand and where the measured gripper has them; infinite
+        where the lens maps one of them nowhere.
+        """
+        if not put_px:
+            return 0.0
+        model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m)
+        apart = [model_px[name] - np.asarray(at) for name, at in put_px.items()]
+        return float(np.nan_to_num(np.sqrt(np.mean(np.square(apart).sum(axis=1))), nan=np.inf))
+
+    def _corners_px(self, cam_T_grip: Array, jaw_opening_m: float | None) -> dict[str, Array]:
+        points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]
+        uv_px = self.camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+        return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
+
+    def _rough(self, placed: Placed, opening_m: float, why: str) -> Snapped:
+        pose = placed.cam_T_grip
+        corners = tuple(
+            SnappedCorner(name, at, None, None, None, None, REASONS[CornerFault.NO_FIT])
+            for name, at in self._corners_px(pose, opening_m).items()
+        )
+        known_m = opening_m if self.gripper.has_jaw else None
+        outlines = outlines_px(self.camera, self.gripper, pose, opening_m)
+        return Snapped(pose, corners, outlines, np.zeros((0, 2)), 0.0, known_m, None, why, None)
+
+    def _measured(self, found: Measurement, jaw_opening_m: float | None) -> Snapped:
+        gripper = self.gripper
+        has_jaw = gripper.has_jaw
+        opening_m = found.jaw_opening_m if jaw_opening_m is None else jaw_opening_m
+        jaw_sigma_m = self._jaw_sigma_m
+        if has_jaw and jaw_opening_m is None:
+            jaw_sigma_m = float(np.sqrt(found.covariance[6, 6]))
+        model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m if has_jaw else None)
+        corners = tuple(
+            self._corner(found, index, name, model_px[name]) for index, name in enumerate(gripper.corner_ids)
+        )
+        sample = found.candidates.sample[found.consensus.weight > 0.0]
+        offset_px = found.candidates.offset_px[found.consensus.weight > 0.0]
+        prediction = found.prediction
+        return Snapped(
+            found.cam_T_grip,
+            corners,
+            outlines_px(self.camera, gripper, found.cam_T_grip, found.jaw_opening_m),
+            prediction.uv_px[sample] + offset_px[:, None] * prediction.normal[sample],
+            found.consensus.share,
+            opening_m if has_jaw else None,
+            jaw_sigma_m if has_jaw else None,
+            None,
+            found,
+        )
+
+    def _corner(self, found: Measurement, index: int, name: str, model_px: Array) -> SnappedCorner:
+        corners, consensus, layout = found.corners, found.consensus, found.prediction.layout
+        mine = np.isin(layout.edge, self.gripper.edges_at_corner(index)) & found.prediction.ok
+        inliers = float(consensus.supported[mine].mean()) if mine.any() else None
+        fault = corners.fault[index]
+        if fault is not None:
+            return SnappedCorner(name, model_px, None, None, None, inliers, REASONS.get(fault, fault.value))
+        lens = found.prediction.corners.d_uv_d_xy[index]
+        covariance_px = lens @ corners.covariance_xy[index] @ lens.T
+        sigma_px = float(corners.sigma_px[index])
+        return SnappedCorner(name, model_px, corners.uv_px[index], covariance_px, sigma_px, inliers, None)
+
+
+def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | None:
+    """Each corner's counterpart on the other finger; None where the fingers aren't each other's mirror image."""
+    at = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
+    apart = np.linalg.norm(at[:, None] * [-1.0, 1.0, 1.0] - at, axis=2)
+    nearest = apart.argmin(axis=1)
+    between = np.linalg.norm(at[:, None] - at, axis=2) + np.where(np.eye(len(at)), np.inf, 0.0)
+    if apart.min(axis=1).max() > _ALIKE * between.min() or (nearest[nearest] != np.arange(len(at))).any():
+        return None
+    names = gripper.corner_ids
+    return {name: names[twin] for name, twin in zip(names, nearest.tolist(), strict=True)}
+
+
+def outlines_px(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None, points: int = 17
+) -> dict[str, Array]:
+    """Where the visible edges show: name: (points, 2), px, without those that the lens maps nowhere."""
+    points_m = gripper.points_grip_m(jaw_opening_m)
+    eye_m = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
+    way = np.linspace(0.0, 1.0, points)[:, None]
+    out = {}
+    for edge in np.flatnonzero(gripper.edge_view(points_m, eye_m).visible).tolist():
+        start, end = points_m[gripper.edge_points[edge]]
+        line_m = start + way * (end - start)
+        uv_px = camera.project(line_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+        if np.isfinite(uv_px).all(axis=1).sum() > 1:
+            out[gripper.edge_ids[edge]] = uv_px[np.isfinite(uv_px).all(axis=1)]
+    return out
+
+
+def _worth(measurement: Measurement) -> float:
+    """What agrees, by how many edges it is spread over: one finger alone can agree anywhere along itself."""
+    edges = measurement.prediction.layout.edges
+    seen = np.count_nonzero(measurement.consensus.edge_seen[edges]) / max(len(edges), 1)
+    return measurement.consensus.share * seen * (1.0 if measurement.trusted else 0.5)
+
+
+class _Meter(FingertipMeter):
+    """Tries many poses, with a coarse zoom first: its profiles reach farther."""
+
+    def followed(self, image: Image, placed: Placed, jaw_opening_m: float, reported: bool) -> Expected:
+        """The most promising pose among those that the corners put by hand allow."""
+        self._prior = self._prior_reported if reported else self._prior_unreported
+        root = np.linalg.cholesky(placed.covariance)
+        poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_SPREAD)]
+        starts = [Expected(pose, jaw_opening_m, jaw_opening_m) for pose in poses if pose[2, 3] > 0.0]
+        for zoom, kept in zip((ZOOMS[2], ZOOMS[1]), _KEPT, strict=True):
+            self._zoom_to(zoom)
+            places = sorted((self._tried(image, start) for start in starts), key=lambda at: -at.share)
+            starts = [at.expected for at in places[:kept]]
+        self._zoom_to(ZOOMS[0])
+        return max((self._tried(image, start) for start in starts), key=lambda at: at.share).expected
+
+
+def _spread(count: int) -> Array:
+    """(count, 6) standard normal offsets without gaps or clusters, the first one zero."""
+    from scipy.stats import norm, qmc
+
+    # Fixed: the same corners give the same answer.
+    points = qmc.Halton(6, scramble=False).random(count + 1)[1:]
+    offsets = norm.ppf(points)
+    offsets[0] = 0.0
+    return np.asarray(offsets, dtype=float)

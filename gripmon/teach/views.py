@@ -1,0 +1,277 @@
+"""One teaching image against the reference: whether the gripper is there, and the edge candidates beside its edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
+from gripmon.model.records import Array, Image, ReferenceRecord
+from gripmon.teach.lines import EdgePoints
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import FingertipMeter, Measurement, Patience
+from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
+from gripmon.track.edges.profiles import (
+    Candidates,
+    estimate_noise,
+    find_candidates,
+    full_scale,
+    profile_offsets_px,
+    quantum,
+    read_profiles,
+)
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
+
+USUAL_SHARE = 0.6
+"""Share of agreeing profiles that is expected: before clutter, or with bevels, fewer agree than in quiet images."""
+
+_CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is searched for elsewhere
+_DENSE = 4096  # profiles: as many as there are pixels along the edges
+_EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
+_NARROW = Patience(when_doubtful=False, when_lost=False)
+
+
+class TeachingRefused(ValueError):
+    """These images can't be taught from; the text is ``what is wrong; what would be right``."""
+
+
+class ImageRefused(TeachingRefused):
+    """This image can't be taught from; others may."""
+
+    def __init__(self, image: TeachingImage, why: str):
+        super().__init__(f"{image.name}: {why}")
+        self.image = image
+
+
+@dataclass(frozen=True, slots=True)
+class TeachingImage:
+    """An image at the reference, and the jaw opening that was reported for it (the nominal one without jaw)."""
+
+    image: Image
+    jaw_opening_m: float
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One image, sampled along all edges in view, with their predictions at the reference.
+
+    ``prediction`` from where it was sampled, with its ``profiles`` (n, s) in grey levels and edge ``candidates``;
+    ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m`` (k,) how far each
+    candidate lies from there across the line of sight, ``expected_m`` (n,) how far the samples do, ``per_m`` (n,) how
+    many px a metre is.
+    """
+
+    image: TeachingImage
+    prediction: Prediction
+    profiles: NDArray[np.float32]
+    candidates: Candidates
+    at_reference: Prediction
+    offset_m: Array
+    expected_m: Array
+    per_m: Array
+
+
+class Viewer:
+    """Measures teaching images with one camera, gripper and reference.
+
+    ``crease`` (e,) which edges lie between two visible faces at the reference, ``inside`` (e,) on which side of an edge
+    its finger lies (1: to the right of somebody who walks along it, -1: to the left), ``turned`` (i, e) by what angle
+    the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold (rad).
+    """
+
+    def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
+        self.rig, self.gripper, gripper = rig, rig.gripper, rig.gripper
+        sampling, self._jaw_sigma_m = rig.settings.corners.sampling, rig.settings.jaw_sigma_m
+        self.ref_cam_T_grip = from_record(reference.cam_T_grip)
+        self.reference_covariance = np.reshape(reference.covariance, (6, 6))
+        self._reach_px = sampling.reach_px
+        self._dense = msgspec.structs.replace(sampling, samples=_DENSE, creases=True)
+        self.jaw_opening_m = float(np.mean([image.jaw_opening_m for image in images]))
+        self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
+        edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
+        self.crease = edges.crease
+        self.inside = self._inside(self.points_grip_m, edges.inside_point_m)
+        _, depth = sight_axes(gripper, self.points_grip_m, self.ref_cam_T_grip)
+        openings = [gripper.points_grip_m(image.jaw_opening_m) for image in images]
+        across = [sight_axes(gripper, points_grip_m, self.ref_cam_T_grip)[0] for points_grip_m in openings]
+        self.turned = np.einsum("nei,ei->ne", across, depth)
+
+    def arrays(self, edges: Mapping[str, TaughtEdge]) -> TaughtEdges:
+        """Edges as the measurement uses them."""
+        return TaughtEdges.of(edges, self.gripper, self.ref_cam_T_grip, self.jaw_opening_m)
+
+    def _inside(self, points_grip_m: Array, inside_point_m: Array) -> Array:
+        """(e,) by the visible face beside each edge; without faces by the middle of the finger's points."""
+        gripper, cam_T_grip = self.gripper, self.ref_cam_T_grip
+        middles = np.array(
+            [points_grip_m[gripper.point_finger == f].mean(axis=0) for f in range(len(gripper.finger_ids))]
+        )
+        inside = np.where(np.isfinite(inside_point_m), inside_point_m, middles[gripper.edge_finger])
+        ends = points_grip_m[gripper.edge_points]
+        # Right of the edge as the camera sees it: x right, y down, z forward.
+        eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
+        right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
+        return np.sign(np.einsum("ei,ei->e", right, inside - eye))
+
+    def measured(
+        self,
+        image: TeachingImage,
+        taught: TaughtEdges | None,
+        cam_T_grip: Array | None = None,
+        share: float = USUAL_SHARE,
+        patience: Patience = _NARROW,
+    ) -> Measurement:
+        """The image measured as in use, from a pose, the reference if None."""
+        rig = self.rig
+        meter = FingertipMeter(rig.camera, rig.gripper, rig.settings.corners, rig.settings.jaw_sigma_m, taught)
+        here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
+        return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
+
+    def _off_reference_px(self, found: Measurement) -> float:
+        """How far the measured gripper shows from the reference."""
+        return found.prediction.moved_px(perturbation_between(self.ref_cam_T_grip, found.cam_T_grip))
+
+    def fitted(self, image: TeachingImage) -> Measurement | None:
+        """The sharp model fitted to the image from the reference; None where it doesn't fit, as with wide bevels."""
+        found = self.measured(image, None)
+        return found if found.trusted and self._off_reference_px(found) <= self._reach_px else None
+
+    def check_elsewhere(self, image: TeachingImage) -> None:
+        """Raise :class:`ImageRefused` if the gripper clearly stands farther from the reference than the profiles
+        reach.
+        """
+        found = self.measured(image, None, None, _CLEAR_SHARE, _EVERYWHERE)
+        if found.trusted:
+            # Once more from there: the first search goes by predictions at the reference, and clutter may mislead it.
+            found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, _EVERYWHERE)
+        away_px = self._off_reference_px(found)
+        if found.trusted and away_px > self._reach_px:
+            motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
+            raise ImageRefused(
+                image,
+                f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
+                f"{self._reach_px:g} px: {self.advice(motion)}",
+            )
+
+    def view(
+        self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
+    ) -> View:
+        """All edges in view, or those that were ``taught``, as densely as pixels lie: from where the sharp model was
+        found, or else from the reference at a ``zoom``.
+        """
+        cam_T_grip, jaw_opening_m = self.ref_cam_T_grip, image.jaw_opening_m
+        if found is not None:
+            cam_T_grip, jaw_opening_m, zoom = found.cam_T_grip, found.jaw_opening_m, found.candidates.zoom
+        rig, sampling, grey = self.rig, self._dense, image.image
+        margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
+        sampling = msgspec.structs.replace(sampling, **margins)
+        layout = lay_out(rig.camera, rig.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
+        # Both have the same samples: those that the lens maps from both poses.
+        here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        if there.layout is not here.layout:
+            here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        profiles = read_profiles(grey, there.map_x, there.map_y)
+        noise = estimate_noise(profiles, quantum(grey))
+        candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), rig.settings.corners.edges, zoom)
+        per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
+        # Edges are straight: that a sample moves along its edge, too, doesn't matter.
+        expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)
+        sample = candidates.sample
+        across = np.einsum("ni,ni->n", there.normal, here.normal)
+        offset_px = expected_px[sample] + candidates.offset_px * across[sample]
+        return View(image, there, profiles, candidates, here, offset_px / per_m[sample], expected_px / per_m, per_m)
+
+    def _predict(
+        self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
+    ) -> Prediction:
+        offsets_px = zoom * profile_offsets_px(self._reach_px)
+        return predict(self.rig.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
+
+    def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
+        """How far an edge may show from the reference: a bevel's offset and a number of standard deviations of the
+        reference and the reported opening; never farther than the profiles reach.
+        """
+        here = view.at_reference
+        mine = here.layout.edge == edge
+        rows = here.jacobian[mine, :6]
+        variance = np.einsum("ni,ij,nj->n", rows, self.reference_covariance, rows).max()
+        variance += np.square(self._jaw_sigma_m * here.jacobian[mine, 6]).max()
+        bevel_m = max(shape_m, float(self.gripper.edge_bevel_m[edge]))
+        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self._reach_px)
+
+    @property
+    def prior_covariance(self) -> Array:
+        """(7, 7) of the reference and the reported opening; at least a micrometre, which stands for "exact"."""
+        out = np.zeros((7, 7))
+        out[:6, :6] = self.reference_covariance
+        out[6, 6] = max(self._jaw_sigma_m, 1e-6) ** 2
+        return out
+
+    def distance(self, motion: Array) -> str:
+        """A motion (6 or 7,) of the reference, in words."""
+        x, y, z = (1e3 * motion[:3]).tolist()
+        return f"by ({x:.3f}, {y:.3f}, {z:.3f}) mm and {np.degrees(np.linalg.norm(motion[3:6])):.3f}°"
+
+    def pose(self, motion: Array) -> str:
+        """The reference after a motion (6 or 7,), as it stands in a configuration."""
+        there = to_record(perturb(self.ref_cam_T_grip, motion[:6]))
+        translation_m = [round(v, 7) for v in there.translation_m]
+        rotation_xyzw = [round(v, 8) for v in there.rotation_xyzw]
+        return f"reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
+
+    def advice(self, motion: Array) -> str:
+        """What to do about a reference that is off by a motion (6 or 7,)."""
+        return (
+            "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
+            f"pose as {self.pose(motion)}"
+        )
+
+
+class Sampled(NamedTuple):
+    """One edge in all images: candidates, the shares of the edge between which it was sampled (the middle ones of all
+    images), px a metre, the line (2,) that was expected, px, and ``rows`` (2, 7): metres at both ends by the unknowns.
+    """
+
+    points: EdgePoints
+    share: tuple[float, float]
+    per_m: float
+    expected_px: Array
+    rows: Array
+
+
+def sampled(views: Sequence[View], edge: int) -> Sampled | None:
+    """Everything seen of one edge; None if no image samples it."""
+    spans, scales, expected, rows, profiles = [], [], [], [], []
+    parts: list[tuple[Any, ...]] = []
+    before = 0
+    for number, view in enumerate(views):
+        layout, candidates = view.prediction.layout, view.candidates
+        mine = np.flatnonzero((layout.edge == edge) & view.prediction.ok)
+        profiles.append(len(mine))
+        if len(mine) > 1:
+            ends = mine[[0, -1]]
+            spans.append(layout.fraction[ends])
+            scales.append(view.per_m[mine].mean())
+            expected.append(view.expected_m[ends])
+            rows.append(view.at_reference.jacobian[ends] / view.per_m[ends, None])
+        own = np.flatnonzero(layout.edge[candidates.sample] == edge)
+        sample = candidates.sample[own]
+        image = np.full(len(own), number)
+        parts.append((layout.fraction[sample], view.offset_m[own], candidates.step[own], before + sample, image, own))
+        before += len(layout.edge)
+    if not spans:
+        return None
+    low, high = np.median(spans, axis=0).tolist()
+    per_m = float(np.mean(scales))
+    fraction, offset_m, step, profile, image, own = (np.concatenate(part) for part in zip(*parts, strict=True))
+    way = (fraction - low) / (high - low)
+    points = EdgePoints(way, per_m * offset_m, step, profile, image, own, np.array(profiles))
+    return Sampled(points, (low, high), per_m, per_m * np.mean(expected, axis=0), np.mean(rows, axis=0))

@@ -1,0 +1,361 @@
+"""Which corners and edges of the gripper a camera sees from a pose, as the monitor will look for them, and why others
+are not seen.
+
+Beyond the monitor's own rule (a face must look at the camera) fingers that stand before each other are found: the
+monitor will look for such an edge, and see the other finger.  And margins: how far visible corners are from the image's
+border, how far the camera may move until too few of them are in view, and over which part of the jaw's travel the view
+suffices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import exp_rotation, invert, make_transform
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
+from gripmon.monitor import MonitorSettings
+from gripmon.track.edges import TaughtEdges
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
+
+FEWEST_EDGES = 3
+"""Edges that must be seen for a fit to be believed."""
+
+FEWEST_CORNERS = 3
+"""Corners that must be seen; a configuration that shows fewer is refused."""
+
+FEWEST_SAMPLES = 4
+"""Profiles of an edge below which it isn't used, as in the monitor's layout."""
+
+TOUCHING_M = 1e-4
+"""A point that is less than this behind another finger's face lies on it."""
+
+
+class Rig(NamedTuple):
+    """A camera, a gripper, and the monitor's settings; everything but the pose between them."""
+
+    camera: Camera
+    gripper: Gripper
+    settings: MonitorSettings
+    taught: TaughtEdges | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What is seen from one pose at one jaw opening: arrays (c,) over the gripper's corners.
+
+    ``uv_px`` (c, 2), NaN where the lens maps nothing.  Each corner is ``visible``, or ``outside`` of the image, or
+    ``self_hidden`` by its own finger, or ``behind`` another one, the first that holds.  ``edges``: how many can be
+    sampled.
+    """
+
+    uv_px: Array
+    outside: NDArray[np.bool_]
+    self_hidden: NDArray[np.bool_]
+    behind: NDArray[np.bool_]
+    edges: int
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        return ~(self.outside | self.self_hidden | self.behind)
+
+    @property
+    def corners(self) -> int:
+        return int(np.count_nonzero(self.visible))
+
+    @property
+    def enough(self) -> bool:
+        """Whether the monitor can measure from here."""
+        return self.corners >= FEWEST_CORNERS and self.edges >= FEWEST_EDGES
+
+    @property
+    def reason(self) -> str | None:
+        """Why the monitor can't measure from here; None if it can."""
+        if self.corners < FEWEST_CORNERS:
+            counts = {
+                "outside of the image": self.outside,
+                "hidden by their own finger": self.self_hidden,
+                "behind another finger": self.behind,
+            }
+            parts = [f"{np.count_nonzero(n)} {text}" for text, n in counts.items() if n.any()]
+            return f"{self.corners} corners visible ({', '.join(parts)})"
+        if self.edges < FEWEST_EDGES:
+            return f"{self.edges} edges long enough in the image"
+        return None
+
+
+def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
+    """What ``rig`` sees at a pose (4, 4) and an opening (nominal if None)."""
+    camera, gripper = rig.camera, rig.gripper
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    eye_grip_m = invert(cam_T_grip)[:3, 3]
+    corners_grip_m = points_grip_m[gripper.corner_points]
+    uv_px = camera.project(corners_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+    last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    with np.errstate(invalid="ignore"):
+        within = (uv_px >= CORNER_MARGIN_PX) & (uv_px <= last_px - CORNER_MARGIN_PX)
+    outside = np.asarray(~within.all(axis=1))
+    self_hidden = ~outside & ~gripper.corners_visible(points_grip_m, eye_grip_m)
+    opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+    layout = lay_out(camera, gripper, cam_T_grip, opening_m, rig.settings.corners.sampling, rig.taught)
+    # Both in one call, which takes most of the time.
+    samples_m, of_samples = _samples(gripper, layout, points_grip_m)
+    of_corners = gripper.point_finger[gripper.corner_points]
+    targets_m, finger = np.concatenate([corners_grip_m, samples_m]), np.concatenate([of_corners, of_samples])
+    hidden = behind_another_finger(gripper, points_grip_m, eye_grip_m, targets_m, finger)
+    behind, free = ~outside & ~self_hidden & hidden[: len(of_corners)], ~hidden[len(of_corners) :]
+    edges = np.count_nonzero(np.bincount(layout.edge[free], minlength=1) >= FEWEST_SAMPLES)
+    return Sight(uv_px, outside, self_hidden, behind, int(edges))
+
+
+def samples_behind(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
+    """(n,) which samples of a layout lie behind another finger."""
+    samples_m, finger = _samples(gripper, layout, points_grip_m)
+    return behind_another_finger(gripper, points_grip_m, eye_grip_m, samples_m, finger)
+
+
+def _samples(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array) -> tuple[Array, NDArray[np.intp]]:
+    """A layout's samples (n, 3) in the gripper frame, and their fingers (n,)."""
+    ends = points_grip_m[gripper.edge_points[layout.edge]]
+    samples_m = ends[:, 0] + layout.fraction[:, None] * (ends[:, 1] - ends[:, 0])
+    return samples_m, gripper.edge_finger[layout.edge]
+
+
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+_LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+_LEVI_CIVITA[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
+_WITHOUT = ([1, 2], [0, 2], [0, 1])
+
+
+def behind_another_finger(
+    gripper: Gripper, points_grip_m: Array, eye_grip_m: Array, targets_m: Array, finger: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """(n,) whether a face of another finger stands between the eye (3,) and each of the targets (n, 3), which belong to
+    the fingers ``finger`` (n,); all in the gripper frame.  Fingers are convex solids, of which the faces that look at
+    the eye hide all that the others do.  Without faces nothing is known to hide.
+    """
+    hidden = np.zeros(len(targets_m), dtype=bool)
+    rays = targets_m - eye_grip_m
+    length_m = np.sqrt(np.einsum("ni,ni->n", rays, rays))
+    for face in gripper.faces:
+        other = (finger != face.finger) & ~hidden
+        if not other.any():
+            continue
+        loop = points_grip_m[face.points]
+        spokes = loop[1:] - loop[0]
+        normal = np.einsum("ijk,nj,nk->i", _LEVI_CIVITA, spokes[:-1], spokes[1:])  # outwards, twice the area long
+        height = float((eye_grip_m - loop[0]) @ normal)
+        if height <= 0.0:
+            continue
+        towards = -(rays @ normal)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = height / towards
+            crosses = other & (share > 0.0) & ((1.0 - share) * length_m > TOUCHING_M)
+        which = np.flatnonzero(crosses)
+        if not len(which):
+            continue
+        hits = eye_grip_m + share[which, None] * rays[which]
+        hidden[which] = _in_polygon(hits, loop, int(np.abs(normal).argmax()))
+    return hidden
+
+
+def _in_polygon(points: Array, loop: Array, drop: int) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 3) of a planar loop's plane lie in it (even-odd rule), seen along the axis ``drop``."""
+    x, y = points[:, _WITHOUT[drop]].T[:, :, None]
+    ax, ay = loop[:, _WITHOUT[drop]].T
+    bx, by = np.append(ax[1:], ax[0]), np.append(ay[1:], ay[0])
+    spans = (ay > y) != (by > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = x < ax + (y - ay) * (bx - ax) / (by - ay)
+    return np.asarray(np.count_nonzero(spans & left, axis=1) % 2 == 1)
+
+
+SOUGHT_M = 1.0
+"""How far a shift of the camera is followed."""
+
+SOUGHT_RAD = np.pi
+"""How far a turn of the camera is followed."""
+
+STEP_PX = 16.0
+"""Image motion between two views on the way: a gap in the view that is narrower than this may be passed over."""
+
+_SIDES = ("left", "right", "top", "bottom")
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """Distance of the visible corners from the image's border: the smallest on each side, px; and the smallest of all,
+    with the corner and the side.
+    """
+
+    by_side_px: dict[str, float]
+    smallest_px: float
+    corner: str
+    side: str
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """How far the camera may move alone along each axis before the monitor can't measure any more.
+
+    ``limits`` (6, 2): shift (m) along, then turn (rad) about the camera's own x, y, z, to the negative and to the
+    positive side, all as amounts; NaN where the view suffices as far as was sought.  ``reasons`` (6 pairs) what is
+    missing beyond.
+    """
+
+    limits: Array
+    reasons: tuple[tuple[str | None, str | None], ...]
+
+
+def moved_camera(cam_T_grip: Array, motion: Array) -> Array:
+    """``cam_T_grip`` (4, 4) after the camera has shifted by ``motion[:3]`` (m) and turned about its own centre by the
+    rotation vector ``motion[3:]`` (rad), both in the axes that it had before.
+    """
+    back = exp_rotation(motion[3:]).T
+    return make_transform(back @ cam_T_grip[:3, :3], back @ (cam_T_grip[:3, 3] - motion[:3]))
+
+
+def border(rig: Rig, sight: Sight) -> Border | None:
+    """Where the visible corners come nearest to the image's border; None if no corner is visible."""
+    if not sight.corners:
+        return None
+    which = np.flatnonzero(sight.visible)
+    u, v = sight.uv_px[which].T
+    distances = np.stack([u, rig.camera.width_px - 1.0 - u, v, rig.camera.height_px - 1.0 - v])
+    side, corner = np.unravel_index(int(distances.argmin()), distances.shape)
+    by_side_px = dict(zip(_SIDES, distances.min(axis=1).tolist(), strict=True))
+    return Border(by_side_px, float(distances.min()), rig.gripper.corner_ids[which[corner]], _SIDES[side])
+
+
+def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
+    """How far the camera may shift and turn along each of its axes while the jaws stand at an opening."""
+    found = [_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for axis in np.eye(6) for sign in (-1.0, 1.0)]
+    limits = np.reshape([amount for amount, _ in found], (6, 2))
+    return Freedom(limits, tuple((found[k][1], found[k + 1][1]) for k in range(0, 12, 2)))
+
+
+def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> float:
+    """The shortest shift of the camera along its x or y, either way, after which the monitor can't measure; infinite
+    for none.  Found in steps that are coarser than those of :func:`freedom`, to a hundredth of a step.
+    """
+    axes = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
+    limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, 4.0 * STEP_PX, halvings=7)[0] for axis in axes]
+    return float(np.nan_to_num(limits, nan=np.inf).min())
+
+
+def _limit(
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 24
+) -> tuple[float, str | None]:
+    """The amount of a motion along ``axis`` (6,), a unit vector, after which the view doesn't suffice, and why; NaN for
+    never.
+    """
+
+    def view(amount: float) -> Sight:
+        return see(rig, moved_camera(cam_T_grip, amount * axis), jaw_opening_m)
+
+    sought = SOUGHT_M if axis[:3].any() else SOUGHT_RAD
+    good, bad = 0.0, 0.0
+    sight = view(0.0)
+    if (reason := sight.reason) is not None:
+        return 0.0, reason
+    while sight.enough:
+        if bad >= sought:
+            return float("nan"), None
+        good = bad
+        bad = min(bad + _step(rig, cam_T_grip, jaw_opening_m, axis, good, sight, step_px), sought)
+        sight = view(bad)
+    bad, sight = _first_failing(good, bad, sight, view, halvings)
+    return bad, sight.reason
+
+
+def _step(
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, amount: float, sight: Sight, step_px: float
+) -> float:
+    """How much farther moves the visible corners by ``step_px`` at most."""
+    gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
+    points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[sight.visible]]
+    pose = moved_camera(cam_T_grip, (amount + small) * axis)
+    moved_px = rig.camera.project(points_m @ pose[:3, :3].T + pose[:3, 3]) - sight.uv_px[sight.visible]
+    rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / small
+    # Near the lens's axis a shift along it moves nothing, yet.
+    farthest = 0.05 if axis[3:].any() else 0.02 * (1.0 + 50.0 * amount)
+    return min(step_px / max(rate, 1e-12), farthest)
+
+
+def _first_failing(
+    good: float, bad: float, there: Sight, view: Callable[[float], Sight], halvings: int
+) -> tuple[float, Sight]:
+    """By bisection between a value whose view suffices and one whose view, ``there``, doesn't: the nearest such value
+    to the former that was found, and its view.
+    """
+    for _ in range(halvings):
+        middle = 0.5 * (good + bad)
+        sight = view(middle)
+        if sight.enough:
+            good = middle
+        else:
+            bad, there = middle, sight
+    return bad, there
+
+
+class Gap(NamedTuple):
+    """Openings at which the view doesn't suffice, and why (in its middle)."""
+
+    from_m: float
+    to_m: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class JawTravel:
+    """``share`` of the jaw's travel in which the monitor can measure, with the ``gaps`` that are left out; ``corners``
+    and ``edges`` (n,) visible at the ``openings_m`` (n,).
+    """
+
+    share: float
+    gaps: tuple[Gap, ...]
+    openings_m: Array
+    corners: NDArray[np.intp]
+    edges: NDArray[np.intp]
+
+
+def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
+    """What is visible at ``count`` openings from end to end, the ends of gaps found between them; None for a gripper
+    whose jaw doesn't move.  Where the view fails only between two openings is not noticed.
+    """
+    gripper = rig.gripper
+    if not gripper.jaw_max_m > gripper.jaw_min_m:
+        return None
+
+    def view(opening_m: float) -> Sight:
+        return see(rig, cam_T_grip, opening_m)
+
+    openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, count)
+    sights = list(map(view, openings_m.tolist()))
+    gaps = _gaps(openings_m.tolist(), sights, view)
+    lost_m = sum(gap.to_m - gap.from_m for gap in gaps)
+    share = 1.0 - lost_m / (gripper.jaw_max_m - gripper.jaw_min_m)
+    corners, edges = np.array([(s.corners, s.edges) for s in sights], dtype=np.intp).T
+    return JawTravel(max(share, 0.0), gaps, openings_m, corners, edges)
+
+
+def _gaps(openings_m: list[float], sights: list[Sight], view: Callable[[float], Sight]) -> tuple[Gap, ...]:
+    """The runs without enough, their ends by bisection."""
+    change = np.flatnonzero(np.diff([1, *(int(sight.enough) for sight in sights), 1]))
+    gaps = []
+    for first, beyond in change.reshape(-1, 2).tolist():
+        low_m, high_m = openings_m[first], openings_m[beyond - 1]
+        if first > 0:
+            low_m, _ = _first_failing(openings_m[first - 1], low_m, sights[first], view, 14)
+        if beyond < len(openings_m):
+            high_m, _ = _first_failing(openings_m[beyond], high_m, sights[beyond - 1], view, 14)
+        reason = sights[(first + beyond - 1) // 2].reason
+        assert reason is not None
+        gaps.append(Gap(low_m, high_m, reason))
+    return tuple(gaps)
