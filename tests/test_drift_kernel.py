@@ -8,23 +8,22 @@ import numpy as np
 import pytest
 from support.drift_noise import COVARIANCE, autocorrelated, claimed, vibrating, white
 
-from gripmon.judge.drift import DriftSettings, kernel
-from gripmon.judge.drift.compiled import CompiledTest
-from gripmon.judge.drift.sequential import PlainTest, square_beyond, whitening
+from gripmon.judge.drift import DriftSettings, SequentialTest, kernel, plain
+from gripmon.judge.drift.sequential import SWEEPS
 from gripmon.judge.drift.statistics import Scatter
 from gripmon.model.compiled import COMPILES
 
 pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
 
-STREAMS, FRAMES = 3, 5000
+STREAMS, FRAMES, STILL = 3, 3000, 1800
 STEP = np.linalg.cholesky(COVARIANCE) @ np.ones(6)
 
 
-def pair(settings: DriftSettings, streams: int = STREAMS) -> tuple[CompiledTest, PlainTest]:
-    return CompiledTest(settings, streams), PlainTest(settings, streams)
+def pair(settings: DriftSettings, streams: int = STREAMS) -> tuple[SequentialTest, SequentialTest]:
+    return SequentialTest(settings, streams, kernel), SequentialTest(settings, streams, plain)
 
 
-def assert_alike(found: PlainTest, expected: PlainTest) -> None:
+def assert_alike(found: SequentialTest, expected: SequentialTest) -> None:
     """What either has learnt."""
     np.testing.assert_allclose(found.scatter.of_differences, expected.scatter.of_differences, rtol=1e-9, atol=1e-22)
     np.testing.assert_allclose(found.scatter.windows, expected.scatter.windows, rtol=1e-12)
@@ -42,7 +41,7 @@ def test_each_frame_is_found_alike(noise: Callable[..., np.ndarray]):
     rng = np.random.default_rng(3)
     found, expected = pair(DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0))
     shifts = noise(rng, FRAMES, STREAMS)
-    shifts[3000:] += np.linspace(0.0, 15.0, FRAMES - 3000)[:, None, None] * STEP
+    shifts[STILL:] += np.linspace(0.0, 15.0, FRAMES - STILL)[:, None, None] * STEP
     moved = 0
     for number, shift in enumerate(shifts):
         covariance = rng.uniform(0.5, 3.0, (STREAMS, 1, 1)) * claimed(STREAMS)
@@ -54,11 +53,11 @@ def test_each_frame_is_found_alike(noise: Callable[..., np.ndarray]):
         np.testing.assert_array_equal(one.stepped, other.stepped)
         np.testing.assert_allclose(one.excess, other.excess, rtol=1e-9, atol=1e-12)
         moved += int(one.moved.sum())
-        if number in (1000, 4500):
+        if number in (600, 2700):
             for test in (found, expected):
                 test.restart(np.array([True, False, True]), np.array([0, 0, 5]))
                 test.set_reference_covariance(0.1 * COVARIANCE)
-    assert 100 < moved < STREAMS * (FRAMES - 3000), "of both kinds"
+    assert 100 < moved < STREAMS * (FRAMES - STILL), "of both kinds"
     assert_alike(found, expected)
 
 
@@ -96,10 +95,11 @@ def test_covariances_are_those_of_numpy_however_much_of_the_claim_was_seen(seen:
 def test_a_shift_beyond_what_is_tolerated_is_measured_alike():
     rng = np.random.default_rng(6)
     found, expected = pair(DriftSettings(tolerated_m=2e-5, tolerated_rad=1e-3), 1)
-    white_of = whitening(COVARIANCE)
+    white_of = plain.whitening_of(COVARIANCE)
     for size in (0.1, 1.0, 5.0, 50.0):
         shift = size * STEP * rng.normal(size=6)
-        known = float(square_beyond(white_of, shift, DriftSettings(tolerated_m=2e-5, tolerated_rad=1e-3).tolerated))
+        tolerated = DriftSettings(tolerated_m=2e-5, tolerated_rad=1e-3).tolerated
+        known = float(plain.least_squares(white_of, shift, tolerated, SWEEPS))
         assert found.square_beyond(shift, COVARIANCE) == pytest.approx(known, rel=1e-9, abs=1e-12)
         assert expected.square_beyond(shift, COVARIANCE) == known
 
@@ -107,4 +107,4 @@ def test_a_shift_beyond_what_is_tolerated_is_measured_alike():
 def test_what_has_no_root_is_left_to_numpy():
     assert not kernel.square_beyond(-np.eye(6), np.ones(6), np.ones(6), 8)[0]
     with pytest.raises(np.linalg.LinAlgError):
-        CompiledTest(DriftSettings()).square_beyond(np.ones(6), -np.eye(6))
+        SequentialTest(DriftSettings(), by=kernel).square_beyond(np.ones(6), -np.eye(6))

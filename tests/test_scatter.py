@@ -20,9 +20,9 @@ def learnt(shifts: np.ndarray, every: int = 4) -> Scatter:
     for number, values in enumerate(shifts):
         windows.add(values)
         if number % every == 0:
-            mean, before = windows.means()
+            _, difference = windows.means()
             _, usable = windows.full()
-            scatter.learn(mean - before, np.zeros(usable.shape), usable, every)
+            scatter.learn(difference, np.zeros(usable.shape), usable, every)
     return scatter
 
 

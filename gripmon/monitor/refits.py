@@ -80,6 +80,8 @@ class Refits:
         self._free = self._sums.fits()
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
+        self.of_model = self._free.of_model
+        """(h, f, 6) of how those are off where a finger is longer by its standard deviation."""
 
     def anchored(self, anchor_T: Array, covariance: Array, of_model: Array) -> Anchored:
         """The fits with the gripper known to be at ``anchor_T`` (4, 4) but for ``covariance`` (6, 6), and off by the
@@ -95,11 +97,6 @@ class Refits:
     def edges(self) -> NDArray[np.intp]:
         """(v,) that the fits are made of."""
         return self._normal.edge
-
-    @property
-    def of_model(self) -> Array:
-        """(h, f, 6) of how the fits by the frame alone are off where a finger is longer by its standard deviation."""
-        return self._free.of_model
 
     def shifts(self, base_T: Array) -> Array:
         """(h, 6) from a pose (4, 4) near by to the fits by the frame alone."""

@@ -57,6 +57,7 @@ class Renewal:
         self._recalibrator = Recalibrator(
             settings.recalibration, gripper, floor, CORNER_COUNTS[settings.recalibrate_corners]
         )
+        self._collects = False
         self.outcome: Proposal | Refusal | None = None
         """What came of the newest attempt at a new reference; None before the first one."""
         self.wanted = False
@@ -72,7 +73,9 @@ class Renewal:
 
     def moved(self) -> None:
         """The camera doesn't stand still, or needs no new reference: begin to collect anew."""
-        self._recalibrator.forget()
+        if self._collects:
+            self._recalibrator.forget()
+            self._collects = False
 
     def collect(self, frame: Frame, standing: Standing, judgement: Judgement) -> bool:
         """Past the limit, or when an operator wants it, collect a frame whose pose is believed: whether there are
@@ -89,6 +92,7 @@ class Renewal:
 
     def still(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array) -> None:
         """One more frame of a camera that stands still."""
+        self._collects = True
         corners, jaw_opening_m = measurement.corners, measurement.jaw_opening_m
         self._recalibrator.add(
             StillFrame(

@@ -227,7 +227,7 @@ class Integrity:
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """What to publish of a place, and whether it becomes the anchor."""
         measurement, cam_T_grip, covariance, trust = candidate
-        if trust.instead is not None and not trust.proven and (trust.displaced or self._short(trust)):
+        if trust.most_probable is not None and not trust.proven and (trust.displaced or self._short(trust)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         moved = self._knocked(trust, self._beside_px(measurement, cam_T_grip))

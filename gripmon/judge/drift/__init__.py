@@ -2,8 +2,8 @@
 was."""
 
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
-from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, MotionWatch, SequentialTest
-from gripmon.judge.drift.sequential import Finding
+from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, MotionWatch
+from gripmon.judge.drift.sequential import Finding, SequentialTest, warm_up
 from gripmon.judge.drift.settings import DriftSettings
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "MotionWatch",
     "SequentialTest",
     "foresee",
+    "warm_up",
 ]

@@ -1,7 +1,7 @@
 """The arithmetic of the sequential test, compiled: k lengths of windows, s streams, six axes.
 
-What the quantities mean, and the same by NumPy, stands in :mod:`~gripmon.judge.drift.sequential` and
-:mod:`~gripmon.judge.drift.statistics`, in functions of the same names.  What is learnt is changed in place.
+The same by NumPy stands in :mod:`~gripmon.judge.drift.plain`, function by function; what the quantities are for, in
+:mod:`~gripmon.judge.drift.sequential` and :mod:`~gripmon.judge.drift.statistics`.  What is learnt is changed in place.
 """
 
 from __future__ import annotations
@@ -352,7 +352,7 @@ def refresh(
     to_reported: Array,
     from_reported: Array,
 ) -> bool:
-    """Covariances and their whitening anew: see ``SequentialTest._refresh`` and ``Scatter.covariances``.
+    """Covariances of means and of differences anew, and their whitening.
 
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``

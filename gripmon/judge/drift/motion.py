@@ -7,21 +7,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT, History, VibrationWatch, goes_on
+from gripmon.judge.drift.sequential import SequentialTest
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.model.compiled import COMPILES
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
-
-if TYPE_CHECKING or not COMPILES:
-    from gripmon.judge.drift.sequential import PlainTest as SequentialTest
-else:
-    from gripmon.judge.drift.compiled import CompiledTest as SequentialTest
-
-__all__ = ["USUAL_SQUARE", "Baseline", "MotionWatch", "SequentialTest"]
 
 
 class Baseline:

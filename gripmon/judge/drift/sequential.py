@@ -13,51 +13,28 @@ has shown enough extremes of its own, the thresholds of short windows are learnt
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 from scipy import special
 
+from gripmon.judge.drift import plain
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.statistics import BLOCK_FRAMES, COUNT, LARGEST, LENGTHS, Extremes, Scatter, Windows
+from gripmon.judge.drift.statistics import (
+    ARITHMETIC,
+    BLOCK_FRAMES,
+    COUNT,
+    LARGEST,
+    LENGTHS,
+    RARE,
+    Extremes,
+    Scatter,
+    Windows,
+)
 from gripmon.model.records import Array
 
 SWEEPS = 8
 """Rounds over the axes; each can only come closer, and after none of them the answer is too small."""
-
-
-def whitening(covariance: Array) -> Array:
-    """(..., 6, 6) W with ``W C W' = 1``."""
-    return np.linalg.inv(np.linalg.cholesky(covariance))
-
-
-def times(matrix: Array, values: Array) -> Array:
-    """(..., 6, 6) times (..., 6)."""
-    return np.asarray((matrix @ values[..., None])[..., 0])
-
-
-def square(whitening: Array, values: Array) -> Array:
-    """(...) normalised squares of values (..., 6)."""
-    white = times(whitening, values)
-    return np.asarray((white * white).sum(axis=-1))
-
-
-def square_beyond(whitening: Array, shift: Array, tolerated: Array) -> Array:
-    """(...) smallest normalised square of ``shift`` (..., 6) less a shift within ``tolerated`` (6,) on every axis.
-
-    ``whitening`` (..., 6, 6) is W with ``W C W' = 1``.  Errors of the axes belong together: what is tolerated on each
-    axis by itself must not be taken off by itself, or what is left would be a shift that C takes to be impossible.
-    Coordinate descent from both ends, nothing taken off and all of it; never more than the square of the shift itself.
-    """
-    precision = np.swapaxes(whitening, -1, -2) @ whitening
-    best = np.full(shift.shape[:-1], np.inf)
-    for start in (np.zeros_like(shift), np.clip(shift, -tolerated, tolerated)):
-        taken = start
-        for _ in range(SWEEPS):
-            for axis in range(6):
-                pull = (precision[..., axis, :] * (shift - taken)).sum(axis=-1) / precision[..., axis, axis]
-                taken[..., axis] = np.clip(taken[..., axis] + pull, -tolerated[axis], tolerated[axis])
-        best = np.minimum(best, square(whitening, shift - taken))
-    return best
 
 
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
@@ -103,6 +80,8 @@ BIAS_FREEDOM = 10.0
 
 REPORTED_MEMORY = 1.0 / 64.0
 
+_LENGTHS = np.array(LENGTHS)
+
 WORTH = 0.25
 """Part of its threshold from which a statistic is worth the search for the shift that may be tolerated."""
 
@@ -120,14 +99,14 @@ class Finding:
     excess: Array
 
 
-class PlainTest:
-    """Tests ``streams`` series of shifts against a reference, by NumPy."""
+class SequentialTest:
+    """Tests ``streams`` series of shifts against a reference."""
 
-    def __init__(self, settings: DriftSettings, streams: int = 1):
+    def __init__(self, settings: DriftSettings, streams: int = 1, by: ModuleType = ARITHMETIC):
+        """``by``: whose arithmetic, :mod:`~gripmon.judge.drift.kernel` or :mod:`~gripmon.judge.drift.plain`."""
         self._settings = settings
-        self._streams = streams
-        self.windows = Windows(streams)
-        self.scatter = Scatter(streams)
+        self._streams, self._by = streams, by
+        self.windows, self.scatter = Windows(streams, by), Scatter(streams, by)
         self._tolerated = settings.tolerated
         self._frames_per_s = settings.frames_per_s
         self._last_two = np.zeros((2, streams, 6))
@@ -148,6 +127,10 @@ class PlainTest:
         self._limit = np.full((2, len(LENGTHS), streams), np.inf)
         self._known = np.zeros(self._limit.shape, dtype=bool)
         self._middle: Array = np.zeros((streams, 6))
+        lengths, each = len(LENGTHS), (streams, 6, 6)
+        self._to_reported, self._from_reported = np.zeros((2, *each))
+        self._plain, self._whitening = np.zeros((2, SHORT, *each)), np.zeros((2, lengths, *each))
+        self._mean_covariance, self._learnt_whitening = np.zeros((2, lengths, *each))
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate: the contract is in days, the thresholds are in frames."""
@@ -167,16 +150,29 @@ class PlainTest:
         ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.  Windows of
         fewer than ``at_least`` frames decide nothing now.
         """
-        usual = self._report(covariance)
+        by = self._by
+        if self._frames == 0:
+            self._reported = np.array(covariance)
+            self.scatter.begin(covariance)
+        usual = by.report(self._reported, covariance, REPORTED_MEMORY)
         if self._stale or self._frames % REFRESH_FRAMES == 0:
             self._refresh()
-        self.windows.add(self._steady(shift, usual))
+        # The median of three frames: no single frame can decide, and a step is late by one.  In axes in which errors
+        # are independent: medians of others need not be a shift that any of the frames makes likely.
+        self.windows.add(
+            by.steady(
+                shift, usual, self._seen, self._sure, self._last_two, self._to_reported, self._from_reported
+            )
+        )  # fmt: skip
         self._frames, self._since_restart = self._frames + 1, self._since_restart + 1
         if self._since_restart < 3:
             # Of fewer than three frames there is no middle one.
             self.windows.keep(self._seen < 3, 0)
-        mean, difference = self._means()
-        beyond = self._beyond(mean, difference)
+        mean, difference = self.windows.means()
+        beyond = by.beyond(
+            mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
+            self._tolerated, WORTH, SWEEPS,
+        )  # fmt: skip
         if self._frames % EXTREME_FRAMES == 0:
             usable = np.stack(self.windows.full()) & (beyond[1] <= FAR).all(axis=0)
             self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
@@ -184,35 +180,7 @@ class PlainTest:
             # An offset that stays says nothing against what differences show.
             usable = self.windows.full()[1] & ~(beyond[1] > 1.0).any(axis=0)
             self._learn(difference, usable if learn is None else usable & learn)
-        return self._decide(beyond, LENGTHS.index(at_least))
-
-    def _means(self) -> tuple[Array, Array]:
-        """(k, s, 6) of the windows' means, and those less the means of the windows before."""
-        mean, before = self.windows.means()
-        return mean, mean - before
-
-    def _beyond(self, mean: Array, difference: Array) -> Array:
-        """(2, k, s) squares of means, but for what is tolerated, and of differences, over their limits; 0 for windows
-        that reach back too far.
-        """
-        mean_full, both_full = self.windows.full()
-        squares = np.stack([square(self._whitening[0], mean), square(self._whitening[1], difference)])
-        # What is tolerated can only matter between these two.
-        limit = self._limit
-        surely = np.sqrt(limit[0]) + self._most_tolerated
-        worth = mean_full & (squares[0] > WORTH * limit[0]) & (squares[0] <= surely * surely)
-        if worth.any():
-            squares[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
-        return np.where(np.stack([mean_full, both_full]), squares / limit, 0.0)
-
-    def _decide(self, beyond: Array, first: int) -> Finding:
-        """By windows from the number ``first`` on."""
-        beyond = beyond[:, first:]
-        excess = beyond.max(axis=(0, 1))
-        # The shortest window that is beyond its threshold dates the motion best.
-        index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
-        stepped = beyond[1, index, np.arange(self._streams)] > 1.0
-        return Finding(excess > 1.0, np.array(LENGTHS)[first:][index], stepped, excess)
+        return Finding(*by.decide(beyond, LENGTHS.index(at_least), _LENGTHS))
 
     def level(self, frames: int) -> tuple[Array, Array]:
         """Mean shift (s, 6) over the last ``frames`` frames, and its covariance (s, 6, 6) (that of the next shorter
@@ -222,7 +190,8 @@ class PlainTest:
 
     def square_beyond(self, shift: Array, covariance: Array) -> float:
         """Normalised square of what of a shift (6,) with a covariance (6, 6) isn't tolerated."""
-        return float(square_beyond(whitening(covariance), shift, self._tolerated))
+        rooted, found = self._by.square_beyond(covariance, shift, self._tolerated, SWEEPS)
+        return float(found if rooted else plain.square_beyond(covariance, shift, self._tolerated, SWEEPS)[1])
 
     def noticed(self) -> Array | None:
         """(6,) constant shifts, each alone on its axis, that the first stream's windows that are full show by their
@@ -245,36 +214,9 @@ class PlainTest:
         self._seen = np.where(streams & (np.asarray(keep) == 0), 0, self._seen)
         self._since_restart = 0
 
-    def _report(self, covariance: Array) -> Array:
-        """Follow the reported covariances; the usual variances over this frame's, 1 at most, on average (s,)."""
-        if self._frames == 0:
-            self._reported = np.array(covariance)
-            self.scatter.begin(covariance)
-        else:
-            self._reported += REPORTED_MEMORY * (covariance - self._reported)
-        variances = np.einsum("sii->si", covariance) / np.einsum("sii->si", self._reported)
-        return 1.0 / np.maximum(variances.mean(axis=1), 1.0)
-
-    def _steady(self, shift: Array, usual: Array) -> Array:
-        """Median of three frames: no single frame can decide, and a step is late by one.  A frame that claims more
-        error than usual (s,) moves the series by that much less.
-
-        In axes in which errors are independent: medians of axes whose errors belong together need not be a shift that
-        any of the frames makes likely.
-        """
-        fresh = (self._seen == 0)[:, None]
-        shift = self._sure = np.where(fresh, shift, self._sure + usual[:, None] * (shift - self._sure))
-        last = np.where(fresh, shift, self._last_two)
-        self._last_two = np.stack([last[1], shift])
-        self._seen += 1
-        one, two = (times(self._to_reported, each) for each in last)
-        three = times(self._to_reported, shift)
-        middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three))
-        return times(self._from_reported, middle)
-
     def _learn(self, difference: Array, usable: np.ndarray) -> None:
         """What differences (k, s, 6) show of the noise, where they are usable (k, s)."""
-        normalised = square(self._learnt_whitening, difference)
+        normalised = self._by.squares(self._learnt_whitening, difference)
         self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
         self._learn_surge(normalised, usable)
         self._learn_tail(normalised, usable)
@@ -294,7 +236,9 @@ class PlainTest:
 
     def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
         """Means about that of the longest window: an offset that stays is no noise, and a creep is hardly any."""
-        squares = self._extreme_squares(mean, difference)
+        squares = self._by.extremes(
+            mean, difference, self._middle, self._plain, self._limit, self._known, FAR
+        )  # fmt: skip
         usable = usable[:, :SHORT].copy()
         # The longest window was full already when its mean was taken last.
         usable[0] &= self.windows.frames >= LENGTHS[-1] + REFRESH_FRAMES
@@ -302,12 +246,6 @@ class PlainTest:
         if self._extremes.add(squares.reshape(kinds), usable.reshape(kinds), EXTREME_FRAMES):
             self._stale = True
             self._learnt_limits()  # what the next frame's refresh wants, so that no frame pays for both
-
-    def _extreme_squares(self, mean: Array, difference: Array) -> Array:
-        """(2, k, s) of the short windows, up to :data:`FAR` times the limit where that is known."""
-        values = np.stack([mean[:SHORT] - self._middle, difference[:SHORT]])
-        most = np.where(self._known[:, :SHORT], FAR * self._limit[:, :SHORT], np.inf)
-        return np.minimum(square(self._plain, values), most)
 
     def _refresh(self) -> None:
         fitted, self._stale = self._stale, False
@@ -330,16 +268,13 @@ class PlainTest:
         """Covariances of means and differences, and their whitening, where the variance of what was seen counts so
         many times, ``each`` (3, k, s): for limits that are assumed, standard deviations, and limits that are learnt.
         """
-        self._from_reported = np.linalg.cholesky(self._reported)
-        self._to_reported = np.linalg.inv(self._from_reported)
-        of_mean, of_difference = self.scatter.covariances(self._reported, each)
-        self._plain = whitening(np.stack([of_mean[2, :SHORT], of_difference[2, :SHORT]]))
-        of_mean += self._reference
-        self._mean_covariance = of_mean[1]
-        known = self._known[..., None, None]
-        of_both = np.stack([of_mean[::2], of_difference[::2]])  # (2 statistics, assumed and learnt, k, s, 6, 6)
-        self._whitening = whitening(np.where(known, of_both[:, 1], of_both[:, 0]))
-        self._learnt_whitening = whitening(self.scatter.of_differences)
+        of = (
+            self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference, self._known,
+            self._plain, self._mean_covariance, self._whitening, self._learnt_whitening, self._to_reported,
+            self._from_reported,
+        )  # fmt: skip
+        if not self._by.refresh(*of):
+            plain.refresh(*of)
 
     def _limits(self) -> tuple[Array, np.ndarray]:
         """Squares (2, k, s) beyond which the camera has moved, and which of them are learnt.
@@ -378,3 +313,11 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
     freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * COUNT**FREEDOM_GROWTH))
     threshold = float(special.chdtri(6, chance))
     return MARGIN * threshold, np.asarray(special.fdtri(6.0, freedom, 1.0 - chance) * 6.0 / threshold)
+
+
+def warm_up() -> None:
+    """Compile what a frame needs, or load what was compiled."""
+    test = SequentialTest(DriftSettings())
+    for number in range(4):
+        test.add(np.full((1, 6), 1e-6 * number), 1e-12 * np.eye(6)[None])
+    test.square_beyond(np.zeros(6), np.eye(6))

@@ -20,13 +20,22 @@ holds for the next block although the tail's scale is known from few blocks: the
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import numpy as np
 
+from gripmon.judge.drift import kernel, plain
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
 
 LENGTHS = tuple(2**k for k in range(13))
 """Frames that a window holds: 1, 2, 4 ... 4096, which is a minute at 60 frames/s."""
+
+COUNT = np.array(LENGTHS, dtype=float)[:, None]
+"""(k, 1) the lengths, for what is reckoned for all of them at once."""
+
+ARITHMETIC: ModuleType = kernel if COMPILES else plain
+"""Whose functions are used, the compiled ones if anything compiles."""
 
 
 class Windows:
@@ -35,10 +44,10 @@ class Windows:
     One stream is the daemon; benchmarks run hundreds beside one another.
     """
 
-    def __init__(self, streams: int):
+    def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
+        self._by = by
         self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
         self._lengths = np.array(LENGTHS)
-        self._shape = (-1, 1, 1)
         self._frames = np.zeros(streams, dtype=np.intp)
         self._newest = 0
 
@@ -46,11 +55,6 @@ class Windows:
     def frames(self) -> np.ndarray:
         """(s,) frames in the windows of each stream."""
         return self._frames
-
-    @property
-    def sums(self) -> tuple[Array, int]:
-        """Ring (n, s, 6) of the sums over all frames until each of the last n, and the newest one's number in it."""
-        return self._ring, self._newest
 
     def add(self, values: Array) -> None:
         """One frame's values (s, 6)."""
@@ -60,14 +64,13 @@ class Windows:
         self._frames += 1
 
     def means(self) -> tuple[Array, Array]:
-        """Means (k, s, 6) of the last n frames, and of the n before those, for every n of :data:`LENGTHS`.
+        """Means (k, s, 6) of the last n frames, for every n of :data:`LENGTHS`, and by how much they differ from those
+        of the n before.
 
         What reaches back beyond the first frame is meaningless; see :meth:`full`.
         """
-        ago = self._ring[(self._newest - self._lengths) % len(self._ring)]
-        twice_ago = self._ring[(self._newest - 2 * self._lengths) % len(self._ring)]
-        count = self._lengths.reshape(self._shape)
-        return (self._ring[self._newest] - ago) / count, (ago - twice_ago) / count
+        of: tuple[Array, Array] = self._by.means(self._ring, self._newest, self._lengths)
+        return of
 
     def full(self) -> tuple[np.ndarray, np.ndarray]:
         """(k, s) whether the last n frames, and the last 2 n, lie within the stream."""
@@ -97,11 +100,11 @@ more are themselves as rare as that.
 MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
 """What is learnt is forgotten over so many frames, or windows, whichever is longer."""
 
+_MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
+
 LARGEST = 4.0
 """Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
 
-COUNT = np.array(LENGTHS, dtype=float)[:, None]
-"""(k, 1) the lengths, for what is reckoned for all of them at once."""
 RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
 """(k,) number of the first length in which noise is rare to each."""
 
@@ -109,7 +112,8 @@ RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in 
 class Scatter:
     """Covariances of window means (k lengths, s streams, 6, 6)."""
 
-    def __init__(self, streams: int):
+    def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
+        self._by = by
         lengths = len(LENGTHS)
         self._of_difference = np.zeros((lengths, streams, 6, 6))
         self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
@@ -128,12 +132,9 @@ class Scatter:
         (k, s) to a mean of 6, and which of them to learn from.
         """
         share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
-        most = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
-        self._windows = np.where(usable, np.minimum(self._windows + share, most), self._windows)
-        tame = np.minimum(1.0, 6.0 * LARGEST / np.maximum(normalised, 1e-12))
-        gain = np.where(usable, share / self._windows, 0.0)
-        outer = (tame[..., None] * difference)[..., :, None] * difference[..., None, :]
-        self._of_difference += gain[..., None, None] * (outer - self._of_difference)
+        self._by.learn(
+            difference, normalised, usable, self._of_difference, self._windows, share, _MOST_WINDOWS, 6.0 * LARGEST
+        )  # fmt: skip
 
     @property
     def of_differences(self) -> Array:
@@ -146,30 +147,16 @@ class Scatter:
         ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (..., k, s) by how much more the
         variance of what the stream has shown counts.
         """
-        parts = 0.25 * self._of_difference
-        parts[-1] *= 2.0  # beyond the longest, windows count as independent
-        inflated = inflation[..., None, None]
-        total = np.flip(np.cumsum(np.flip(inflated * parts, axis=-4), axis=-4), axis=-4)
-        # What was only assumed has not been seen.
-        learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
-        seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
-        rare = np.concatenate([seen, np.zeros_like(seen[:1])])[RARE]
-        # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
-        missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
-        return total + missing[0], inflated * self._of_difference + 2.0 * missing[1:]
+        return plain.covariances(reported, self._of_difference, self.learnt, inflation, RARE)
+
+    @property
+    def learnt(self) -> Array:
+        """(k, s) part of the covariances that the stream has shown; the rest was only assumed."""
+        return 1.0 - PRIOR_WINDOWS / self._windows
 
     def of_single_frames(self) -> Array:
         """(s, 6, 6) of frames about their mean, as the stream has shown it."""
         return np.asarray(0.25 * self._of_difference.sum(axis=0))
-
-
-def _what_is_missing(seen: Array, claimed: Array) -> Array:
-    """The part of a claimed covariance (s, 6, 6), direction by direction, that exceeds what was seen (..., s, 6, 6)."""
-    root = np.linalg.cholesky(claimed)
-    inverse = np.linalg.inv(root)
-    share, directions = np.linalg.eigh(inverse @ seen @ np.swapaxes(inverse, -1, -2))
-    towards = root @ directions
-    return np.asarray((towards * np.maximum(1.0 - share, 0.0)[..., None, :]) @ np.swapaxes(towards, -1, -2))
 
 
 BLOCK_FRAMES, KEPT_BLOCKS = 256, 512

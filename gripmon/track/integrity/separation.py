@@ -69,6 +69,7 @@ class Sums(NamedTuple):
         ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
         """
         add_up = kernel.add_up if COMPILES else plain.add_up
+        pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
         return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
 
     def with_pose(self, at: Array, covariance: Array, of_model: Array) -> Sums:
@@ -140,16 +141,18 @@ class Doubts:
         """Those that are ``chosen`` (h,)."""
         if chosen.all():
             return self
-        tails = Tails(self.tails.sigma[:, chosen], self.tails.factor[:, chosen])
-        return Doubts(tuple(compress(self.name, chosen.tolist())), self.prior[chosen], self.away[:, chosen], tails)
+        away, *tails = (each.compress(chosen, axis=1) for each in (self.away, *self.tails))
+        return Doubts(tuple(compress(self.name, chosen.tolist())), self.prior[chosen], away, Tails(*tails))
 
     def __add__(self, other: Doubts) -> Doubts:
-        tails = Tails(*(np.concatenate(both, axis=1) for both in zip(self.tails, other.tails, strict=True)))
         return Doubts(
             self.name + other.name,
             np.concatenate([self.prior, other.prior]),
             np.concatenate([self.away, other.away], axis=1),
-            tails,
+            Tails(
+                np.concatenate([self.tails.sigma, other.tails.sigma], axis=1),
+                np.concatenate([self.tails.factor, other.tails.factor], axis=1),
+            ),
         )
 
     def levels(self, risk: float) -> tuple[float, float, str]:
