@@ -177,8 +177,9 @@ def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, se
         assert one.protection.hypothesis == other.protection.hypothesis
         assert one.protection.position_m == pytest.approx(other.protection.position_m, rel=near)
         assert one.protection.rotation_rad == pytest.approx(other.protection.rotation_rad, rel=near)
-        scale = np.abs(other.covariance).max()
-        np.testing.assert_allclose(one.covariance, other.covariance, rtol=near, atol=near * scale)
+        mine, known = np.reshape(one.covariance, (6, 6)), np.reshape(other.covariance, (6, 6))
+        sigma = np.sqrt(known.diagonal())
+        assert np.abs((mine - known) / np.outer(sigma, sigma)).max() < near
 
 
 def test_doubts_of_none_bound_nothing():
