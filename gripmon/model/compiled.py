@@ -1,7 +1,7 @@
 """Machine code for the arithmetic that every frame needs, by numba; without it NumPy does the same, more slowly.
 
-Numba keeps what it has compiled beside the sources, or in ``NUMBA_CACHE_DIR``, and goes by the file of a function alone
-to see whether it has changed: compiled functions that call one another stand in one file.
+Numba keeps what it has compiled beside the sources, in the user's cache or in ``NUMBA_CACHE_DIR``, and goes by the file
+of a function alone to see whether it has changed: compiled functions that call one another stand in one file.
 """
 
 from __future__ import annotations
@@ -27,5 +27,8 @@ def compiled(function: _F) -> _F:
     """
     if not COMPILES:
         return function
-    made: Any = numba.njit(cache=True, error_model="numpy")(function)
+    try:
+        made: Any = numba.njit(cache=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder in which it could be kept: every start compiles
+        made = numba.njit(error_model="numpy")(function)
     return cast("_F", made)

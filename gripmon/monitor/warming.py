@@ -1,0 +1,49 @@
+"""Before the first frame: machine code for the arithmetic of all of them."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from gripmon.judge import drift, smoothing
+from gripmon.model import poses
+from gripmon.model.compiled import COMPILES
+from gripmon.track import edges, integrity
+
+_log = logging.getLogger(__name__)
+
+LOADED_WITHIN_S = 2.0
+"""What takes longer was compiled, not only loaded."""
+
+MOST_UNKEPT = 1000
+"""Functions that could not be kept on the disk, more than there are: something else is wrong."""
+
+
+def warm_up() -> None:
+    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine."""
+    if not COMPILES:
+        _log.warning("numba can't be imported: every frame takes about ten times as long (pip install numba)")
+        return
+    begin_s = time.perf_counter()
+    unkept = ""
+    for part in (edges, integrity, drift, smoothing, poses):
+        unkept = _warm(part.warm_up) or unkept
+    took_s = time.perf_counter() - begin_s
+    if unkept:
+        _log.warning("what was compiled can't be kept (%s): every start takes so long; NUMBA_CACHE_DIR", unkept)
+    how = "compiled" if took_s > LOADED_WITHIN_S else "loaded"
+    _log.info("the arithmetic of frames is ready after %.1f s (%s)", took_s, how)
+
+
+def _warm(part: Callable[[], object]) -> str:
+    """Why something could not be kept, or empty."""
+    unkept = ""
+    for _ in range(MOST_UNKEPT):
+        try:
+            part()
+        except OSError as error:  # raised after a function was compiled: it works from then on
+            unkept = error.strerror or str(error)
+        else:
+            break
+    return unkept
