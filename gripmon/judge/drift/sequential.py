@@ -27,6 +27,7 @@ from gripmon.judge.drift.statistics import (
     LARGEST,
     LENGTHS,
     RARE,
+    ByArithmetic,
     Extremes,
     Scatter,
     Windows,
@@ -99,13 +100,13 @@ class Finding:
     excess: Array
 
 
-class SequentialTest:
+class SequentialTest(ByArithmetic):
     """Tests ``streams`` series of shifts against a reference."""
 
     def __init__(self, settings: DriftSettings, streams: int = 1, by: ModuleType = ARITHMETIC):
         """``by``: whose arithmetic, :mod:`~gripmon.judge.drift.kernel` or :mod:`~gripmon.judge.drift.plain`."""
-        self._settings = settings
-        self._streams, self._by = streams, by
+        super().__init__(by)
+        self._settings, self._streams = settings, streams
         self.windows, self.scatter = Windows(streams, by), Scatter(streams, by)
         self._tolerated = settings.tolerated
         self._frames_per_s = settings.frames_per_s

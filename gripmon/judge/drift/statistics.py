@@ -37,15 +37,28 @@ COUNT = np.array(LENGTHS, dtype=float)[:, None]
 ARITHMETIC: ModuleType = kernel if COMPILES else plain
 """Whose functions are used, the compiled ones if anything compiles."""
 
+_EITHER = {module.__name__: module for module in (kernel, plain)}
 
-class Windows:
+
+class ByArithmetic:
+    """What calls the functions of one of both, by name: a module can't be copied, and what a stream has taught can."""
+
+    def __init__(self, by: ModuleType):
+        self._arithmetic = by.__name__
+
+    @property
+    def _by(self) -> ModuleType:
+        return _EITHER[self._arithmetic]
+
+
+class Windows(ByArithmetic):
     """Running means of ``streams`` series of 6-vectors, from a ring of their sums.
 
     One stream is the daemon; benchmarks run hundreds beside one another.
     """
 
     def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
-        self._by = by
+        super().__init__(by)
         self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
         self._lengths = np.array(LENGTHS)
         self._frames = np.zeros(streams, dtype=np.intp)
@@ -109,11 +122,11 @@ RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in 
 """(k,) number of the first length in which noise is rare to each."""
 
 
-class Scatter:
+class Scatter(ByArithmetic):
     """Covariances of window means (k lengths, s streams, 6, 6)."""
 
     def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
-        self._by = by
+        super().__init__(by)
         lengths = len(LENGTHS)
         self._of_difference = np.zeros((lengths, streams, 6, 6))
         self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
