@@ -28,7 +28,7 @@ def normalised(error: np.ndarray, covariance: np.ndarray) -> float:
 def measurements(meter: NoisyMeter, reported: bool = True, count: int = SAMPLES) -> list[Measurement]:
     """Many, each with an opening that is told wrong by the stated standard deviation."""
     told_m = OPENING_M + np.random.default_rng(7).normal(scale=JAW_SIGMA_M, size=count)
-    return [meter.foresee(nominal_cam_T_grip(), opening_m, reported) for opening_m in told_m]
+    return [meter.forecast(nominal_cam_T_grip(), opening_m, reported) for opening_m in told_m]
 
 
 @pytest.mark.parametrize(

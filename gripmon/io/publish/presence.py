@@ -25,6 +25,7 @@ is looked at: 14.5 s after a SIGSTOP were measured.
 
 _CONNECTED_WITHIN_S = 2.0  # a router that isn't there yet is no reason to wait longer
 _LOOK_EVERY_S = 0.5
+_LOOKS_FOR_AN_ID = 4  # on a busy machine one isn't enough
 _NOT_IN_A_KEY = re.compile(r"[^A-Za-z0-9.]+")
 _LONGEST_HOST = 32
 
@@ -86,8 +87,11 @@ class Presence:
         session = self._session
         if session is None:
             return ()
-        if (found := self._ids(session)) == {""}:
-            # Zenoh answers at first without the tokens that our subscriber of ids waits for: look twice
+        found = self._ids(session)
+        for _ in range(_LOOKS_FOR_AN_ID):
+            if found != {""}:
+                break
+            # Zenoh answers at first without the tokens that our subscriber of ids waits for
             time.sleep(_LOOK_EVERY_S)
             found = self._ids(session)
         # a monitor with an id shows the token without one, too: "" counts only alone
