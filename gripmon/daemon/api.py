@@ -33,9 +33,8 @@ class Monitor(monitor.Monitor):
 
     def __init__(self, config: Config, state: MonitorState | None = None, keep: Keep = lambda _: "") -> None:
         """``state`` and ``keep``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for a state that doesn't
-        hold together.  The first one on a machine takes a minute: what frames need is compiled.
+        hold together.  The very first frame on a machine takes a minute: what frames need is compiled.
         """
-        monitor.warm_up()
         super().__init__(
             config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, state, keep
         )

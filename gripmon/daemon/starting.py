@@ -25,6 +25,7 @@ from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
 from gripmon.model.stopping import StopRequest
+from gripmon.monitor import warm_up
 from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
 from gripmon.record.write import ViewSettings, open_recorder, open_spot_recorder
 
@@ -115,8 +116,11 @@ def run_monitor(
         network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         on_network()
+        compiled = warm_up()  # before frames come
         source = open_configured(config, network.link)
         opened.callback(source.close)
+        if compiled:
+            _log.info("%s", compiled)
         with _recording_errors(config, out):
             recorder = open_recorder(
                 settings.recording,

@@ -20,20 +20,24 @@ MOST_UNKEPT = 1000
 """Functions that could not be kept on the disk, more than there are: something else is wrong."""
 
 
-def warm_up() -> None:
-    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine."""
+def warm_up() -> str:
+    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine; what a person
+    should know of it, or empty.
+    """
     if not COMPILES:
-        _log.warning("numba can't be imported: every frame takes about ten times as long (pip install numba)")
-        return
+        return "numba can't be imported: every frame takes about ten times as long (pip install numba)"
     begin_s = time.perf_counter()
     unkept = ""
     for part in (edges, integrity, drift, smoothing, poses):
         unkept = _warm(part.warm_up) or unkept
     took_s = time.perf_counter() - begin_s
+    _log.debug("the arithmetic of frames was ready after %.1f s", took_s)
+    if took_s < LOADED_WITHIN_S:
+        return ""
+    text = f"what every frame needs was compiled, in {took_s:.0f} s"
     if unkept:
-        _log.warning("what was compiled can't be kept (%s): every start takes so long; NUMBA_CACHE_DIR", unkept)
-    how = "compiled" if took_s > LOADED_WITHIN_S else "loaded"
-    _log.info("the arithmetic of frames is ready after %.1f s (%s)", took_s, how)
+        return f"{text}; it can't be kept ({unkept}), so that every start takes as long: set NUMBA_CACHE_DIR"
+    return f"{text}; the next start loads it"
 
 
 def _warm(part: Callable[[], object]) -> str:

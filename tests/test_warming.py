@@ -1,0 +1,78 @@
+"""What frames need is compiled before the first of them; where that can't be, or can't be kept, a person is told."""
+
+from __future__ import annotations
+
+import errno
+import os
+from types import SimpleNamespace
+
+import numba
+import pytest
+
+from gripmon.model import compiled
+from gripmon.monitor import warm_up, warming
+
+
+class Part:
+    """Takes a while, and fails some times as numba does that can't write what it has compiled."""
+
+    def __init__(self, failures: int = 0, takes_s: float = 0.0) -> None:
+        self.failures, self.takes_s = failures, takes_s
+
+    def warm_up(self) -> None:
+        CLOCK.now_s += self.takes_s
+        if self.failures:
+            self.failures -= 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+CLOCK = SimpleNamespace(now_s=0.0)
+
+
+@pytest.fixture
+def part(monkeypatch: pytest.MonkeyPatch) -> Part:
+    made = Part()
+    for name in ("edges", "integrity", "drift", "smoothing", "poses"):
+        monkeypatch.setattr(warming, name, made)
+    monkeypatch.setattr(warming, "time", SimpleNamespace(perf_counter=lambda: CLOCK.now_s))
+    return made
+
+
+def test_what_is_only_loaded_is_no_news(part: Part):
+    part.takes_s = 0.1
+    assert warm_up() == ""
+
+
+def test_a_first_start_says_what_took_so_long(part: Part):
+    part.takes_s = 8.0
+    assert warm_up() == "what every frame needs was compiled, in 40 s; the next start loads it"
+
+
+def test_a_full_disk_costs_time_at_every_start_and_no_start(part: Part):
+    part.takes_s, part.failures = 2.0, 7
+    said = warm_up()
+    assert part.failures == 0, "tried on: each failure is another function that works from then on"
+    assert "No space left on device" in said and "NUMBA_CACHE_DIR" in said
+
+
+def test_without_a_compiler_it_is_said_how_to_get_one(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(warming, "COMPILES", False)
+    assert "pip install numba" in warm_up()
+
+
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch):
+    """A service without a home on a read-only system: numba refuses to cache when the module is imported."""
+    njit, asked = numba.njit, []
+
+    def without_a_folder(**options: object) -> object:
+        asked.append(options)
+        if options.get("cache"):
+            raise RuntimeError("cannot cache function 'double': no locator available")
+        return njit(**options)
+
+    def double(x: float) -> float:
+        return x + x
+
+    monkeypatch.setattr(numba, "njit", without_a_folder)
+    assert compiled.compiled(double)(21.0) == 42.0
+    assert [bool(options.get("cache")) for options in asked] == [True, False]
