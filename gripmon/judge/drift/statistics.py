@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -41,14 +42,16 @@ _EITHER = {module.__name__: module for module in (kernel, plain)}
 
 
 class ByArithmetic:
-    """What calls the functions of one of both, by name: a module can't be copied, and what a stream has taught can."""
+    """What calls the functions of one of both, and can be copied with what a stream has taught: a module can't."""
 
     def __init__(self, by: ModuleType):
-        self._arithmetic = by.__name__
+        self._by = by
 
-    @property
-    def _by(self) -> ModuleType:
-        return _EITHER[self._arithmetic]
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_by": self._by.__name__}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _by=_EITHER[state["_by"]])
 
 
 class Windows(ByArithmetic):
