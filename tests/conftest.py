@@ -17,6 +17,7 @@ from support.loopback import free_endpoint, plain_session
 from support.published import Published
 
 from gripmon.io.wire import PublishSettings
+from gripmon.monitor import warm_up
 
 # No test fails because a machine is slow.
 hypothesis.settings.register_profile("unhurried", deadline=None)
@@ -24,6 +25,12 @@ hypothesis.settings.load_profile("unhurried")
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Machine code is made once, before workers and the processes of tests would make it, each for itself."""
+    if not hasattr(config, "workerinput"):
+        warm_up()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -59,6 +59,23 @@ def test_who_needs_a_result_waits_for_the_thread_that_makes_it():
     worker.join()
 
 
+def test_who_waits_for_a_result_does_not_do_what_comes_after_it():
+    """The frame that needs the first result has waited for the thread that makes it; the second is not due yet."""
+    backlog: Backlog[str] = Backlog()
+    began, may_end, after = threading.Event(), threading.Event(), []
+    backlog.add(lambda: began.set() or (may_end.wait(10.0) and "first"), 0.0)
+    worker = threading.Thread(target=lambda: backlog._do_next(), name="worker")
+    worker.start()
+    assert began.wait(10.0)
+    backlog.add(lambda: after.append(threading.current_thread().name) or "second", 5.0)
+    threading.Timer(0.05, may_end.set).start()
+    assert list(backlog.results(RESULT_AFTER_S)) == ["first"]
+    worker.join()
+    assert after == [] and backlog.undone and len(backlog) == 1
+    backlog.run()
+    assert not backlog.undone and len(backlog) == 1, "done, and still to be taken"
+
+
 @pytest.mark.parametrize("scene", ["bump", "bent_finger"])
 def test_a_thread_beside_the_frames_changes_no_record(scene: str):
     """A bump that has to be searched for, and a finger whose bend has to be worked out."""

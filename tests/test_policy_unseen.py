@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from support.policy_runs import (
@@ -46,6 +48,7 @@ def test_a_transform_is_suspect_while_its_error_may_exceed_an_alert_limit():
     assert reason.startswith("the TCP may be") and "alert limit 1 mm (edge a belongs" in reason
     verdict, reason = judged(1e-4, 1.05 * limit_rad)
     assert verdict is SUSPECT and reason is not None and reason.startswith("the rotation may be")
+    assert judged(math.nan, 1e-3)[0] is SUSPECT and judged(1e-4, math.nan)[0] is SUSPECT, "NaN bounds nothing"
     assert run.feed(seen(protection=None)).verdict is SUSPECT
     assert run.feed(seen(sigma=np.full(6, 0.1))).verdict is VALID, "bounds count, which are made of covariances"
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from gripmon.judge.causes import CauseJudge
+from gripmon.model.errors import in_short
 from gripmon.model.records import Array, EdgeEvidence, Explanation, Frame
 from gripmon.monitor.backlog import Backlog
 
@@ -51,7 +52,8 @@ class CauseAnalysis:
 
     @property
     def pending(self) -> bool:
-        return len(self._backlog) > 0
+        """Whether there is something to do for :meth:`run_pending`."""
+        return self._backlog.undone
 
     def rebase(self, reference_sigma: Array) -> None:
         """There is a new reference, with standard deviations (6,), m and rad."""
@@ -115,8 +117,7 @@ class CauseAnalysis:
         """Take over what is due.  What has failed costs an explanation, not a frame."""
         for found in self._backlog.results(now_s):
             if isinstance(found, Exception):
-                text = f"cause analysis failed: {type(found).__name__}: {found}"
-                self._explanation = Explanation(text=text)
+                self._explanation = Explanation(text=f"cause analysis failed: {in_short(found)}")
                 continue
             self._wants_baseline = found.wants_baseline
             if found.explanation is not None and found.episode == self._episode:

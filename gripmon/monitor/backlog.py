@@ -41,6 +41,11 @@ class Backlog(Generic[_T]):
         """Tasks whose results haven't been taken."""
         return len(self._tasks)
 
+    @property
+    def undone(self) -> bool:
+        """Whether there is something to :meth:`run`."""
+        return len(self._undone) > 0
+
     def add(self, work: Callable[[], _T], now_s: float = -math.inf) -> None:
         """Begin something in the frame of ``now_s``; without a time its result counts as soon as those before do."""
         task = _Task(work, now_s + RESULT_AFTER_S)
@@ -54,7 +59,7 @@ class Backlog(Generic[_T]):
         while self._tasks and self._tasks[0].due_s <= now_s:
             task = self._tasks.popleft()
             while not task.done:
-                self._do_next()
+                self._do_next(task)
             assert task.result is not None
             yield task.result
 
@@ -63,9 +68,10 @@ class Backlog(Generic[_T]):
         while self._undone:
             self._do_next()
 
-    def _do_next(self) -> None:
+    def _do_next(self, wanted: _Task[_T] | None = None) -> None:
+        """The next task; nothing if what is ``wanted`` was done meanwhile: a frame doesn't pay for what isn't due."""
         with self._one_at_a_time:
-            if not self._undone:
+            if not self._undone or (wanted is not None and wanted.done):
                 return
             task = self._undone.popleft()
             try:

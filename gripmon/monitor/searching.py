@@ -32,7 +32,8 @@ class GripperSearch:
 
     @property
     def pending(self) -> bool:
-        return len(self._backlog) > 0
+        """Whether there is something to do for :meth:`run_pending`."""
+        return self._backlog.undone
 
     def run_pending(self) -> None:
         """Do what is waiting; in any thread."""
@@ -45,7 +46,7 @@ class GripperSearch:
             if isinstance(found, Exception):
                 raise found
             self._found = found
-        if self._found is not None or self.pending:
+        if self._found is not None or len(self._backlog):
             return Patience(self._found is not None, self._found is not None)
         eager = self._searches < self._settings.eager_frames
         return Patience(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 
@@ -28,8 +29,12 @@ def warm_up() -> str:
         return "numba can't be imported: every frame takes about ten times as long (pip install numba)"
     begin_s = time.perf_counter()
     unkept = ""
+    patience = threading.Timer(LOADED_WITHIN_S, _log.info, ["compiling what every frame needs: about a minute, once"])
+    patience.daemon = True
+    patience.start()
     for part in (edges, integrity, drift, smoothing, poses):
         unkept = _warm(part.warm_up) or unkept
+    patience.cancel()
     took_s = time.perf_counter() - begin_s
     _log.debug("the arithmetic of frames was ready after %.1f s", took_s)
     if took_s < LOADED_WITHIN_S:

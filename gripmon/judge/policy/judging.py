@@ -345,14 +345,14 @@ class Policy:
 
 
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
-    """Which bound is above its alert limit, in words; None where neither is."""
+    """Which bound is not within its alert limit, in words; None where both are.  One that is NaN bounds nothing."""
     if protection is None:
         return "no bound on the error is known"
     hypothesis = f" ({protection.hypothesis})" if protection.hypothesis else ""
-    if protection.position_m > settings.alert_limit_m:
+    if not protection.position_m <= settings.alert_limit_m:
         limit_mm = 1e3 * settings.alert_limit_m
         return f"the TCP may be {1e3 * protection.position_m:.2g} mm off, alert limit {limit_mm:g} mm{hypothesis}"
-    if protection.rotation_rad > settings.alert_limit_rad:
+    if not protection.rotation_rad <= settings.alert_limit_rad:
         limit = math.degrees(settings.alert_limit_rad)
         may = math.degrees(protection.rotation_rad)
         return f"the rotation may be {may:.2g} degrees off, alert limit {limit:.2g} degrees{hypothesis}"
