@@ -275,6 +275,21 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
     assert bound_m[1e5, 1.0] > 0.1
 
 
+def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_than_they_exclude():
+    """Each excludes nine of ten, and one in 1e5 is asked for: a knock that has happened in 1e-3 of such times."""
+    monitor = new_monitor(MonitorSettings(policy=PolicySettings(mount_jumps_per_month=1.0, integrity_risk=1e-5)))
+    for frame in frames_of(scene(BEGINS))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    seen, along = measurement.consensus.edge_seen, monitor._tracker.along
+    sides = np.flatnonzero(seen & along)[:2]
+    of_two = replace(measurement, normal=replace(measurement.normal, edge=sides))
+    month_s = 365.25 / 12 * 86400.0
+    assert weigher.held_across(of_two, weigher.anchor.now_s + 0.9e-3 * month_s)
+    assert not weigher.held_across(of_two, weigher.anchor.now_s + 1.1e-3 * month_s)
+
+
 def test_while_images_are_refused_the_bound_grows_with_time():
     frames, truths = frames_of(scene(36))
     dark = [

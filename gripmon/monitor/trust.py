@@ -207,7 +207,7 @@ class Integrity:
         """
         weigher = self._weigher
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
-        if there is None or there.trust.displaced or not weigher.held_across(there.measurement):
+        if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
         return there
 

@@ -215,13 +215,15 @@ class Weigher:
         by_edge = set(self._gripper.edge_finger[edge].tolist())
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
-    def held_across(self, measurement: Measurement) -> bool:
-        """Whether enough of the fingers' sides is seen where they are expected to exclude an unseen knock across the
-        fingers, of which their ends' edges say nothing: each side may be misread as an end may.
+    def held_across(self, measurement: Measurement, now_s: float) -> bool:
+        """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
+        proven, of which their ends' edges say nothing: each side may be misread as an end may.
         """
+        assert self.anchor is not None
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._tracker.along[edge]).sum())
-        return KNOCKED_UNSEEN * MISREAD_END**sides <= self._policy.integrity_risk
+        knocked = self._knocked(now_s - self.anchor.now_s, hidden=True)
+        return knocked * MISREAD_END**sides <= self._policy.integrity_risk
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The bound by what the first frames differ from the reference, ``away`` (6,)."""
