@@ -22,6 +22,9 @@ _POINT_PX, _CORNER_PX, _LINE_PX = 1.6, 3.5, 0.6
 _LABEL_HEIGHT_FRACTION = 0.05  # of the image's
 _IMAGE_PLANE_FRACTION = 1.35  # of the distance to the TCP: the image is a backdrop for the fingers
 _AXIS_M, _LINE_M = 0.012, 0.0004
+_CURVE_POINTS = 33
+"""Points of a curved edge in the 3D view."""
+
 _JAW_STEP_M = 2e-5  # the fingers are drawn again
 _EYE = (0.66, -0.36, -0.03)  # beside and above, so that camera and gripper are both in sight
 _LOOK_AT_FRACTION = 0.64  # of the way from camera to TCP
@@ -217,22 +220,23 @@ class RigWriter:
 
     def _write_fingers(self, rows: Sequence[Row]) -> None:
         """The fingers as they are and, white, at the reference; without estimate there is only that."""
-        ends = self._gripper.edge_points
         looks = [self._look(row.record) for row in rows]
         points_m = [self._points_at(opening_m) for opening_m, _ in looks]
+        outlines = [self._outlines(some) for some in points_m]
         posed = [row.record.cam_T_grip is not None for row in rows]
-        counts = [len(ends) * shown for shown in posed]
+        edge_count = len(self._gripper.edge_ids)
+        counts = [edge_count * shown for shown in posed]
         edges = rr.LineStrips3D.columns(
-            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[ends]],
+            strips=[s for some, shown in zip(outlines, posed, strict=True) if shown for s in some],
             colors=[Palette.VERDICTS[v] for (_, v), n in zip(looks, counts, strict=True) for _ in range(n)],
             radii=[_LINE_M] * sum(counts),
         )
         self._send.frames("rig/gripper/edges", rows, edges.partition(counts))
-        ghosts = [strip for some in points_m for strip in some[ends]]
+        ghosts = [strip for some in outlines for strip in some]
         wires = rr.LineStrips3D.columns(
             strips=ghosts, colors=[Palette.REFERENCE] * len(ghosts), radii=[0.7 * _LINE_M] * len(ghosts)
         )
-        self._send.frames("rig/reference/edges", rows, wires.partition([len(ends)] * len(rows)))
+        self._send.frames("rig/reference/edges", rows, wires.partition([edge_count] * len(rows)))
         if len(self._triangles):
             solids = [
                 some[self._face_points] if shown else _NO_POINTS for some, shown in zip(points_m, posed, strict=True)
@@ -252,6 +256,14 @@ class RigWriter:
             radii=[_LINE_M] * len(known),
         )
         self._send.frames("rig/tcp_shift", rows, columns.partition([int(arrow is not None) for arrow in arrows]))
+
+    def _outlines(self, points_m: Array) -> list[Array]:
+        """(s, 3) each: an edge's two ends, or points along a curved one."""
+        gripper = self._gripper
+        outlines = list(points_m[gripper.edge_points])
+        for edge in np.flatnonzero(gripper.edge_curved).tolist():
+            outlines[edge] = gripper.outlines_m(points_m, np.array([edge]), _CURVE_POINTS)[0]
+        return outlines
 
     def _points_at(self, opening_m: float) -> Array:
         """(p, 3) in the gripper frame; a picture, so an opening outside the jaw's range shows the end of it."""

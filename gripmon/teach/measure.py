@@ -146,6 +146,9 @@ def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[in
     """Lines of all edges that some image samples, and why creases have none: outlines then come without a line."""
     lines, untaught = {}, {}
     for edge in sorted({e for view in views for e in view.prediction.layout.edges.tolist()}):
+        if viewer.gripper.edge_curved[edge]:
+            untaught[viewer.gripper.edge_ids[edge]] = "it is curved"
+            continue
         seen = sampled(views, edge)
         found = "out of view" if seen is None else _lines_of(seen, len(views), search)
         if isinstance(found, EdgeLines):

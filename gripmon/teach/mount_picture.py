@@ -205,10 +205,9 @@ def _edges(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
     camera, gripper = rig.camera, rig.gripper
     image = np.full((camera.height_px, camera.width_px), 170, dtype=np.uint8)
     points_m = gripper.points_grip_m(jaw_opening_m) @ trial.cam_T_grip[:3, :3].T + trial.cam_T_grip[:3, 3]
-    along = np.linspace(0.0, 1.0, 50)[:, None]
     thickness = max(round(camera.width_px / 250), 1)
-    for first, last in gripper.edge_points:
-        uv = camera.project(points_m[first] + along * (points_m[last] - points_m[first]))
+    for outline_m in gripper.outlines_m(points_m, np.arange(len(gripper.edge_ids)), 50, trial.cam_T_grip[:3, :3]):
+        uv = camera.project(outline_m)
         # What lies far outside of the image overflows OpenCV's integers.
         seen = np.all(np.isfinite(uv) & (np.abs(uv) < 1e5), axis=1)
         whole = np.rint(np.where(seen[:, None], uv, 0.0)).astype(int).tolist()

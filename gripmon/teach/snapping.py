@@ -248,11 +248,9 @@ def outlines_px(
     """Where the visible edges show: name: (points, 2), px, without those that the lens maps nowhere."""
     points_m = gripper.points_grip_m(jaw_opening_m)
     eye_m = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
-    way = np.linspace(0.0, 1.0, points)[:, None]
+    edges = np.flatnonzero(gripper.edge_view(points_m, eye_m).visible)
     out = {}
-    for edge in np.flatnonzero(gripper.edge_view(points_m, eye_m).visible).tolist():
-        start, end = points_m[gripper.edge_points[edge]]
-        line_m = start + way * (end - start)
+    for edge, line_m in zip(edges.tolist(), gripper.outlines_m(points_m, edges, points), strict=True):
         uv_px = camera.project(line_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         if np.isfinite(uv_px).all(axis=1).sum() > 1:
             out[gripper.edge_ids[edge]] = uv_px[np.isfinite(uv_px).all(axis=1)]

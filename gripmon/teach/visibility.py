@@ -122,8 +122,8 @@ def samples_behind(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array, e
 
 def _samples(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array) -> tuple[Array, NDArray[np.intp]]:
     """A layout's samples (n, 3) in the gripper frame, and their fingers (n,)."""
-    ends = points_grip_m[gripper.edge_points[layout.edge]]
-    samples_m = ends[:, 0] + layout.fraction[:, None] * (ends[:, 1] - ends[:, 0])
+    start, end = gripper.tangents_m(points_grip_m, layout.edge, layout.fraction)
+    samples_m = start + layout.fraction[:, None] * (end - start)
     return samples_m, gripper.edge_finger[layout.edge]
 
 

@@ -22,6 +22,7 @@ from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
+from gripmon.track.edges import finger_of_ends
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""
@@ -224,7 +225,7 @@ def _not_seen_elsewhere(
     before clutter or because the fingertips are round, can't be missed.
     """
     expected = pooled.ends_in_view if baseline is None else pooled.ends_in_view & baseline.ends
-    finger, fingers = gripper.point_finger[gripper.corner_points], len(gripper.finger_ids)
+    finger, fingers = finger_of_ends(gripper), len(gripper.finger_ids)
     wanted = np.bincount(finger[expected], minlength=fingers)
     endless = np.bincount(finger[pooled.ends], minlength=fingers) < np.minimum(wanted, END_CORNERS)
     return np.asarray(endless & (comparison.elsewhere <= GONE))

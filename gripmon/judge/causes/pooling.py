@@ -36,8 +36,8 @@ FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
 class Pooled:
     """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
     edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
-    finger's own place in enough of the frames, NaN where it isn't in view; ``ends`` (c,) corners seen there as ends of
-    their finger in enough of the frames, and ``ends_in_view`` (c,) those that might be; ``blur_px2``: of the lens, None
+    finger's own place in enough of the frames, NaN where it isn't in view; ``ends`` (p,) places seen there as ends of
+    their finger in enough of the frames, and ``ends_in_view`` (p,) those that might be; ``blur_px2``: of the lens, None
     where it can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander``
     (12, 16) of the cells from frame to frame; ``frames`` that it was made of.
     """
@@ -136,7 +136,7 @@ def _share(frames: Sequence[EdgeEvidence]) -> Array:
 
 
 def _often(flags: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """(c,) what holds in as many of the frames as a piece has to be seen in."""
+    """(p,) what holds in as many of the frames as a piece has to be seen in."""
     return np.asarray(np.mean(flags, axis=0) >= SEEN_IN)
 
 

@@ -85,7 +85,7 @@ def edge_places(gripper: Gripper, state: State, edge: NDArray[np.intp], fraction
     across them in which offsets count as positive.
     """
     points, _, _ = points_cam(gripper, state, opened(gripper, state.jaw_opening_m))
-    a, b = points[gripper.edge_points[edge, 0]], points[gripper.edge_points[edge, 1]]
+    a, b = gripper.tangents_m(points, edge, fraction, state.cam_T_grip[:3, :3])
     spot = a + fraction[:, None] * (b - a)
     return spot[:, :2] / spot[:, 2:], _across(a, b)
 
@@ -95,7 +95,7 @@ class EdgeView:
 
     def __init__(self, camera: Camera, gripper: Gripper, evidence: EdgeEvidence):
         self._gripper, self._evidence = gripper, evidence
-        self._ends = gripper.edge_points[evidence.edge]
+        self._start = gripper.edge_points[evidence.edge, 0]
         self._finger = gripper.edge_finger[evidence.edge]
         self._camera = camera
         self._uv_px = camera.distort(evidence.xy)
@@ -111,7 +111,7 @@ class EdgeView:
         if self._opened is None or self._opened[0] != state.jaw_opening_m:
             self._opened = state.jaw_opening_m, opened(self._gripper, state.jaw_opening_m)
         points, rate, middle = points_cam(self._gripper, state, self._opened[1])
-        a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
+        a, b = self._tangents(points, state)
         xy, by_focal = self._ideal(state.log_focal)
         line = _cross(a, b)
         perp = _across(a, b)
@@ -132,11 +132,15 @@ class EdgeView:
         """
         residual, _ = self.residual(state)
         points, _, _ = points_cam(self._gripper, state, opened(self._gripper, state.jaw_opening_m))
-        a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
+        a, b = self._tangents(points, state)
         perp = _across(a, b)
         spot = _on_edge(a, b, self._ideal(state.log_focal)[0], np.column_stack([perp[:, 1], -perp[:, 0]]))
         span = b - a
         return residual, np.einsum("si,si->s", spot - a, span) / np.einsum("si,si->s", span, span)
+
+    def _tangents(self, points: Array, state: State) -> tuple[Array, Array]:
+        evidence = self._evidence
+        return self._gripper.tangents_m(points, evidence.edge, evidence.fraction, state.cam_T_grip[:3, :3])
 
     def _ideal(self, log_focal: float) -> tuple[Array, Array]:
         """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
@@ -155,7 +159,7 @@ class EdgeView:
         out = np.zeros((len(spot), FINGERS + state.finger.size))
         out[:, :3] = gradient
         out[:, 3:6] = _cross(spot - state.cam_T_grip[:3, 3], gradient)
-        out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._ends[:, 0]])
+        out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._start])
         out[:, FOCAL] = by_focal
         about_middle = _cross(spot - middle[self._finger] - state.finger[self._finger, :3], gradient)
         for finger in range(len(state.finger)):

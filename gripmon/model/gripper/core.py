@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.gripper.curves import Curves
 from gripmon.model.gripper.faces import (
     LARGEST_SKEW,
     LARGEST_WARP_M,
@@ -67,6 +68,9 @@ class Gripper:
         self._corners_outwards = self._from_the_tcp_outwards()
         self.edge_points = np.array([self._ends(n, e) for n, e in model.edges.items()], dtype=np.intp).reshape(-1, 2)
         self.edge_finger = self.point_finger[self.edge_points[:, 0]]
+        through = [self._through(n, e, p) for (n, e), p in zip(model.edges.items(), self.edge_points, strict=True)]
+        self._curves = Curves(through, self.edge_ids)
+        self.edge_curved, self.has_curves = self._curves.curved, bool(self._curves.curved.any())
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
@@ -102,6 +106,32 @@ class Gripper:
         rate = (self._finger_offsets_m(high) - self._finger_offsets_m(low)) / (high - low)
         return rate[self.point_finger]
 
+    def tangents_m(
+        self, points_m: Array, edge: NDArray[np.intp], fraction: Array, rotation: Array | None = None
+    ) -> tuple[Array, Array]:
+        """``start`` and ``end`` (n, 3) for fractions (n,) of edges (n,): the place is ``start + fraction * (end -
+        start)``, and the edge goes ``end - start`` there.  A straight edge's two ends; on a curved one its tangent's.
+
+        ``points_m`` (p, 3): the gripper's points, in a frame that ``rotation`` (3, 3) turns its axes to.
+        """
+        ends = self.edge_points[edge]
+        start, end = points_m[ends[:, 0]], points_m[ends[:, 1]]
+        if self.has_curves:
+            bulge, rate = self._curves.bulge_m(edge, fraction)
+            before, behind = bulge - fraction[:, None] * rate, bulge + (1.0 - fraction[:, None]) * rate
+            if rotation is not None:
+                before, behind = before @ rotation.T, behind @ rotation.T
+            start, end = start + before, end + behind
+        return start, end
+
+    def outlines_m(self, points_m: Array, edges: NDArray[np.intp], count: int, rotation: Array | None = None) -> Array:
+        """(k, count, 3) places along edges (k,), evenly from end to end; ``points_m``, ``rotation`` as for
+        :meth:`tangents_m`.
+        """
+        edge, fraction = np.repeat(edges, count), np.tile(np.linspace(0.0, 1.0, count), len(edges))
+        start, end = self.tangents_m(points_m, edge, fraction, rotation)
+        return np.asarray(start + fraction[:, None] * (end - start)).reshape(len(edges), count, 3)
+
     def edge_view(self, points_grip_m: Array, eye_grip_m: Array) -> EdgeView:
         """Which edges show from ``eye_grip_m`` (3,), the camera's centre in the gripper frame."""
         facing = self._facing(points_grip_m, eye_grip_m)
@@ -121,8 +151,11 @@ class Gripper:
         return np.asarray(~self._corner_faces.any(axis=1) | (self._corner_faces & facing[:-1]).any(axis=1))
 
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
-        """Indices of the edges that end in a corner (index into ``corner_ids``)."""
-        return np.flatnonzero((self.edge_points == self.corner_points[corner]).any(axis=1))
+        """Indices of the straight edges that end in a corner (index into ``corner_ids``): those that can be
+        intersected.
+        """
+        at_it = (self.edge_points == self.corner_points[corner]).any(axis=1)
+        return np.flatnonzero(at_it & ~self.edge_curved)
 
     def innermost_corners(self, among: NDArray[np.bool_], count: int | None) -> NDArray[np.bool_]:
         """(c,) at most ``count`` (None: all) of the corners ``among`` (c,): the nearest to the TCP, fingers taking
@@ -167,6 +200,16 @@ class Gripper:
         if not np.linalg.norm(self._nominal_points_m[i] - self._nominal_points_m[j]) > 1e-4:
             raise GripperError(f"edges.{name}: its ends are less than 0.1 mm apart; two different points")
         return i, j
+
+    def _through(self, name: str, edge: EdgeModel, ends: NDArray[np.intp]) -> Array | None:
+        """All points (n, 3) of a curved edge at the nominal opening; None for a straight one."""
+        if not edge.via:
+            return None
+        via_m = np.array(edge.via, dtype=float)
+        if not np.isfinite(via_m).all() or np.abs(via_m).max() > LARGEST_EXTENT_M:
+            raise GripperError(f"edges.{name}.via: a value that is not finite or over a metre; metres")
+        first, last = self._nominal_points_m[ends]
+        return np.vstack([first, via_m, last])
 
     def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> list[FaceLoop]:
         unknown = [p for p in face.points if p not in self._point_index]
@@ -258,18 +301,20 @@ class Gripper:
         if not self.finger_ids:
             raise GripperError("fingers: there are none; at least one finger")
         corners = self._nominal_points_m[self.corner_points]
-        if len(corners) < 3:
+        if self.has_curves:  # it may have no corner at all: then it is measured, and not recalibrated by corners
+            pass
+        elif len(corners) < 3:
             raise GripperError(
                 f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line"
             )
-        if on_a_line(corners):
+        elif on_a_line(corners):
             raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
         if len(self.edge_ids) < 3:
             raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
         for i, name in enumerate(self.corner_ids):
             if len(self.edges_at_corner(i)) < 2:
                 raise GripperError(
-                    f"points.{name}: fewer than two edges end in this corner; a corner is where edges meet"
+                    f"points.{name}: fewer than two straight edges end in this corner; a corner is where edges meet"
                 )
 
 

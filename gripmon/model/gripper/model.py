@@ -54,6 +54,9 @@ class EdgeModel(
     kind: Literal["contour", "crease"] = "contour"
     brighter: Literal["left", "right", "any"] = "any"
     bevel_m: Annotated[float, Meta(ge=0.0, le=0.02, description="width of a bevel or rounding (m)")] = 0.0
+    via: Annotated[
+        tuple[Vector, ...], Meta(max_length=62, description="a curved edge: points on it in turn, without its ends (m)")
+    ] = ()
 
 
 class FaceModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -75,4 +78,8 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 def contents_of(model: GripperModel) -> dict[str, Any]:
     """What a gripper file says of the gripper, for digests: all but where the file comes from."""
-    return {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
+    contents = {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
+    for edge in contents["edges"].values():
+        if not edge["via"]:  # digests of grippers without curves are older than curves
+            del edge["via"]
+    return contents

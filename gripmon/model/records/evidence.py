@@ -28,12 +28,12 @@ class EdgeEvidence:
     ``spread_px`` (s,) what all stretches of an edge share.  ``blur_px2`` (s,): variance of the edge's blur across it,
     and ``across`` (s, 2) that direction in the image.
 
-    ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where none
-    was sampled; of the gripper's corners ``ends`` (c,) those that are seen there as ends of their finger, with nothing
-    that goes on beyond them, and ``ends_in_view`` (c,) those that might be.  ``reach_px``: how far from the measured
-    pose edges were looked for at first.  Of the image, as parts of the full scale: ``noise`` of a pixel; ``brightest``:
-    what only one pixel in a hundred exceeds; ``steepest``: what only one difference of neighbours in a thousand
-    exceeds; ``cells`` (12, 16): the grey levels of its parts.
+    ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where
+    none was sampled; of the places at which fingers may end, the gripper's corners first, ``ends`` (p,) those that
+    are seen there as such, with nothing that goes on beyond them, and ``ends_in_view`` (p,) those that might be.
+    ``reach_px``: how far from the measured pose edges were looked for at first. Of the image, as parts of the full
+    scale: ``noise`` of a pixel; ``brightest``: what only one pixel in a hundred exceeds; ``steepest``: what only
+    one difference of neighbours in a thousand exceeds; ``cells`` (12, 16): the grey levels of its parts.
     """
 
     cam_T_grip: Array

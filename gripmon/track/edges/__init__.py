@@ -1,7 +1,7 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
 from gripmon.track.edges.consensus import prior_information
-from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen
+from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, finger_of_ends
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
@@ -26,6 +26,7 @@ __all__ = [
     "TaughtModel",
     "agreeing_fingers",
     "edge_sums",
+    "finger_of_ends",
     "prior_information",
     "trace_of",
     "warm_up",

@@ -234,14 +234,15 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
 
     Expressed as translations of the gripper across the axis, rotation about the optical axis, and translation along it.
     """
-    middle = prediction.corners.cam_m.mean(axis=0)
+    corners_m = prediction.corners.cam_m
+    depth_m = float(corners_m[:, 2].mean()) if len(corners_m) else float(prediction.cam_T_grip[2, 3])
     span_px = float(np.abs(prediction.uv_px - prediction.uv_px.mean(axis=0)).max())
     ticks = np.arange(-round(reach_px / step_px), round(reach_px / step_px) + 1) * step_px
     turns = np.array([-1.0, 0.0, 1.0]) * 0.6 * reach_px / span_px
     dx, dy, scale, turn = (a.ravel() for a in np.meshgrid(ticks, ticks, turns, turns, indexing="ij"))
     starts = np.zeros((len(dx), prediction.jacobian.shape[1]))
     starts[:, 0], starts[:, 1] = dx / prediction.pixels_per_m, dy / prediction.pixels_per_m
-    starts[:, 2] = scale * middle[2]
+    starts[:, 2] = scale * depth_m
     starts[:, 5] = turn
     return starts
 

@@ -2,7 +2,7 @@
 
 Edges along a finger say nothing about a motion along it; only its ends do, and a rim, a fold or a plate's border
 parallel to them looks like them.  But such a border goes on beside the finger, and a finger that reaches farther goes
-on beyond it.
+on beyond it.  A rounded fingertip has no corner: there the curve is seen, and the side that it begins at doesn't go on.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ REACH_PX = 4.0
 NEAR_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
 
+CLEAR_OF_CURVE_PX = 2.0 * NEAR_PX
+"""So far beside a continued side its curve is no continuation of it, with as much again for what it is off by, px."""
+
 AS_STRONG = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
 
@@ -70,8 +73,8 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class FingerEndsSeen:
-    """(f,) corners at the end of each finger: ``seen`` with nothing that goes on beyond them, and those that ``might``
-    be seen in this view.
+    """(f,) corners at the end of each finger, or places where its sides turn into a curve: ``seen`` with nothing that
+    goes on beyond them, and those that ``might`` be seen in this view.
     """
 
     seen: NDArray[np.intp]
@@ -96,59 +99,104 @@ class FingerEndsSeen:
 
 @dataclass(frozen=True, slots=True)
 class _Probes:
-    """Profiles beyond corners, for one prediction; c extensions of :data:`PROBES` each.
+    """Profiles beyond places, for one prediction; c extensions of :data:`PROBES` each.
 
-    ``corner`` (c,) of the gripper, ``sample`` (c,) the edge's profile next to the corner, ``ok`` (c * PROBES,).
+    ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's profile next to it, ``ok`` (c *
+    PROBES,).
     """
 
-    corner: NDArray[np.intp]
+    place: NDArray[np.intp]
     sample: NDArray[np.intp]
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
     ok: NDArray[np.bool_]
 
 
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Where fingers may end, s places: all corners of the gripper in their order, then where sides turn into curves.
+
+    ``point`` and ``finger`` (s,) of each, ``at_end`` (s,) whether its finger ends there; ``corner`` (s,), or -1 where
+    the edge ``side`` (s,) turns into the curved edge ``curve`` (s,), each -1 at a corner.
+    """
+
+    point: NDArray[np.intp]
+    finger: NDArray[np.intp]
+    at_end: NDArray[np.bool_]
+    corner: NDArray[np.intp]
+    side: NDArray[np.intp]
+    curve: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, gripper: Gripper, along: NDArray[np.bool_]) -> _Places:
+        rows: list[tuple[int, bool, int, int, int]] = []
+        for number, point in enumerate(gripper.corner_points.tolist()):
+            at_it = along[gripper.edges_at_corner(number)]
+            # Without a direction of the fingers every corner is an end.
+            at_end = bool(along.all() or (at_it.any() and not at_it.all()))
+            rows.append((point, at_end, number, -1, -1))
+        corners = set(gripper.corner_points.tolist())
+        for curve in np.flatnonzero(gripper.edge_curved & ~along).tolist():
+            for point in set(gripper.edge_points[curve].tolist()) - corners:
+                at_it = (gripper.edge_points == point).any(axis=1)
+                rows += [(point, True, -1, side, curve) for side in np.flatnonzero(at_it & along).tolist()[:1]]
+        columns = np.array(rows, dtype=np.intp).reshape(-1, 5).T
+        return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, columns[2], columns[3], columns[4])
+
+
+def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
+    """(s,) the finger of each place at which one may end: the gripper's corners, then where sides turn into curves."""
+    return _Places.of(gripper, along_fingers(gripper)[1]).finger
+
+
 class FingerEnds:
-    """Looks beyond the corners at the ends of one gripper's fingers."""
+    """Looks beyond the ends of one gripper's fingers."""
 
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
         self.axis, self.along = along_fingers(gripper)
-        at_corner = [self.along[gripper.edges_at_corner(i)] for i in range(len(gripper.corner_ids))]
-        # Without a direction of the fingers every corner is an end.
-        self._at_end = np.array([self.along.all() or (a.any() and not a.all()) for a in at_corner], dtype=bool)
+        self._places = _Places.of(gripper, self.along)
         self._kept: tuple[Prediction, _Probes] | None = None
+
+    @property
+    def finger(self) -> NDArray[np.intp]:
+        """(s,) the finger of each place at which one ends."""
+        return self._places.finger
 
     def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """How many of each finger's ends are seen; takes as long as a fourth of a measurement.  ``strict``: see
-        :meth:`at_corners`.
+        :meth:`at_places`.
         """
-        gripper = self._gripper
-        finger = gripper.point_finger[gripper.corner_points]
-        fingers = len(gripper.finger_ids)
+        fingers = len(self._gripper.finger_ids)
         return FingerEndsSeen(
-            np.bincount(finger[self.at_corners(image, measurement, strict)], minlength=fingers),
-            np.bincount(finger[self.in_view(measurement.prediction)], minlength=fingers),
+            np.bincount(self.finger[self.at_places(image, measurement, strict)], minlength=fingers),
+            np.bincount(self.finger[self.in_view(measurement.prediction)], minlength=fingers),
         )
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
-        """(c,) the corners that might be seen as ends in this view."""
-        return self._at_end & prediction.corners.visible
+        """(s,) the places that might be seen as ends in this view."""
+        places, profiles = self._places, prediction.profiles
+        curved = (profiles[places.side] > 0) & (profiles[places.curve] > 0)
+        return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
-    def at_corners(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
-        """(c,) the measured corners that are ends: looks beyond them.
+    def at_places(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
+        """(s,) the measured places that are ends: looks beyond them.
 
         ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
-        prediction, corners = measurement.prediction, measurement.corners
+        prediction, places, seen = measurement.prediction, self._places, measurement.consensus.edge_seen
         if self._kept is None or self._kept[0] is not prediction:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
-        measured = self._at_end & corners.usable
+        curved = seen[places.side] & seen[places.curve]
+        cornered = _of_corners(measurement.corners.usable, places)
+        measured = places.at_end & np.where(places.corner < 0, curved, cornered)
         goes_on = np.zeros(len(measured), dtype=bool)
-        if len(probes.corner) and measured.any():
-            goes_on[probes.corner[self._going_on(image, measurement, probes, strict)]] = True
-        return measured & ~goes_on
+        if len(probes.place) and measured.any():
+            goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
+        # A side whose curve never leaves its direction has no end there.
+        looked = np.isin(np.arange(len(measured)), probes.place) | (places.corner >= 0)
+        return measured & looked & ~goes_on
 
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
@@ -161,47 +209,71 @@ class FingerEnds:
         near = np.abs(found.offset_px - offset_px[of]) < NEAR_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
         strong = near & (np.abs(found.step) > AS_STRONG * np.abs(step[of]))
-        shown, well_shown = np.zeros((2, len(probes.corner), PROBES), dtype=bool)
+        shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
         goes_on = well_shown[:, CLEAR:].mean(axis=1) > GOES_ON
         return np.asarray(goes_on | shown[:, :FROM_THE_CORNER].all(axis=1) if strict else goes_on)
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
-        gripper, layout, uv_px = self._gripper, prediction.layout, prediction.corners.uv_px
-        bounds = [*layout.first.tolist(), len(layout.edge)]
-        corner, sample, place, normal = [], [], [], []
-        for slot, edge in enumerate(layout.edges.tolist()):
-            ends = (bounds[slot], bounds[slot + 1] - 1)
-            for point, here, there in zip(gripper.edge_points[edge].tolist(), ends, ends[::-1], strict=True):
-                number = np.flatnonzero(gripper.corner_points == point)
-                if not len(number) or not self._at_end[number[0]]:
+        places, points = self._places, self._gripper.edge_points
+        place, sample, at, across = [], [], [], []
+        for slot, edge in enumerate(prediction.layout.edges.tolist()):
+            for number in np.flatnonzero(places.at_end & np.isin(places.point, points[edge])).tolist():
+                if places.corner[number] < 0 and places.side[number] != edge:
                     continue
-                way = prediction.uv_px[here] - prediction.uv_px[there]
-                length = float(np.linalg.norm(way))
-                if not length > 1.0:
+                beyond = self._beyond(prediction, slot, edge, number)
+                if beyond is None:
                     continue
-                reach = np.linspace(*BEYOND_PX, PROBES)
-                corner.append(int(number[0]))
+                here, from_uv_px, way = beyond
+                place.append(number)
                 sample.append(here)
-                place.append(uv_px[number[0]] + reach[:, None] * (way / length))
-                normal.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
-        if not corner:
+                at.append(from_uv_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
+                across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
+        if not place:
             nowhere = np.zeros((0, 3), dtype=np.float32)
             none = np.zeros(0, dtype=np.intp)
             return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool))
         half = round(REACH_PX / STEP_PX)
         offsets = np.arange(-half, half + 1) * STEP_PX
-        at, across = np.concatenate(place), np.concatenate(normal)
-        maps = at[:, :, None] + across[:, :, None] * offsets
-        inside = np.isfinite(at).all(axis=1)
+        probes = np.concatenate(at)
+        maps = probes[:, :, None] + np.concatenate(across)[:, :, None] * offsets
+        inside: NDArray[np.bool_] = np.asarray(np.isfinite(probes).all(axis=1))
         return _Probes(
-            np.array(corner, dtype=np.intp),
+            np.array(place, dtype=np.intp),
             np.array(sample, dtype=np.intp),
             np.nan_to_num(maps[:, 0]).astype(np.float32),
             np.nan_to_num(maps[:, 1]).astype(np.float32),
             inside,
         )
+
+    def _beyond(self, prediction: Prediction, slot: int, edge: int, number: int) -> tuple[int, Array, Array] | None:
+        """Beyond a place at an end of a sampled edge: the edge's profile next to it, where (2,), px, to look from, and
+        the way (2,) in which the edge would go on.  None if it is too short for one, or its curve goes the same way.
+        """
+        layout, places, uv_px = prediction.layout, self._places, prediction.uv_px
+        ends = layout.first[slot], np.append(layout.first, len(layout.edge))[slot + 1] - 1
+        at_end = int(self._gripper.edge_points[edge, 1] == places.point[number])
+        here, there = int(ends[at_end]), int(ends[1 - at_end])
+        way = uv_px[here] - uv_px[there]
+        length = float(np.linalg.norm(way))
+        if not length > 1.0:
+            return None
+        if places.corner[number] >= 0:
+            return here, prediction.corners.uv_px[places.corner[number]], way / length
+        fraction = layout.fraction
+        left = (at_end - fraction[here]) / (fraction[here] - fraction[there])
+        from_px = uv_px[here] + left * way
+        way = way / length
+        curve = uv_px[layout.edge == places.curve[number]] - from_px
+        forward, aside = curve @ way, np.abs(curve @ np.array([-way[1], way[0]]))
+        clear = forward[(forward > 0.0) & (aside > CLEAR_OF_CURVE_PX)]
+        return (here, from_px + clear.min() * way, way) if len(clear) else None
+
+
+def _of_corners(value: NDArray[np.bool_], places: _Places) -> NDArray[np.bool_]:
+    """(s,) of ``value`` (c,), False where there is no corner."""
+    return np.append(value, False)[places.corner]
 
 
 def _own_step(measurement: Measurement) -> Array:

@@ -158,18 +158,17 @@ class FingerMeter(Settler):
     def _ends_at(
         self, image: Image, measurement: Measurement, places: list[_Place | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(c,) corners that are seen as ends of their finger at its own place of ``places``, one for each finger, and
-        (c,) those that might be.
+        """(s,) places at the fingers' ends that are seen as such where its own one of ``places`` has the finger, and
+        (s,) those that might be.
         """
-        gripper = self._gripper
-        seen, in_view = np.zeros((2, len(gripper.corner_ids)), dtype=bool)
+        seen, in_view = np.zeros((2, len(self._ends.finger)), dtype=bool)
         for finger, place in enumerate(places):
             if place is None:
                 continue
-            own = gripper.point_finger[gripper.corner_points] == finger
+            own = self._ends.finger == finger
             there = self._measured_at(image, measurement, place, finger)
             in_view |= own & self._ends.in_view(there.prediction)
-            seen |= own & self._ends.at_corners(image, there)
+            seen |= own & self._ends.at_places(image, there)
         return seen, in_view
 
     def _measured_at(self, image: Image, measurement: Measurement, place: _Place, finger: int) -> Measurement:
@@ -318,10 +317,8 @@ class _Stretches(NamedTuple):
             return np.asarray(np.bincount(stretch, weight * values) / total)
 
         edge = prediction.layout.edge[sample]
-        direction = prediction.line_direction[edge]
-        off = prediction.gain[sample] * candidates.offset_px[index]
-        xy = prediction.line_origin[edge] + prediction.along[sample][:, None] * direction
-        xy = xy + off[:, None] * np.column_stack([-direction[:, 1], direction[:, 0]])
+        off, way = prediction.gain[sample] * candidates.offset_px[index], prediction.way_xy[sample]
+        xy = prediction.xy[sample] + off[:, None] * np.column_stack([-way[:, 1], way[:, 0]])
         first = np.flatnonzero(np.diff(stretch, prepend=-1))
         normal = prediction.normal[sample]
         return cls(

@@ -73,10 +73,9 @@ def outline_points(
     if np.count_nonzero(wanted) < FEWEST_EDGES:
         wanted = view.visible
     edges = np.flatnonzero(wanted)
-    start, end = np.moveaxis(ends_m[gripper.edge_points[edges]], 1, 0)
     share = np.linspace(_EDGE_MARGIN, 1.0 - _EDGE_MARGIN, 65)
-    points_m = start[:, None] + share[:, None] * (end - start)[:, None]
-    uv = camera.project(points_m.reshape(-1, 3) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]).reshape(-1, len(share), 2)
+    points_m, _ = _places(gripper, ends_m, np.repeat(edges, len(share)), np.tile(share, len(edges)))
+    uv = camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]).reshape(-1, len(share), 2)
     with np.errstate(invalid="ignore"):
         limit = np.array([camera.width_px, camera.height_px]) - 1.0 + margin_px
         near: NDArray[np.bool_] = np.all((uv >= -margin_px) & (uv <= limit), axis=2)
@@ -87,20 +86,23 @@ def outline_points(
     for k in np.flatnonzero(weight > 0.0).tolist():
         travelled = np.concatenate([[0.0], np.cumsum(way_px[k])])
         # Within what is near, equally spaced in the image.
-        places = np.interp(np.linspace(0.0, travelled[-1], counts[k]), travelled, share)
-        chosen.append(start[k] + places[:, None] * (end - start)[k])
-        which.append(np.full(counts[k], k))
+        chosen.append(np.interp(np.linspace(0.0, travelled[-1], counts[k]), travelled, share))
+        which.append(np.full(counts[k], edges[k]))
     if not chosen:
         nothing = np.zeros((3, 0), np.float32)
         return OutlinePoints(nothing, nothing, np.zeros(0, np.intp))
-    index = np.concatenate(which)
-    direction = (end - start)[index]
+    edge = np.concatenate(which)
+    points_m, direction = _places(gripper, ends_m, edge, np.concatenate(chosen))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     return OutlinePoints(
-        np.ascontiguousarray(np.concatenate(chosen).T, dtype=np.float32),
-        np.ascontiguousarray(direction.T, dtype=np.float32),
-        edges[index],
+        np.ascontiguousarray(points_m.T, dtype=np.float32), np.ascontiguousarray(direction.T, dtype=np.float32), edge
     )
+
+
+def _places(gripper: Gripper, ends_m: Array, edge: NDArray[np.intp], fraction: Array) -> tuple[Array, Array]:
+    """Points (n, 3) at fractions (n,) of edges (n,), and the way (n, 3) that the edge goes there."""
+    start, end = gripper.tangents_m(ends_m, edge, fraction)
+    return start + fraction[:, None] * (end - start), end - start
 
 
 class Projected(NamedTuple):

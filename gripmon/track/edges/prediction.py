@@ -122,8 +122,9 @@ class Prediction:
 
     ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking
     along the edge. ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform
-    and, where the jaw opening is an unknown too, by the opening (px/m). ``along`` (n,) and ``gain`` (n,): ideal
-    coordinate along the edge's line, and ideal distance from the line for each px of offset along the normal.
+    and, where the jaw opening is an unknown too, by the opening (px/m). In ideal coordinates: ``xy`` (n, 2) the places,
+    ``way_xy`` (n, 2) the edge's direction there, ``along`` (n,) the place along the edge's line, ``gain`` (n,) the
+    distance from the edge for each px of offset along the normal.
     ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
     in the image.  ``map_x``, ``map_y`` (r, n, s): where r neighbouring rows of each profile are read.
 
@@ -138,6 +139,8 @@ class Prediction:
     uv_px: Array
     normal: Array
     jacobian: Array
+    xy: Array
+    way_xy: Array
     along: Array
     gain: Array
     line_origin: Array
@@ -224,15 +227,13 @@ def lay_out(
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-    start, end = points_cam_m[gripper.edge_points[:, 0]], points_cam_m[gripper.edge_points[:, 1]]
     as_taught = np.zeros(len(gripper.edge_ids), dtype=bool)
     if taught is not None:
         as_taught = taught.known & (view.crease == taught.crease)
     wanted = view.visible & (settings.creases | ~view.crease | as_taught)
     coarse = np.linspace(0.0, 1.0, 65)
-    uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(
-        -1, 65, 2
-    )
+    along_m = gripper.outlines_m(points_cam_m, np.arange(len(gripper.edge_ids)), len(coarse), cam_T_grip[:3, :3])
+    uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, len(coarse), 2)
     inside = _inside(camera, uv, settings.reach_px)
     step_px = np.linalg.norm(np.diff(uv, axis=1), axis=2)
     ranges = [
@@ -303,13 +304,13 @@ def predict(
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     levers = points_grip_m @ rotation.T
-    ends = levers[gripper.edge_points]
-    spans = ends[:, 1] - ends[:, 0]
     edge = layout.edge
-    lever = ends[edge, 0] + layout.fraction[:, None] * spans[edge]
+    start, end = gripper.tangents_m(levers, edge, layout.fraction, rotation)
+    way = end - start
+    lever = start + layout.fraction[:, None] * way
     points_cam_m = lever + translation
     uv, d_uv = camera.project_with_jacobian(points_cam_m)
-    tangent = np.einsum("nij,nj->ni", d_uv, spans[edge])
+    tangent = np.einsum("nij,nj->ni", d_uv, way)
     tangent /= np.sqrt(np.einsum("ni,ni->n", tangent, tangent))[:, None]
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     gradient = np.einsum("ni,nij->nj", normal, d_uv)
@@ -333,7 +334,12 @@ def predict(
         spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
         edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0)
-    along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
+    xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
+    along, origin, direction = _ideal_lines(xy, layout, len(gripper.edge_ids))
+    way_xy = direction[edge]
+    if gripper.has_curves:
+        curved = gripper.edge_curved[edge]
+        way_xy[curved] = _unit((way[:, :2] - xy * way[:, 2:])[curved])
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
     offsets = offsets_px.astype(np.float32)
     uv32, normal32 = uv.astype(np.float32), normal.astype(np.float32)
@@ -347,8 +353,10 @@ def predict(
         uv_px=uv,
         normal=normal,
         jacobian=jacobian,
+        xy=xy,
+        way_xy=way_xy,
         along=along,
-        gain=gain,
+        gain=_gain(points_cam_m, normal, d_uv, way_xy),
         line_origin=origin,
         line_direction=direction,
         ok=ok,
@@ -378,28 +386,34 @@ def _predict_corners(
     )
 
 
-def _ideal_lines(
-    points_cam_m: Array, normal: Array, d_uv: Array, layout: EdgeLayout, edge_count: int
-) -> tuple[Array, Array, Array, Array]:
-    """The edges as straight lines in ideal coordinates, and how an offset in px along the image normal moves a point
-    off its line.
+def _ideal_lines(xy: Array, layout: EdgeLayout, edge_count: int) -> tuple[Array, Array, Array]:
+    """The edges as straight lines in ideal coordinates, and where on them (n,) the sample points ``xy`` (n, 2) lie.
+
+    Lines of edges that are not sampled are NaN; a curved edge's is that from its first sample to its last.
+    """
+    origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
+    if len(layout.edges) == 0:
+        return np.zeros(0), origin, direction
+    last = np.append(layout.first[1:], len(xy)) - 1
+    origin[layout.edges] = 0.5 * (xy[layout.first] + xy[last])
+    direction[layout.edges] = _unit(xy[last] - xy[layout.first])
+    edge = layout.edge
+    return np.einsum("ni,ni->n", xy - origin[edge], direction[edge]), origin, direction
+
+
+def _unit(ways: Array) -> Array:
+    """(n, 2) of length 1."""
+    return np.asarray(ways / np.sqrt(np.einsum("ni,ni->n", ways, ways))[:, None])
+
+
+def _gain(points_cam_m: Array, normal: Array, d_uv: Array, way_xy: Array) -> Array:
+    """(n,) by how much an offset of a pixel along the image normal moves a point off its edge in ideal coordinates.
 
     ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal
-    coordinates.  Lines of edges that are not sampled are NaN.
+    coordinates.
     """
-    if len(layout.edges) == 0:
-        nowhere = np.full((edge_count, 2), np.nan)
-        return np.zeros(0), np.zeros(0), nowhere, nowhere
-    xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
-    last = np.append(layout.first[1:], len(xy)) - 1
-    origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
-    origin[layout.edges] = 0.5 * (xy[layout.first] + xy[last])
-    span = xy[last] - xy[layout.first]
-    direction[layout.edges] = span / np.sqrt(np.einsum("ei,ei->e", span, span))[:, None]
-    edge = layout.edge
-    along = np.einsum("ni,ni->n", xy - origin[edge], direction[edge])
     lens = d_uv[:, :, :2] * points_cam_m[:, 2][:, None, None]
     determinant = lens[:, 0, 0] * lens[:, 1, 1] - lens[:, 0, 1] * lens[:, 1, 0]
     step_x = (lens[:, 1, 1] * normal[:, 0] - lens[:, 0, 1] * normal[:, 1]) / determinant
     step_y = (lens[:, 0, 0] * normal[:, 1] - lens[:, 1, 0] * normal[:, 0]) / determinant
-    return along, step_y * direction[edge, 0] - step_x * direction[edge, 1], origin, direction
+    return np.asarray(step_y * way_xy[:, 0] - step_x * way_xy[:, 1])

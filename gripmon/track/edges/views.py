@@ -16,10 +16,10 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
     sample = candidates.sample
     points_grip_m = gripper.points_grip_m(measurement.jaw_opening_m if gripper.has_jaw else None)
     points_cam_m = points_grip_m @ measurement.cam_T_grip[:3, :3].T + measurement.cam_T_grip[:3, 3]
-    along = np.linspace(0.0, 1.0, 33)[:, None]
-    start, end = points_cam_m[gripper.edge_points[prediction.layout.visible]].swapaxes(0, 1)[:, :, None]
+    visible = np.flatnonzero(prediction.layout.visible)
+    lines_m = gripper.outlines_m(points_cam_m, visible, 33, measurement.cam_T_grip[:3, :3])
     # All at once: this is called while the next frame may be waiting.
-    lines = camera.project((start + along * (end - start)).reshape(-1, 3)).reshape(len(start), -1, 2)
+    lines = camera.project(lines_m.reshape(-1, 3)).reshape(len(visible), -1, 2)
     finite = np.asarray(np.isfinite(lines).all(axis=2))
     corners_uv_px = camera.project(points_cam_m[gripper.corner_points])
     corners_uv_px[~prediction.corners.visible] = np.nan

@@ -68,6 +68,8 @@ def _of_one_edge() -> Prediction:
         uv_px=np.zeros((4, 2)),
         normal=np.ones((4, 2)),
         jacobian=np.ones((4, 6)),
+        xy=np.zeros((4, 2)),
+        way_xy=np.ones((4, 2)),
         along=np.zeros(4),
         gain=np.ones(4),
         line_origin=point,

@@ -1,0 +1,51 @@
+"""Curved edges: smooth curves through points, as what they bulge from the straight line between their two ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from gripmon.model.gripper.model import GripperError
+from gripmon.model.records import Array
+
+SHORTEST_PIECE_M = 1e-5
+"""Points of a curve nearer together than a file's digits tell apart are one point, m."""
+
+
+class Curves:
+    """The curved ones among a gripper's edges, each a cubic spline over the length of the polyline through its points.
+
+    A fraction of such an edge is one of that length.  Fingers move without turning, so that a curve keeps its shape
+    whatever the opening.
+    """
+
+    def __init__(self, points_m: Sequence[Array | None], names: Sequence[str]):
+        """``points_m``: all points (n, 3) of each edge in turn, gripper frame; None for a straight one."""
+        self.curved: NDArray[np.bool_] = np.array([p is not None for p in points_m], dtype=bool)
+        self._bulges = {
+            i: _bulge(points, names[i]) for i, points in enumerate(points_m) if points is not None
+        }  # fmt: skip
+
+    def bulge_m(self, edge: NDArray[np.intp], fraction: Array) -> tuple[Array, Array]:
+        """How far (n, 3) points at fractions (n,) of edges (n,) lie from the straight line between the two ends,
+        gripper frame, and the derivative (n, 3) of that by the fraction; zero on straight edges.
+        """
+        bulge, rate = np.zeros((2, len(edge), 3))
+        for i, spline in self._bulges.items():
+            own = np.flatnonzero(edge == i)
+            bulge[own], rate[own] = spline(fraction[own]), spline(fraction[own], 1)
+        return bulge, rate
+
+
+def _bulge(points_m: Array, name: str) -> CubicSpline:
+    """Through the points (n, 3), minus the way from the first to the last, by the fraction of the length."""
+    length_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+    if not (length_m > SHORTEST_PIECE_M).all():
+        raise GripperError(f"edges.{name}.via: two points in turn are the same; different points along the edge")
+    fraction = np.concatenate([[0.0], np.cumsum(length_m)]) / length_m.sum()
+    fraction[-1] = 1.0
+    straight = points_m[0] + fraction[:, None] * (points_m[-1] - points_m[0])
+    return CubicSpline(fraction, points_m - straight)
