@@ -82,7 +82,8 @@ class Condition:
 
     ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``moves``:
     the mount moves, so that an alert which says so is true; ``inside``: a scene may begin in the midst of it;
-    ``truth``: what the true gripper is instead of the one that the monitor knows.
+    ``truth``: what the true gripper is instead of the one that the monitor knows; ``round_tips``: fingers with rounded
+    tips instead of the usual grippers.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Condition:
     moves: bool = False
     inside: bool = True
     truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
+    round_tips: bool = False
 
 
 def with_(settings: Any, **changes: Any) -> Any:

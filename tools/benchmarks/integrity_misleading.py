@@ -6,6 +6,7 @@ What fixes the motion along the fingers are the tips alone; most of these offer 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from benchmarks.integrity_conditions import ORDINARY, bump
@@ -239,4 +240,15 @@ MISLEADING: tuple[Condition, ...] = (
     ),
     Condition("bump at rim", "the mount jumps beside a bar", both(rim_beside, bump), moves=True, inside=False),
 )
-CONDITIONS = (*ORDINARY, *MISLEADING)
+_WITH_ROUND_TIPS = (
+    "ordinary", "clutter", "light", "blur", "jaw cycle", "cover one", "bump", "vibration", "creep", "opening wrong",
+    "grasp", "grasp lines", "long bar", "rim over tips", "rim beside", "shadow lines", "bump in grasp",
+    "bump, tips hidden",
+)  # fmt: skip
+
+ROUND_TIPS = tuple(
+    replace(condition, name=f"round tips: {condition.name}", round_tips=True)
+    for condition in (*ORDINARY, *MISLEADING)
+    if condition.name in _WITH_ROUND_TIPS
+)
+CONDITIONS = (*ORDINARY, *MISLEADING, *ROUND_TIPS)

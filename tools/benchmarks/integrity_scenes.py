@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.integrity_draft import Condition, Draft
+from benchmarks.rounded import rounded_model, rounded_solids
 from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
 from gripmon.model.camera import Camera, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
@@ -60,13 +61,11 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
     """Scene ``number`` of a condition."""
     rng = np.random.default_rng([seed, zlib.crc32(b"integrity " + condition.name.encode()), number])
     camera = _camera(rng)
-    model = gripper_models()[number % len(gripper_models())]
-    gripper = Gripper(msgspec.convert(model, GripperModel))
-    cam_T_grip, opening_m = _placed(rng, camera, gripper)
-    draft = _draft(rng, frames, gripper, cam_T_grip, opening_m)
-    shown = gripper
+    gripper, shown = _round_tipped(rng) if condition.round_tips else 2 * (_usual(number),)
+    cam_T_grip, opening_m = _placed(rng, camera, shown)
+    draft = _draft(rng, frames, shown, cam_T_grip, opening_m)
     if condition.truth is not None:
-        shown = Gripper(msgspec.convert(condition.truth(rng, model), GripperModel))
+        shown = Gripper(msgspec.convert(condition.truth(rng, msgspec.to_builtins(gripper.model)), GripperModel))
     scenario = _scenario(condition, draft)
     simulator = Simulator(camera, shown, cam_T_grip, scenario, seed=int(rng.integers(2**31)))
     sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
@@ -82,6 +81,18 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
         first=first,
         frames=frames,
     )
+
+
+def _usual(number: int) -> Gripper:
+    models = gripper_models()
+    return Gripper(msgspec.convert(models[number % len(models)], GripperModel))
+
+
+def _round_tipped(rng: np.random.Generator) -> tuple[Gripper, Gripper]:
+    """What the monitor knows of fingers with rounded tips, and what they are: tips from a little to wholly round."""
+    width_m = float(rng.uniform(0.008, 0.02))
+    radius_m = float(rng.uniform(0.002, 0.5 * width_m))
+    return rounded_model(width_m, radius_m), rounded_solids(width_m, radius_m)
 
 
 def _scenario(condition: Condition, draft: Draft) -> Scenario:

@@ -47,16 +47,27 @@ def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: floa
     for finger, x_m in middle_x_m(width_m).items():
         for rim, loop, y_m in (("n", near, -0.5 * THICK_M), ("f", far, 0.5 * THICK_M)):
             for i, (x, z) in enumerate(loop.tolist()):
-                points[f"{finger}_{rim}{i}"] = {"finger": finger, "xyz_m": [x_m + x, y_m, z], "corner": rim == "n"}
+                points[f"{finger}_{rim}{i}"] = {
+                    "finger": finger,
+                    "xyz_m": [x_m + x, y_m, z],
+                    "corner": 0 < i < count - 1,
+                }
         names = {rim: [f"{finger}_{rim}{i}" for i in range(count)] for rim in "nf"}
         for i in range(count):
             k = (i + 1) % count
-            edges[f"{finger}_rim{i}"] = {"from": names["n"][i], "to": names["n"][k]}
+            edges.update({f"{finger}_{rim}{i}": {"from": each[i], "to": each[k]} for rim, each in names.items()})
             faces.append({"finger": finger, "points": [names["n"][i], names["f"][i], names["f"][k], names["n"][k]]})
         faces.append({"finger": finger, "points": names["n"]})
         faces.append({"finger": finger, "points": names["f"][::-1]})
     return gripper_from_dict(
-        {"name": "rounded", "jaw": JAW, "fingers": MOTION, "points": points, "edges": edges, "faces": _outwards(points, faces)}
+        {
+            "name": "rounded",
+            "jaw": JAW,
+            "fingers": MOTION,
+            "points": points,
+            "edges": edges,
+            "faces": _outwards(points, faces),
+        }
     )
 
 
@@ -66,7 +77,12 @@ def rounded_model(width_m: float = 0.012, radius_m: float = 0.004, step_m: float
     points: dict[str, Any] = {}
     edges: dict[str, Any] = {}
     for finger, x_m in middle_x_m(width_m).items():
-        places = {"a_back": (-0.5 * width_m, -LENGTH_M), "a": tip[0], "b": tip[-1], "b_back": (0.5 * width_m, -LENGTH_M)}
+        places = {
+            "a_back": (-0.5 * width_m, -LENGTH_M),
+            "a": tip[0],
+            "b": tip[-1],
+            "b_back": (0.5 * width_m, -LENGTH_M),
+        }
         for name, (x, z) in places.items():
             points[f"{finger}_{name}"] = {"finger": finger, "xyz_m": [float(x_m + x), -0.5 * THICK_M, float(z)]}
         via = [[x_m + x, -0.5 * THICK_M, z] for x, z in tip[1:-1].tolist()]
