@@ -8,97 +8,93 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper, gripper_from_dict
 
-THICK_M, SLANT_M, LENGTH_M, GAP_M = 0.006, 0.003, 0.045, 0.030
+Array = NDArray[np.float64]
+
+THICK_M, LENGTH_M, GAP_M = 0.003, 0.045, 0.030
+FAR_SHARE = 0.6
+"""Width of the far face over the near one's: of 8 mm, no side is seen at up to 28 degrees."""
+
 MOTION = {"left": {"motion": {"axis": [-0.5, 0.0, 0.0]}}, "right": {"motion": {"axis": [0.5, 0.0, 0.0]}}}
 JAW = {"nominal_m": GAP_M, "min_m": 0.01, "max_m": 0.06}
 
 
-def outline_m(width_m: float, radius_m: float, step_m: float) -> np.ndarray:
-    """(n, 2) x, z of a finger's tip from its left side to its right one, corners rounded by a radius; tip at z = 0."""
+def outline_m(width_m: float, radius_m: float, step_m: float) -> Array:
+    """(n, 2) x, z of a finger's tip from its left side to its right one, corners rounded by a radius (0: sharp); tip at
+    z = 0.
+    """
     half = 0.5 * width_m
+    if radius_m == 0.0:
+        return np.array([[-half, 0.0], [half, 0.0]])
     angle = np.linspace(0.0, 0.5 * np.pi, max(round(0.5 * np.pi * radius_m / step_m), 2) + 1)
     left = np.column_stack([radius_m - half - radius_m * np.cos(angle), radius_m * np.sin(angle) - radius_m])
     right = left[::-1] * (-1.0, 1.0)
-    flat = np.linspace(left[-1], right[0], max(round((width_m - 2.0 * radius_m) / step_m), 1) + 1)[1:-1]
     if np.allclose(left[-1], right[0]):
         return np.vstack([left, right[1:]])
-    return np.vstack([left, flat, right])
+    flat = np.linspace(left[-1], right[0], max(round((width_m - 2.0 * radius_m) / step_m), 1) + 1)
+    return np.vstack([left, flat[1:-1], right])
 
 
-def middle_x_m(width_m: float) -> dict[str, float]:
-    return {"left": -0.5 * (GAP_M + width_m), "right": 0.5 * (GAP_M + width_m)}
-
-
-def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 1.5e-4) -> Gripper:
-    """For the simulator: prisms with a facet each ``step_m``."""
+def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 2e-4) -> Gripper:
+    """For the simulator: prisms with a facet each ``step_m``; their vertices lie on the rounded outline."""
     tip = outline_m(width_m, radius_m, step_m)
     near = np.vstack([[-0.5 * width_m, -LENGTH_M], tip, [0.5 * width_m, -LENGTH_M]])
-    # The far face is the same, smaller by the slant on every side.
     middle = np.array([0.0, -0.5 * LENGTH_M])
-    size = np.ptp(near, axis=0)
-    far = middle + (near - middle) * (size - 2.0 * SLANT_M) / size
+    inset_m = (1.0 - FAR_SHARE) * width_m
+    far = middle + (near - middle) * (FAR_SHARE, 1.0 - inset_m / LENGTH_M)
+    count = len(near)
     points: dict[str, Any] = {}
     edges: dict[str, Any] = {}
-    faces: list[dict[str, Any]] = []
-    count = len(near)
-    for finger, x_m in middle_x_m(width_m).items():
-        for rim, loop, y_m in (("n", near, -0.5 * THICK_M), ("f", far, 0.5 * THICK_M)):
+    faces: list[tuple[str, list[str]]] = []
+    for finger, x_m in _middles_m(width_m).items():
+        rims = {rim: [f"{finger}_{rim}{i}" for i in range(count)] for rim in ("near", "far")}
+        for names, loop, y_m in zip(rims.values(), (near, far), (-0.5 * THICK_M, 0.5 * THICK_M), strict=True):
             for i, (x, z) in enumerate(loop.tolist()):
-                points[f"{finger}_{rim}{i}"] = {
-                    "finger": finger,
-                    "xyz_m": [x_m + x, y_m, z],
-                    "corner": 0 < i < count - 1,
-                }
-        names = {rim: [f"{finger}_{rim}{i}" for i in range(count)] for rim in "nf"}
-        for i in range(count):
-            k = (i + 1) % count
-            edges.update({f"{finger}_{rim}{i}": {"from": each[i], "to": each[k]} for rim, each in names.items()})
-            faces.append({"finger": finger, "points": [names["n"][i], names["f"][i], names["f"][k], names["n"][k]]})
-        faces.append({"finger": finger, "points": names["n"]})
-        faces.append({"finger": finger, "points": names["f"][::-1]})
-    return gripper_from_dict(
-        {
-            "name": "rounded",
-            "jaw": JAW,
-            "fingers": MOTION,
-            "points": points,
-            "edges": edges,
-            "faces": _outwards(points, faces),
-        }
-    )
+                at_tip = 0 < i < count - 1
+                points[names[i]] = {"finger": finger, "xyz_m": [x_m + x, y_m, z], "corner": at_tip}
+            edges |= {f"{names[i]}-": {"from": names[i], "to": names[(i + 1) % count]} for i in range(count)}
+            faces.append((finger, names))
+        one, other = rims.values()
+        pairs = ((i, (i + 1) % count) for i in range(count))
+        faces += [(finger, [one[i], other[i], other[k], one[k]]) for i, k in pairs]
+    return _gripper(points, edges, [_outwards(points, *face) for face in faces])
 
 
 def rounded_model(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 1e-3) -> Gripper:
-    """For the monitor: two straight sides and one curved edge a finger, and no corner at all."""
+    """For the monitor: two straight sides and one curved edge a finger, and no corner; sharp ones with a radius of 0."""
     tip = outline_m(width_m, radius_m, step_m)
     points: dict[str, Any] = {}
     edges: dict[str, Any] = {}
-    for finger, x_m in middle_x_m(width_m).items():
-        places = {
-            "a_back": (-0.5 * width_m, -LENGTH_M),
-            "a": tip[0],
-            "b": tip[-1],
-            "b_back": (0.5 * width_m, -LENGTH_M),
-        }
-        for name, (x, z) in places.items():
-            points[f"{finger}_{name}"] = {"finger": finger, "xyz_m": [float(x_m + x), -0.5 * THICK_M, float(z)]}
+    for finger, x_m in _middles_m(width_m).items():
+        backs = (-0.5 * width_m, -LENGTH_M), (0.5 * width_m, -LENGTH_M)
+        for name, (x, z) in {"a_back": backs[0], "a": tip[0], "b": tip[-1], "b_back": backs[1]}.items():
+            corner = radius_m == 0.0 and "back" not in name
+            xyz_m = [float(x_m + x), -0.5 * THICK_M, float(z)]
+            points[f"{finger}_{name}"] = {"finger": finger, "xyz_m": xyz_m, "corner": corner}
         via = [[x_m + x, -0.5 * THICK_M, z] for x, z in tip[1:-1].tolist()]
         edges[f"{finger}_side_a"] = {"from": f"{finger}_a_back", "to": f"{finger}_a"}
         edges[f"{finger}_tip"] = {"from": f"{finger}_a", "to": f"{finger}_b", "via": via}
         edges[f"{finger}_side_b"] = {"from": f"{finger}_b", "to": f"{finger}_b_back"}
-    return gripper_from_dict({"name": "rounded", "jaw": JAW, "fingers": MOTION, "points": points, "edges": edges})
+    return _gripper(points, edges, [])
 
 
-def _outwards(points: dict[str, Any], faces: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Faces with their points counter-clockwise seen from outside."""
-    out = []
-    for face in faces:
-        own = np.array([points[name]["xyz_m"] for name in face["points"]])
-        whole = np.array([p["xyz_m"] for p in points.values() if p["finger"] == face["finger"]])
-        normal = np.cross(own, np.roll(own, -1, axis=0)).sum(axis=0)
-        inwards = normal @ (own.mean(axis=0) - whole.mean(axis=0)) < 0.0
-        out.append({**face, "points": face["points"][::-1] if inwards else face["points"]})
-    return out
+def _middles_m(width_m: float) -> dict[str, float]:
+    """x of each finger's middle at the nominal opening."""
+    return {"left": -0.5 * (GAP_M + width_m), "right": 0.5 * (GAP_M + width_m)}
+
+
+def _outwards(points: dict[str, Any], finger: str, names: list[str]) -> dict[str, Any]:
+    """A face with its points counter-clockwise seen from outside."""
+    own = np.array([points[name]["xyz_m"] for name in names])
+    whole = np.array([point["xyz_m"] for point in points.values() if point["finger"] == finger])
+    normal = np.cross(own, np.roll(own, -1, axis=0)).sum(axis=0)
+    inwards = normal @ (own.mean(axis=0) - whole.mean(axis=0)) < 0.0
+    return {"finger": finger, "points": names[::-1] if inwards else names}
+
+
+def _gripper(points: dict[str, Any], edges: dict[str, Any], faces: list[dict[str, Any]]) -> Gripper:
+    parts = {"points": points, "edges": edges, "faces": faces}
+    return gripper_from_dict({"name": "rounded_fingers", "jaw": JAW, "fingers": MOTION, **parts})
