@@ -64,7 +64,7 @@ def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: floa
 
 
 def rounded_model(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 1e-3) -> Gripper:
-    """For the monitor: two straight sides and one curved edge a finger, and no corner; sharp ones with a radius of 0."""
+    """For the monitor: two straight sides and a curved edge a finger, and no corner; sharp ones with a radius of 0."""
     tip = outline_m(width_m, radius_m, step_m)
     points: dict[str, Any] = {}
     edges: dict[str, Any] = {}

@@ -53,6 +53,9 @@ AS_STRONG = 0.4
 GOES_ON = 0.5
 """Share of the probes that must show it: half of them, as for an edge beside a corner."""
 
+SHOWN = 0.5
+"""Share of the profiles on a stretch that must agree for a turn to be seen: most of them."""
+
 
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
     """The way (3,) that most of the edges' length has, gripper frame, and (e,) which edges run along it.
@@ -102,7 +105,7 @@ class _Probes:
     """Profiles beyond places, for one prediction; c extensions of :data:`PROBES` each.
 
     ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's profile next to it, ``ok`` (c *
-    PROBES,).
+    PROBES,).  ``turns``: for each place where a side turns into a curve, the profiles of the stretches that show it.
     """
 
     place: NDArray[np.intp]
@@ -110,6 +113,7 @@ class _Probes:
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
     ok: NDArray[np.bool_]
+    turns: dict[int, tuple[NDArray[np.intp], ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,19 +188,18 @@ class FingerEnds:
 
         ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
-        prediction, places, seen = measurement.prediction, self._places, measurement.consensus.edge_seen
+        prediction, places = measurement.prediction, self._places
         if self._kept is None or self._kept[0] is not prediction:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
-        curved = seen[places.side] & seen[places.curve]
-        cornered = _of_corners(measurement.corners.usable, places)
-        measured = places.at_end & np.where(places.corner < 0, curved, cornered)
+        measured = places.at_end & _of_corners(measurement.corners.usable, places)
+        supported = measurement.consensus.supported
+        for number, stretches in probes.turns.items():
+            measured[number] = all(supported[stretch].mean() > SHOWN for stretch in stretches)
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
-        # A side whose curve never leaves its direction has no end there.
-        looked = np.isin(np.arange(len(measured)), probes.place) | (places.corner >= 0)
-        return measured & looked & ~goes_on
+        return measured & ~goes_on
 
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
@@ -218,6 +221,7 @@ class FingerEnds:
     def _lay_out(self, prediction: Prediction) -> _Probes:
         places, points = self._places, self._gripper.edge_points
         place, sample, at, across = [], [], [], []
+        turns: dict[int, tuple[NDArray[np.intp], ...]] = {}
         for slot, edge in enumerate(prediction.layout.edges.tolist()):
             for number in np.flatnonzero(places.at_end & np.isin(places.point, points[edge])).tolist():
                 if places.corner[number] < 0 and places.side[number] != edge:
@@ -226,6 +230,8 @@ class FingerEnds:
                 if beyond is None:
                     continue
                 here, from_uv_px, way = beyond
+                if places.corner[number] < 0:
+                    turns[number] = self._turn(prediction, number, here, from_uv_px)
                 place.append(number)
                 sample.append(here)
                 at.append(from_uv_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
@@ -233,7 +239,7 @@ class FingerEnds:
         if not place:
             nowhere = np.zeros((0, 3), dtype=np.float32)
             none = np.zeros(0, dtype=np.intp)
-            return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool))
+            return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool), {})
         half = round(REACH_PX / STEP_PX)
         offsets = np.arange(-half, half + 1) * STEP_PX
         probes = np.concatenate(at)
@@ -245,7 +251,27 @@ class FingerEnds:
             np.nan_to_num(maps[:, 0]).astype(np.float32),
             np.nan_to_num(maps[:, 1]).astype(np.float32),
             inside,
+            turns,
         )
+
+    def _turn(
+        self, prediction: Prediction, number: int, here: int, clear_px: Array
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """The profiles that show a side turn into a curve: of the side's end, of the curve beside it, and of the curve
+        from where it has left the side's direction, ``clear_px`` (2,), on; :data:`BEYOND_PX` long each.
+
+        A straight border beside or across the finger is like two of them at most.
+        """
+        uv_px, edge = prediction.uv_px, prediction.layout.edge
+        side, curve = (np.flatnonzero(edge == edges[number]) for edges in (self._places.side, self._places.curve))
+        reach_px = BEYOND_PX[1]
+        on_side = side[np.linalg.norm(uv_px[side] - uv_px[here], axis=1) < reach_px]
+        if self._gripper.edge_points[self._places.curve[number], 1] == self._places.point[number]:
+            curve = curve[::-1]
+        travelled_px = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(uv_px[curve], axis=0), axis=1))])
+        left_px = travelled_px[np.argmin(np.linalg.norm(uv_px[curve] - clear_px, axis=1))]
+        beside = curve[travelled_px < reach_px]
+        return on_side, beside, curve[(travelled_px >= left_px) & (travelled_px < left_px + reach_px)]
 
     def _beyond(self, prediction: Prediction, slot: int, edge: int, number: int) -> tuple[int, Array, Array] | None:
         """Beyond a place at an end of a sampled edge: the edge's profile next to it, where (2,), px, to look from, and
