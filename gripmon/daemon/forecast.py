@@ -184,7 +184,7 @@ def _corners(config: Config) -> tuple[CornerView, ...]:
             reason=None if visible else "outside" if not inside else "self_hidden",
         )
         for name, uv, point, visible, inside in zip(
-            config.gripper.corner_ids, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
+            config.gripper.landmark_ids, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
         )
     )
 
@@ -263,7 +263,7 @@ def _in_view(config: Config) -> InView:
         enough=sight.enough,
         reason=sight.reason,
         behind_another_finger=tuple(
-            name for name, behind in zip(rig.gripper.corner_ids, sight.behind, strict=True) if behind
+            name for name, behind in zip(rig.gripper.landmark_ids, sight.behind, strict=True) if behind
         ),
         border=None
         if near is None

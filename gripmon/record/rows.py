@@ -355,7 +355,7 @@ def _corner_residuals_px(record: FrameRecord, trace: TraceNote) -> list[float]:
     """Distance of each corner from where the transform has it; NaN, which leaves a gap, where it was not measured."""
     predicted = pairs(trace.predicted_corners_uv_px)
     measured = [(math.nan, math.nan) if corner.uv_px is None else corner.uv_px for corner in record.corners]
-    if len(measured) != len(predicted):
+    if len(measured) != len(predicted) or not measured:
         return []
     return [float(d) for d in np.linalg.norm(np.array(measured) - predicted, axis=1)]
 

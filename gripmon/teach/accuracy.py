@@ -115,7 +115,7 @@ def forecast_frame(
     tracker = Tracker(rig.camera, gripper, settings, rig.taught)
     given = meter.forecast(cam_T_grip, opening_m, jaw_reported=True)
     covariance = tracker.update(given)[1]
-    levers_m = given.prediction.corners.cam_m - given.prediction.cam_T_grip[:3, 3]
+    levers_m = gripper.points_grip_m(opening_m if gripper.has_jaw else None)[gripper.landmarks]
     lever_m = float(np.sqrt((levers_m**2).sum(axis=1).mean()))
     jaw = None
     if with_jaw:

@@ -48,7 +48,8 @@ class Rig(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What is seen from one pose at one jaw opening: arrays (c,) over the gripper's corners.
+    """What is seen from one pose at one jaw opening: arrays (c,) over the gripper's landmarks, which are its corners if
+    it has some.
 
     ``uv_px`` (c, 2), NaN where the lens maps nothing.  Each corner is ``visible``, or ``outside`` of the image, or
     ``self_hidden`` by its own finger, or ``behind`` another one, the first that holds.  ``edges``: how many can be
@@ -95,18 +96,18 @@ def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
     camera, gripper = rig.camera, rig.gripper
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     eye_grip_m = invert(cam_T_grip)[:3, 3]
-    corners_grip_m = points_grip_m[gripper.corner_points]
+    corners_grip_m = points_grip_m[gripper.landmarks]
     uv_px = camera.project(corners_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
     last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     with np.errstate(invalid="ignore"):
         within = (uv_px >= CORNER_MARGIN_PX) & (uv_px <= last_px - CORNER_MARGIN_PX)
     outside = np.asarray(~within.all(axis=1))
-    self_hidden = ~outside & ~gripper.corners_visible(points_grip_m, eye_grip_m)
+    self_hidden = ~outside & ~gripper.points_visible(points_grip_m, eye_grip_m, gripper.landmarks)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     layout = lay_out(camera, gripper, cam_T_grip, opening_m, rig.settings.corners.sampling, rig.taught)
     # Both in one call, which takes most of the time.
     samples_m, of_samples = _samples(gripper, layout, points_grip_m)
-    of_corners = gripper.point_finger[gripper.corner_points]
+    of_corners = gripper.point_finger[gripper.landmarks]
     targets_m, finger = np.concatenate([corners_grip_m, samples_m]), np.concatenate([of_corners, of_samples])
     hidden = behind_another_finger(gripper, points_grip_m, eye_grip_m, targets_m, finger)
     behind, free = ~outside & ~self_hidden & hidden[: len(of_corners)], ~hidden[len(of_corners) :]
@@ -230,7 +231,7 @@ def border(rig: Rig, sight: Sight) -> Border | None:
     distances = np.stack([u, rig.camera.width_px - 1.0 - u, v, rig.camera.height_px - 1.0 - v])
     side, corner = np.unravel_index(int(distances.argmin()), distances.shape)
     by_side_px = dict(zip(_SIDES, distances.min(axis=1).tolist(), strict=True))
-    return Border(by_side_px, float(distances.min()), rig.gripper.corner_ids[which[corner]], _SIDES[side])
+    return Border(by_side_px, float(distances.min()), rig.gripper.landmark_ids[which[corner]], _SIDES[side])
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
@@ -279,7 +280,7 @@ def _step(
 ) -> float:
     """How much farther moves the visible corners by ``step_px`` at most."""
     gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
-    points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[sight.visible]]
+    points_m = gripper.points_grip_m(jaw_opening_m)[gripper.landmarks[sight.visible]]
     pose = moved_camera(cam_T_grip, (amount + small) * axis)
     moved_px = rig.camera.project(points_m @ pose[:3, :3].T + pose[:3, 3]) - sight.uv_px[sight.visible]
     rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / small

@@ -50,7 +50,8 @@ _IN_FRONT = (
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the calibration predicts at one jaw opening: arrays over the gripper's corners and edges.
+    """What the calibration predicts at one jaw opening: arrays over the gripper's edges, and its landmarks, which are
+    its corners if it has some.
 
     ``corners_px`` (c, 2) is NaN where the lens maps nothing; ``in_image``, ``visible`` (c,); ``edges_visible`` (e,).
     """
@@ -120,7 +121,7 @@ def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_openin
     """Where the calibration expects the gripper's corners in the image."""
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-    corners_cam_m = points_cam_m[gripper.corner_points]
+    corners_cam_m = points_cam_m[gripper.landmarks]
     corners_px = camera.project(corners_cam_m)
     last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     in_image: NDArray[np.bool_] = np.all((corners_px >= 0.0) & (corners_px <= last_px), axis=1)
@@ -129,7 +130,7 @@ def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_openin
         corners_cam_m,
         corners_px,
         in_image,
-        gripper.corners_visible(points_grip_m, eye_grip_m) & in_image,
+        gripper.points_visible(points_grip_m, eye_grip_m, gripper.landmarks) & in_image,
         gripper.edge_view(points_grip_m, eye_grip_m).visible,
     )
 
@@ -141,7 +142,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
     if (depths_m <= 0.0).all():
         return Fault(key, "puts all corners of the gripper behind the camera", _IN_FRONT)
     if (depths_m <= 0.0).any():
-        name = gripper.corner_ids[int(depths_m.argmin())]
+        name = gripper.landmark_ids[int(depths_m.argmin())]
         return Fault(key, f"puts corner {name} behind the camera (z = {depths_m.min():.4g} m)", _IN_FRONT)
     if not view.in_image.any():
         u, v = np.nanmedian(view.corners_px, axis=0) if np.isfinite(view.corners_px).any() else (math.nan, math.nan)
@@ -153,7 +154,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
         )
     seen = int(view.visible.sum())
     if seen < FEWEST_CORNERS_IN_VIEW:
-        names = ", ".join(c for c, v in zip(gripper.corner_ids, view.visible, strict=True) if v) or "none"
+        names = ", ".join(c for c, v in zip(gripper.landmark_ids, view.visible, strict=True) if v) or "none"
         return Fault(
             key,
             f"shows {seen} corners ({names})",

@@ -77,7 +77,12 @@ class Gripper:
         self.notes: list[str] = []
         self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
         self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
-        self._edge_faces, self._corner_faces = self._adjacency()
+        self._edge_faces, self._point_faces = self._adjacency()
+        self.landmarks = self._stand_for_the_tips()
+        """(l,) the points by which a view of the fingertips is judged: the corners; with fewer than three of them the
+        ends of curved edges, too, and if that isn't enough all points.
+        """
+        self.landmark_ids = tuple(self.point_ids[i] for i in self.landmarks)
         jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
         self.has_jaw = model.jaw is not None
         self.jaw_nominal_m, self.jaw_min_m, self.jaw_max_m = jaw.nominal_m, jaw.min_m, jaw.max_m
@@ -147,8 +152,12 @@ class Gripper:
 
     def corners_visible(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
         """(c,) whether a face at the corner looks at the camera; True for corners without faces."""
-        facing = self._facing(points_grip_m, eye_grip_m)
-        return np.asarray(~self._corner_faces.any(axis=1) | (self._corner_faces & facing[:-1]).any(axis=1))
+        return self.points_visible(points_grip_m, eye_grip_m, self.corner_points)
+
+    def points_visible(self, points_grip_m: Array, eye_grip_m: Array, points: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """(k,) whether a face at one of the ``points`` (k,) looks at the camera; True for those without faces."""
+        facing, touching = self._facing(points_grip_m, eye_grip_m), self._point_faces[points]
+        return np.asarray(~touching.any(axis=1) | (touching & facing[:-1]).any(axis=1))
 
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
         """Indices of the straight edges that end in a corner (index into ``corner_ids``): those that can be
@@ -264,7 +273,7 @@ class Gripper:
         return np.roll(face.points, 1 - best)[:3]
 
     def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Faces at each edge (e, 2), -1 for none, and whether a face touches a corner (c, f)."""
+        """Faces at each edge (e, 2), -1 for none, and whether a face touches a point (p, f)."""
         members = [set(f.points.tolist()) for f in self.faces]
         edge_faces = np.full((len(self.edge_points), 2), -1, dtype=np.intp)
         for i, (start, end) in enumerate(self.edge_points.tolist()):
@@ -272,8 +281,13 @@ class Gripper:
             if len(faces) > 2:
                 raise GripperError(f"edges.{self.edge_ids[i]}: {len(faces)} faces meet in it; at most two")
             edge_faces[i, : len(faces)] = faces
-        corner_faces = np.array([[int(c) in m for m in members] for c in self.corner_points], dtype=bool)
-        return edge_faces, corner_faces.reshape(len(self.corner_points), len(members))
+        point_faces = np.array([[point in m for m in members] for point in range(len(self.point_ids))], dtype=bool)
+        return edge_faces, point_faces.reshape(len(self.point_ids), len(members))
+
+    def _stand_for_the_tips(self) -> NDArray[np.intp]:
+        every = np.arange(len(self.point_ids))
+        of_curves = np.union1d(self.corner_points, self.edge_points[self.edge_curved])
+        return next((some for some in (self.corner_points, of_curves) if len(some) >= 3), every)
 
     def _facing(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
         """(f + 1,) which faces look at the eye; the last is False and stands for "no face" (index -1)."""
@@ -301,14 +315,12 @@ class Gripper:
         if not self.finger_ids:
             raise GripperError("fingers: there are none; at least one finger")
         corners = self._nominal_points_m[self.corner_points]
-        if self.has_curves:  # it may have no corner at all: then it is measured, and not recalibrated by corners
-            pass
-        elif len(corners) < 3:
-            raise GripperError(
-                f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line"
+        if len(corners) < 3 or on_a_line(corners):
+            where = ", all on a line" if len(corners) > 2 else ""
+            self.notes.append(
+                f"{len(corners)} corners{where}: too few for a calibration by corners, it is measured by its edges; "
+                "`corner: true` where two straight edges meet"
             )
-        elif on_a_line(corners):
-            raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
         if len(self.edge_ids) < 3:
             raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
         for i, name in enumerate(self.corner_ids):

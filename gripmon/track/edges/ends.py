@@ -54,7 +54,9 @@ GOES_ON = 0.5
 """Share of the probes that must show it: half of them, as for an edge beside a corner."""
 
 SHOWN = 0.5
-"""Share of the profiles on a stretch that must agree for a turn to be seen: most of them."""
+"""Share of the profiles on a stretch of the curve that must agree for a turn to be seen, and over the rest of its side
+that of the side's end: half, as for an edge beside a corner.
+"""
 
 
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
@@ -193,9 +195,10 @@ class FingerEnds:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
         measured = places.at_end & _of_corners(measurement.corners.usable, places)
-        supported = measurement.consensus.supported
-        for number, stretches in probes.turns.items():
-            measured[number] = all(supported[stretch].mean() > SHOWN for stretch in stretches)
+        supported, share = measurement.consensus.supported, measurement.consensus.edge_share
+        for number, (beside, *turning) in probes.turns.items():
+            side_shows = supported[beside].mean() >= SHOWN * share[places.side[number]]
+            measured[number] = side_shows and all(supported[stretch].mean() >= SHOWN for stretch in turning)
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
