@@ -293,5 +293,10 @@ def test_the_overlay_and_the_recording_show_the_curve(tmp_path: Path, capsys: py
     monitor = seen(0.004, make_scenario("clutter", duration_s=2.0, fps=FPS))[1]
     trace = monitor.trace()
     assert trace is not None
-    bends = [np.abs(np.diff(line, 2, axis=0)).max() for line in trace.predicted_edges_uv_px]
-    assert sum(bend > 0.05 for bend in bends) == 2, "both tips are drawn as curves"
+    assert sum(_farthest_from_chord_px(line) > 5.0 for line in trace.predicted_edges_uv_px) == 2, "both tips are curves"
+
+
+def _farthest_from_chord_px(line_px: np.ndarray) -> float:
+    way = line_px[-1] - line_px[0]
+    beside = (line_px - line_px[0]) @ np.array([-way[1], way[0]]) / np.linalg.norm(way)
+    return float(np.abs(beside).max())
