@@ -19,10 +19,10 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TOOLS))
-        from benchmarks import latency
+        from benchmarks import rings
 
         path = tmp_path_factory.mktemp("frames") / "ring.npz"
-        latency.render(SIZE, 6, path, creep_m=0.0)
+        rings.render(SIZE, 6, path, "quiet")
     return path
 
 

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,20 @@ from gripmon.daemon.config import Config
 from gripmon.daemon.running import run
 from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
-from gripmon.monitor import Monitor
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, State, StateRecord, Verdict
+from gripmon.monitor import Monitor, warm_up
 from gripmon.record.write import NullRecorder, Recorder
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)
+_TRACKING = (State.TRACKING, State.DRIFTING)
 _MATCH_S = 0.5  # until the publisher knows of its subscriber
 
 
 class RingSource:
-    """Hands frames over and notes when, and when the loop came back; ``paced``: at the camera's rate, else at once.
+    """Hands frames over and notes when, and when the loop came back; ``paced``: at the camera's rate, else at once;
+    ``opening``: with the jaw's.  Of what was published it notes when, and whether it was ``measured``, ``valid``, and
+    ``tracking``, or drifting.
 
     ``between`` is called before each frame, outside of what is timed.
     """
@@ -42,11 +46,19 @@ class RingSource:
     dropped = 0
 
     def __init__(
-        self, ring: Ring, count: int, *, paced: bool = False, between: Callable[[int], None] = lambda seq: None
+        self,
+        ring: Ring,
+        count: int,
+        *,
+        paced: bool = False,
+        opening: bool = True,
+        between: Callable[[int], None] = lambda seq: None,
     ) -> None:
         # Filled, not just reserved: memory that is first touched later would look like a leak of the product's.
         self.handed_ns, self.published_ns, self.back_ns = (np.full(count, -1, np.int64) for _ in range(3))
+        self.measured, self.tracking, self.valid = (np.full(count, False) for _ in range(3))
         self._ring, self._count, self._paced, self._between = ring, count, paced, between
+        self._opening = opening
         self._seq = 0
         self._due_s = time.monotonic()
 
@@ -58,6 +70,8 @@ class RingSource:
             return None
         self._between(seq)
         frame = self._ring.frame(seq)
+        if not self._opening:
+            frame = replace(frame, jaw_opening_m=None)
         self._seq = seq + 1
         if self._paced:
             self._due_s = max(self._due_s + 1.0 / FPS, time.monotonic())
@@ -86,6 +100,9 @@ class _TimedPublisher:
     def transform(self, record: FrameRecord) -> None:
         self._inner.transform(record)
         self._source.published_ns[record.seq] = time.monotonic_ns()
+        self._source.measured[record.seq] = record.measured
+        self._source.tracking[record.seq] = record.measured and record.state in _TRACKING
+        self._source.valid[record.seq] = record.verdict is Verdict.VALID
 
     def state(self, record: StateRecord) -> None:
         self._inner.state(record)
@@ -143,6 +160,7 @@ def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
 def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder: Recorder | None = None) -> None:
     """The daemon's loop, as ``gripmon run`` runs it, until the source ends.  Closes the recorder, not the publisher."""
     settings = config.settings
+    warm_up()
     run(
         Monitor(config.camera, config.gripper, settings.monitor, config.reference),
         source,

@@ -1,230 +1,225 @@
-"""``tools/bench latency``: from a frame handed over to its transform published, and what that costs."""
+"""``tools/bench latency``: what a frame costs, from handed over to published, and how long the program takes."""
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
+import json
 import sys
 import tempfile
+import time
+import traceback
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from benchmarks import options
+from benchmarks.latency_rows import skipped
+from benchmarks.rings import Rings, in_new_process
+from gripmon.model.errors import in_short
 
 _DESCRIPTION = """\
 Times the daemon's own loop (gripmon.daemon.running.run with a Zenoh publisher and a subscriber in another process) on
-cluttered simulator frames that were rendered beforehand, for two image sizes: latency, share of each stage,
-frames per second on one core, memory, and the cost of recording; and beside it, in the same run, interleaved
-and on one thread, AprilTags on the fingertips of the same images (cv2.aruco with sub-pixel corners, solvePnP).
-Takes some five minutes; --quick, less exact, one."""
+simulator frames that were rendered beforehand, beside it, in the same run and on one core, AprilTags on the
+fingertips of the same images (cv2.aruco with sub-pixel corners, solvePnP) and ViSP's edge tracker where that is
+installed; the whole daemon on a live camera, its demo, replay, starts. Each row is printed as soon as it is measured,
+its target beside it. On two quiet cores, which it needs, it takes some eight minutes; --quick, less exact, one and a
+half. Exit code 1 if a row is missed."""
 
-SIZES = ((768, 576), (1920, 1080))
-
-_T = TypeVar("_T")
+SMALL, LARGE = (768, 576), (1920, 1080)
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much of everything is measured."""
+    """How much of everything: frames that are rendered of each kind, and the plans of the two kinds of parts."""
 
-    sizes: tuple[tuple[int, int], ...] = SIZES
+    loop: Any
+    program: Any
     ring: int = 90
-    warm_up: int = 200
-    frames: int = 6000
-    block: int = 200
-    tags_per_block: int = 10
-    staged: int = 3000
-    paced_block: int = 300
-    paced_blocks: int = 6
-    memory_marks: tuple[int, ...] = (1_000, 10_000, 100_000)
+    ring_large: int = 45
+    ring_gone: int = 150
+    small: Size = SMALL
+    large: Size = LARGE
 
 
-QUICK = Plan(ring=60, frames=2000, staged=1000, paced_block=120, paced_blocks=4, memory_marks=(1_000, 5_000, 20_000))
+def full_plan() -> Plan:
+    from benchmarks import latency_loop, latency_program
+
+    return Plan(latency_loop.Plan(), latency_program.Plan())
+
+
+def quick_plan() -> Plan:
+    """Everything, but less of it."""
+    from benchmarks import latency_loop, latency_program
+
+    loop = latency_loop.Plan(
+        settle=60, frames=2500, compared=1000, block=100, beside=5, turns=2, turn=150, gone=180, staged=600
+    )
+    program = latency_program.Plan(daemon_s=4.0, demo_s=4.0, replayed=200, starts=1, calls=3)
+    return Plan(loop, program, ring=16, ring_large=6, ring_gone=54)
+
+
+@dataclass(frozen=True)
+class Part:
+    """``frames``: kinds of rendered frames, and whether large ones; ``measure`` is called in a new process with the
+    paths of their files and its plan.
+    """
+
+    what: str
+    measure: str
+    frames: tuple[tuple[str, bool], ...] = ()
+
+
+_CLUTTER = (("clutter", False),)
+PARTS = {
+    "frame": Part("768 x 576, handed over -> published: median, 99 %, longest; memory", "loop.frame", _CLUTTER),
+    "size": Part("1920 x 1080 against 768 x 576", "loop.size", (*_CLUTTER, ("clutter", True))),
+    "clutter": Part("tags on the fingers in a cluttered scene", "loop.against_tags clutter", _CLUTTER),
+    "plain": Part("tags on the fingers in a plain scene", "loop.against_tags plain", (("plain", False),)),
+    "visp": Part("ViSP's edge tracker on the same frames", "loop.against_visp", _CLUTTER),
+    "unreported": Part("jaw opening unreported against reported", "loop.unreported", _CLUTTER),
+    "hidden": Part("a hand covers the gripper", "loop.gone hidden", (("hidden", False),)),
+    "lost": Part("the gripper has left the view", "loop.gone lost", (("lost", False),)),
+    "daemon": Part("a live camera at 60 frames/s, with recording", "program.daemon", (("quiet", False),)),
+    "demo": Part("gripmon demo", "program.demo"),
+    "replay": Part("replay of a folder, decoding aside", "program.replay", (("quiet", False), *_CLUTTER)),
+    "start": Part("from the start of gripmon run to its first transform", "program.start", _CLUTTER),
+    "commands": Part("gripmon --help, import gripmon", "program.commands"),
+    "profile": Part("time of each stage of a frame", "loop.profile", (*_CLUTTER, ("hidden", False))),
+}
 
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    options.add_command(
+    parser = options.add_command(
         commands,
         "latency",
         run,
-        "time from frame to published transform, memory, recording; against AprilTags",
+        "time from frame to published transform, and of the rest of the program; against tags and ViSP",
         _DESCRIPTION,
         quick="a shorter run",
-        as_json="write everything that was measured",
-        markdown=True,
+        as_json="write all rows",
     )
+    parser.add_argument("--only", nargs="+", metavar="ROW", default=[], help="rows with these names")
+    parser.add_argument("--list", action="store_true", help="print the names of all rows and end")
+    parser.add_argument(
+        "--daemon-s", type=options.positive, metavar="S", help="length of the daemon's run, s (default 60, --quick 4)"
+    )
+    parser.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="what is measured is appended there as lines of JSON; rows of the same commit that are there are not "
+        "measured again",
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write speed.md there")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``tools/bench latency``."""
-    from benchmarks import report
+    from dataclasses import replace
 
-    results = measure(QUICK if arguments.quick else Plan())
-    options.deliver(arguments, "latency", report.as_text(results), results)
-    return 0
+    if arguments.list:
+        print("\n".join(f"{name:11s} {part.what}" for name, part in PARTS.items()))
+        return 0
+    unknown = [name for name in arguments.only if name not in PARTS]
+    if unknown:
+        print(f"latency: --only {unknown[0]}: no such row; one of {', '.join(PARTS)}", file=sys.stderr)
+        return 2
+    plan = quick_plan() if arguments.quick else full_plan()
+    if arguments.daemon_s is not None:
+        plan = replace(plan, program=replace(plan.program, daemon_s=float(arguments.daemon_s)))
+    try:
+        for folder in (arguments.out, arguments.resume and arguments.resume.parent):
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+        results = measure(plan, [name for name in PARTS if name in (arguments.only or PARTS)], arguments.resume)
+        if arguments.json is not None:
+            arguments.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        if arguments.out is not None:
+            from benchmarks import latency_page
+
+            given = " --quick" * arguments.quick
+            given += "" if arguments.daemon_s is None else f" --daemon-s {arguments.daemon_s}"
+            (arguments.out / "speed.md").write_text(latency_page.as_markdown(results, given), encoding="utf-8")
+    except OSError as error:
+        print(f"latency: {error.filename}: {error.strerror}; a place that can be written to", file=sys.stderr)
+        return 2
+    missed = [row for part in results["parts"].values() for row in part["missed"]]
+    left_out = sum(row["value"] is None for part in results["parts"].values() for row in part["rows"])
+    print((f"{len(missed)} missed" if missed else "none missed") + (f", {left_out} skipped" if left_out else ""))
+    return 1 if missed else 0
 
 
-def measure(plan: Plan) -> dict[str, Any]:
-    """Run all parts, each in a new process; plain values by part and size."""
-    from benchmarks import machine
+def measure(plan: Plan, names: list[str], resume: Path | None = None) -> dict[str, Any]:
+    """The rows of these parts, each printed as soon as it is there; plain values."""
+    from benchmarks import latency_rows, machine
 
-    results: dict[str, Any] = {"machine": machine.description(), "plan": {"frames": plan.frames, "ring": plan.ring}}
+    about = machine.description()
+    print("\n".join(machine.machine_lines(about)), end="\n\n", flush=True)
+    key = {"commit": about["commit"], "plan": repr(plan)}
+    done = _finished(resume, key)
+    results: dict[str, Any] = {"machine": about, "parts": {}}
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
-        for size in plan.sizes:
-            name = f"{size[0]}x{size[1]}"
-            path = Path(scratch) / f"{name}.npz"
-            render(size, plan.ring, path)
-            parts: dict[str, Callable[..., dict[str, Any]]] = {
-                "latency": _latency, "stages": _stages, "recording": _recording,
-            }  # fmt: skip
-            if size == plan.sizes[0]:
-                parts["memory"] = _memory
-            for part, function in parts.items():
-                print(f"{name}: {part} …", file=sys.stderr)
-                results.setdefault(part, {})[name] = in_new_process(function, size, path, plan)
-            path.unlink()
-    results["machine"]["load_after"] = machine.load()
+        rings = Rings(Path(scratch))
+        for number, name in enumerate(names, 1):
+            if name not in done:
+                print(f"latency: {number} of {len(names)}: {name} …", file=sys.stderr, flush=True)
+                begin_s = time.monotonic()
+                measured = _measured(PARTS[name], rings, plan)
+                done[name] = measured | {"took_s": round(time.monotonic() - begin_s, 1)}
+                if not measured.get("failed"):
+                    _keep(resume, {"part": name, **key, **done[name]})
+            part = latency_rows.of_plain(done[name])
+            print("\n".join(latency_rows.as_lines(name, part)), flush=True)
+            missed = [row.what for row in part.rows if row.met is False or done[name].get("failed")]
+            results["parts"][name] = {k: done[name][k] for k in ("rows", "notes", "took_s")} | {"missed": missed}
+    about["load_after"] = machine.load()
     return results
 
 
-def render(size: tuple[int, int], count: int, path: Path, **how: float) -> None:
-    """Frames of the benchmarks' scene into a file; ``how`` as :func:`benchmarks.scene.render` takes it."""
-    from tqdm import tqdm
-
-    from benchmarks import scene
-
-    with tqdm(total=count, desc=f"render {size[0]}x{size[1]}", unit="frame", file=sys.stderr, disable=None) as bar:
-        scene.render(size, count, bar.update, **how).save(path)
-
-
-def in_new_process(function: Callable[..., _T], *arguments: Any) -> _T:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=1, mp_context=context, initializer=_quiet) as pool:
-        return pool.submit(function, *arguments).result()
-
-
-def _quiet() -> None:
-    """Half an hour of creep passes in seconds: its alerts are published, but not also printed."""
-    import logging
-
-    import cv2
-
-    logging.getLogger("gripmon").setLevel(logging.CRITICAL)
-    cv2.setNumThreads(1)
+def _measured(part: Part, rings: Rings, plan: Plan) -> dict[str, Any]:
+    """One part in a process of its own."""
+    paths = []
+    for kind, large in part.frames:
+        count = plan.ring_large if large else plan.ring_gone if kind in ("hidden", "lost") else plan.ring
+        paths.append(rings.of(plan.large if large else plan.small, count, kind))
+    own = plan.loop if part.measure.startswith("loop.") else plan.program
+    try:
+        measured: dict[str, Any] = in_new_process(_call, part.measure, tuple(paths), own)
+    except Exception as error:  # noqa: BLE001  the other rows are measured all the same
+        traceback.print_exc()
+        return skipped(part.what, f"failed: {in_short(error)}").plain() | {"failed": True}
+    return measured
 
 
-def _latency(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
-    """Back to back on one core, tags between blocks of ours; then the same at the camera's rate."""
-    import time
+def _call(what: str, paths: tuple[Path, ...], plan: Any) -> dict[str, Any]:
+    from benchmarks import latency_loop, latency_program
 
-    import numpy as np
-
-    from benchmarks import harness, scene, tags
-
-    config, ring = scene.config_for(size), scene.Ring.load(path)
-    tracker = tags.TagTracker(config.camera)
-    tags_us: list[float] = []
-    errors_m: list[float] = []
-
-    def tags_between(seq: int) -> None:
-        if seq % plan.block or seq < plan.warm_up:
-            return
-        for place in map(ring.place, range(seq, seq + plan.tags_per_block)):
-            start_ns = time.perf_counter_ns()
-            tcp_m = tracker.tcp_m(ring.tagged[place], float(ring.jaw_openings_m[place]))
-            tags_us.append(1e-3 * (time.perf_counter_ns() - start_ns))
-            if tcp_m is not None:
-                errors_m.append(float(np.linalg.norm(tcp_m - ring.true_tcp_m[place])))
-
-    with harness.on_one_core():
-        source = harness.RingSource(ring, plan.warm_up + plan.frames, between=tags_between)
-        with harness.published(config) as (publisher, subscriber):
-            harness.run_loop(config, source, publisher)
-    paced = harness.RingSource(ring, plan.paced_block * plan.paced_blocks // 2, paced=True)
-    with harness.published(config) as (publisher, paced_subscriber):
-        harness.run_loop(config, paced, publisher)
-    back_to_back = harness.summary(source.latency_us()[plan.warm_up :])
-    arrived_us = 1e-3 * (paced_subscriber.arrivals_ns - paced.handed_ns[paced_subscriber.seqs])
-    return {
-        "published_us": back_to_back,
-        "frames_per_s_one_core": float(1e6 / np.mean(source.loop_us()[plan.warm_up :])),
-        "paced_published_us": harness.summary(paced.latency_us()[scene.WARM_UP_PACED :]),
-        "paced_received_us": harness.summary(arrived_us[scene.WARM_UP_PACED :]),
-        "received": [len(subscriber.seqs), plan.warm_up + plan.frames],
-        "tags_us": harness.summary(np.array(tags_us)),
-        "tags_found": [len(errors_m), len(tags_us)],
-        "tags_tcp_error_m": float(np.median(errors_m)),
-        "times_faster": float(np.median(tags_us) / back_to_back["median"]),
-    }
+    name, *arguments = what.split()
+    room, _, function = name.partition(".")
+    call: Callable[..., Any] = getattr({"loop": latency_loop, "program": latency_program}[room], function)
+    plain: dict[str, Any] = partial(call, paths, plan)(*arguments).plain()
+    return plain
 
 
-def _stages(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
-    """Mean time of each stage, µs, in a run of its own."""
-    from benchmarks import harness, scene, stages
-
-    config, ring = scene.config_for(size), scene.Ring.load(path)
-    with harness.on_one_core(), stages.stop_watches() as watches:
-
-        def begin(seq: int) -> None:
-            if seq == plan.warm_up:
-                watches.reset()
-
-        source = harness.RingSource(ring, plan.warm_up + plan.staged, between=begin)
-        with harness.published(config) as (publisher, _):
-            harness.run_loop(config, source, publisher)
-    return {stage: 1e-3 * total_ns / plan.staged for stage, total_ns in watches.total_ns.items()}
+def _finished(file: Path | None, key: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What an earlier run of the same commit and plan has left, by part; a line that was cut off doesn't count."""
+    done = {}
+    for text in file.read_text(encoding="utf-8").splitlines() if file is not None and file.exists() else ():
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        if all(line.get(name) == value for name, value in key.items()):
+            done[line["part"]] = line
+    return done
 
 
-def _recording(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
-    """Latency at the camera's rate with recording off and on, in turns, one process."""
-    import numpy as np
+def _keep(file: Path | None, line: dict[str, Any]) -> None:
+    if file is not None:
+        from benchmarks.integrity import append_line
 
-    from benchmarks import harness, scene
-    from benchmarks.switched import SwitchedRecorder
-
-    config, ring = scene.config_for(size), scene.Ring.load(path)
-    count = plan.paced_block * plan.paced_blocks
-    with tempfile.TemporaryDirectory(prefix="gripmon-bench-", dir=path.parent) as scratch:
-        recorder = SwitchedRecorder(config, Path(scratch))
-
-        def switch(seq: int) -> None:
-            recorder.on = bool(seq // plan.paced_block % 2)
-
-        source = harness.RingSource(ring, count, paced=True, between=switch)
-        with harness.published(config) as (publisher, _):
-            harness.run_loop(config, source, publisher, recorder)
-        written = sum(file.stat().st_size for file in Path(scratch).glob("*.rrd"))
-    seqs = np.arange(count)
-    settled = seqs % plan.paced_block >= scene.WARM_UP_PACED
-    recorded = (seqs // plan.paced_block % 2).astype(bool)
-    off, on = (source.latency_us()[settled & which] for which in (~recorded, recorded))
-    loop_off, loop_on = (source.loop_us()[settled & which] for which in (~recorded, recorded))
-    return {
-        "off_us": harness.summary(off),
-        "on_us": harness.summary(on),
-        "loop_off_us": harness.summary(loop_off),
-        "loop_on_us": harness.summary(loop_on),
-        "dropped": recorder.dropped,
-        "written_bytes": written,
-    }
-
-
-def _memory(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
-    """Memory of the process after so many frames; the frames themselves are part of it, and always the same."""
-    from benchmarks import harness, machine, scene
-
-    config, ring = scene.config_for(size), scene.Ring.load(path)
-    rss: dict[str, int] = {}
-
-    def look(seq: int) -> None:
-        if seq in plan.memory_marks:
-            rss[str(seq)] = machine.rss_bytes()
-
-    source = harness.RingSource(ring, plan.memory_marks[-1] + 1, between=look)
-    with harness.published(config) as (publisher, subscriber):
-        harness.run_loop(config, source, publisher)
-    return {"rss_bytes": rss, "received": [len(subscriber.seqs), plan.memory_marks[-1] + 1]}
+        append_line(file, line)

@@ -29,6 +29,18 @@ def description() -> dict[str, Any]:
     }
 
 
+def machine_lines(machine: dict[str, Any]) -> list[str]:
+    """What a report begins with; ``load_after``, where it is there, was added at the end."""
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    after = f", {machine['load_after']} after" if "load_after" in machine else ""
+    return [
+        f"gripmon {machine['commit']}, {machine['date']}",
+        f"{machine['cpu']}, {machine['cpus']} cores, {machine['system']}",
+        f"load average {machine['load_before']} before{after} (1 belongs to this benchmark)",
+        f"Python {machine['python']}, {packages}; one thread each",
+    ]
+
+
 def cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0))

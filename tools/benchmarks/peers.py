@@ -108,7 +108,7 @@ class RapidPeer:
         self._tcp_m = sequence.start_cam_T_grip[:3, 3:].copy()
         self._matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
         self._canvas_matrix = self._matrix + np.array([[0, 0, self._MARGIN_PX], [0, 0, self._MARGIN_PX], [0, 0, 0.0]])
-        self._maps = _undistorting_maps(camera)
+        self._maps = undistorting_maps(camera)
         self._meshes = [_mesh(self._gripper, finger) for finger in range(len(self._gripper.finger_ids))]
 
     def cam_T_grip(self, image: Grey, jaw_opening_m: float) -> Array | None:
@@ -238,7 +238,7 @@ def _moved(points: NDArray[np.float32], way_m: Array) -> NDArray[np.float32]:
     return points + way_m.astype(np.float32)
 
 
-def _undistorting_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def undistorting_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Maps from the ideal image, of the same focal length and centre, to the camera's."""
     u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     xy = np.stack([(u.ravel() - camera.cx_px) / camera.fx_px, (v.ravel() - camera.cy_px) / camera.fy_px], axis=1)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import options
+from benchmarks.rings import Rings, in_new_process
 
 _DESCRIPTION = """\
 Times the daemon's own loop at 60 frames/s with its recording off, on, and on with a disk that stands still
@@ -85,53 +86,35 @@ def measure(plans: dict[str, Any]) -> dict[str, Any]:
 
     results: dict[str, Any] = {"machine": machine.description()}
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
-        frames = _Frames(Path(scratch))
+        frames = Rings(Path(scratch))
         for part, plan in plans.items():
             print(f"{part} …", file=sys.stderr)
             if part == "loop":
-                results[part] = {_name(size): _run(record_loop.measure, frames.of(size, plan.ring), size, plan)
-                                 for size in plan.sizes}  # fmt: skip
+                results[part] = {
+                    _name(size): in_new_process(record_loop.measure, frames.of(size, plan.ring), size, plan)
+                    for size in plan.sizes
+                }
             elif part == "bytes":
-                results[part] = {_name(size): _run(record_bytes.measure, frames.of(size, plan.ring, quiet=True),
-                                                   size, plan) for size in plan.sizes}  # fmt: skip
+                results[part] = {
+                    _name(size): in_new_process(record_bytes.measure, frames.of(size, plan.ring, "quiet"), size, plan)
+                    for size in plan.sizes
+                }
             elif part == "hour":
-                rings = (frames.of(plan.size, plan.ring, quiet=quiet) for quiet in (True, False))
-                results[part] = _hour(record_hour, *rings, plan)
+                quiet, moving = (frames.of(plan.size, plan.ring, kind) for kind in ("quiet", "clutter"))
+                results[part] = _hour(record_hour, quiet, moving, plan)
             elif part == "killed":
-                results[part] = _run(record_killed.measure, frames.of(plan.size, plan.ring), plan)
+                results[part] = in_new_process(record_killed.measure, frames.of(plan.size, plan.ring), plan)
             else:
-                results[part] = _run(record_memory.measure, frames.of(plan.size, plan.ring, quiet=True), plan)
+                results[part] = in_new_process(record_memory.measure, frames.of(plan.size, plan.ring, "quiet"), plan)
     results["machine"]["load_after"] = machine.load()
     return results
 
 
 def _hour(record_hour: Any, quiet: Path, moving: Path, plan: Any) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as directory:
-        written = _run(record_hour.write, quiet, moving, Path(directory), plan)
+        written = in_new_process(record_hour.write, quiet, moving, Path(directory), plan)
         return {"written": written, "read": record_hour.read(Path(directory), plan)}
-
-
-def _run(function: Any, *arguments: Any) -> Any:
-    from benchmarks import latency
-
-    return latency.in_new_process(function, *arguments)
 
 
 def _name(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
-
-
-class _Frames:
-    """Rendered frames, each kind once."""
-
-    def __init__(self, scratch: Path) -> None:
-        self._scratch = scratch
-
-    def of(self, size: tuple[int, int], count: int, *, quiet: bool = False) -> Path:
-        """A file with a ring of frames; ``quiet``: in which nothing happens."""
-        from benchmarks import latency
-
-        path = self._scratch / f"{_name(size)}-{count}-{quiet}.npz"
-        if not path.exists():
-            latency.render(size, count, path, **({"creep_m": 0.0} if quiet else {}))
-        return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.report import machine_lines
+from benchmarks.machine import machine_lines
 
 MEDIAN, TAIL, HOUR_S, LOSS_S, FLAT_MIB = 1.10, 1.25, 60.0, 2.0, 1.0
 _CONDITIONS = {"off": "off", "on": "on", "stalled": "on, disk stalled"}

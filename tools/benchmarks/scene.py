@@ -21,29 +21,49 @@ from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame
 from gripmon.simulate import Scenario, Simulator
-from gripmon.simulate.scenario import Background, Creep
+from gripmon.simulate.scenario import Background, Bump, Cover, Creep
 
 FPS = 60.0
 WARM_UP_PACED = 30
 """Frames at the camera's rate after which everything is as it stays."""
 _START_NS = 1_700_000_000_000_000_000
 _DEMO_HEIGHT_PX = 576
-_CREEP_M = 3e-4
+_CREEP = (3e-4, 1.5e-4)
+_GOES_BEFORE = 30
+_COVERED_WITHIN = 12  # frames
+_AWAY_M = 0.3  # three times as wide as the view at the fingertips
+_CLUTTER = Background(kind="printed", boxes=45, cables=14, contrast=0.9, speed_m_per_s=0.12)
+
+KINDS = {
+    "clutter": "boxes, cables and print move behind the gripper, while the mount creeps",
+    "quiet": "the same without creep",
+    "plain": "one shade behind the gripper, while the mount creeps",
+    "hidden": "clutter; after half a second a hand covers the whole view",
+    "lost": "clutter; after half a second the gripper has left the view",
+}
 
 Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Rendered frames: ``images`` and ``tagged``, the same with a tag on each finger, (n, height, width) each."""
+    """Rendered frames: ``images`` and ``tagged``, the same with a tag on each finger, (n, height, width) each; of kinds
+    in which the gripper goes away ``gone`` (n,) says where nothing of it is in view, and none has tags.
+    """
 
     images: NDArray[np.uint8]
     tagged: NDArray[np.uint8]
     jaw_openings_m: NDArray[np.float64]
     true_tcp_m: NDArray[np.float64]
+    gone: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def size(self) -> Size:
+        """Width and height, px."""
+        return self.images.shape[2], self.images.shape[1]
 
     def place(self, seq: int) -> int:
         """Which of the images is frame ``seq``: 0, 1, …, n - 1, n - 2, …, 1, 0, 1, …"""
@@ -84,26 +104,46 @@ def config_for(size: Size) -> Config:
     return dataclasses.replace(config, settings=settings, camera=make_camera(lens))
 
 
-def render(size: Size, count: int, step: Callable[[], object] = lambda: None, *, creep_m: float = _CREEP_M) -> Ring:
-    """A ring of ``count`` frames in which the mount creeps; ``step`` is called after each (for a progress bar)."""
-    config = config_for(size)
-    scenario = Scenario(
-        name="benchmark",
-        duration_s=count / FPS,
-        fps=FPS,
-        mount=(Creep(law="linear", time_s=count / FPS, tcp_shift_m=(creep_m, 0.5 * creep_m)),),
-        background=Background(kind="printed", boxes=45, cables=14, contrast=0.9, speed_m_per_s=0.12),
-    )
+def render(size: Size, count: int, step: Callable[[], object] = lambda: None, *, kind: str = "clutter") -> Ring:
+    """A ring of ``count`` frames of a kind (:data:`KINDS`); ``step`` is called after each (for a progress bar)."""
+    config, goes = config_for(size), kind in ("hidden", "lost")
+    scenario = _scenario(kind, count)
     simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)
     shape = (count, config.camera.height_px, config.camera.width_px)
-    ring = Ring(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(count), np.zeros((count, 3)))
+    ring = Ring(
+        np.zeros(shape, np.uint8),
+        np.zeros((0 if goes else count, *shape[1:]), np.uint8),
+        np.zeros(count),
+        np.zeros((count, 3)),
+        np.zeros(count, bool),
+    )
     rng = np.random.default_rng(1)
     for i in range(count):
         frame, truth = simulator.frame(i), simulator.truth(i)
         assert isinstance(frame.image, np.ndarray) and frame.jaw_opening_m is not None
         ring.images[i] = frame.image
-        ring.tagged[i] = tags.with_tags(ring.images[i], config.camera, truth.cam_T_grip, truth.jaw_opening_m, rng)
+        if not goes:
+            ring.tagged[i] = tags.with_tags(ring.images[i], config.camera, truth.cam_T_grip, truth.jaw_opening_m, rng)
         ring.jaw_openings_m[i] = frame.jaw_opening_m
         ring.true_tcp_m[i] = truth.cam_T_grip[:3, 3]
+        ring.gone[i] = goes and i >= _GOES_BEFORE + (_COVERED_WITHIN if kind == "hidden" else 0)
         step()
     return ring
+
+
+def _scenario(kind: str, count: int) -> Scenario:
+    mount: tuple[Creep | Bump, ...] = ()
+    if kind in ("clutter", "plain"):
+        mount = (Creep(law="linear", time_s=count / FPS, tcp_shift_m=_CREEP),)
+    elif kind == "lost":
+        # Between two frames: none shows it in both places.
+        mount = (Bump(at_s=(_GOES_BEFORE - 0.5) / FPS, translation_m=(_AWAY_M, 0.0, 0.0), ring_fraction=0.0),)
+    hand = Cover(start_s=(_GOES_BEFORE - 0.5) / FPS, end_s=1e4, move_s=(_COVERED_WITHIN - 0.5) / FPS)
+    return Scenario(
+        name="benchmark",
+        duration_s=count / FPS,
+        fps=FPS,
+        mount=mount,
+        covers=(hand,) if kind == "hidden" else (),
+        background=Background(kind="plain", boxes=0, cables=0) if kind == "plain" else _CLUTTER,
+    )

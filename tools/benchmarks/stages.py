@@ -1,11 +1,13 @@
 """Where the time of a frame goes: the product's functions, wrapped in stop watches for one run of its own.
 
-A function's time counts without that of wrapped functions that it calls, so the stages add up to the whole.
+A function's time counts without that of wrapped functions that it calls, so the stages add up to the whole.  Only the
+thread that makes the watches is timed: what runs beside the frames is nobody's stage.
 """
 
 from __future__ import annotations
 
 import functools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +15,7 @@ from typing import Any
 
 import gripmon.monitor.core
 import gripmon.track.edges.settling
+from gripmon.daemon.loop import Daemon
 from gripmon.io.publish import ZenohPublisher
 from gripmon.judge.drift import MotionWatch
 from gripmon.judge.policy import Policy
@@ -20,11 +23,13 @@ from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamWatch
 from gripmon.monitor import Monitor, Tracker
 from gripmon.monitor.analysis import CauseAnalysis
+from gripmon.monitor.trust import Integrity
+from gripmon.monitor.weigher import Weigher
 from gripmon.track.edges import FingertipMeter
 
 STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "inspect the image": ((gripmon.monitor.core, "inspect"),),
-    "predict": ((FingertipMeter, "_predicted"),),
+    "predict": ((FingertipMeter, "_predicted"), (FingertipMeter, "_predict"), (FingertipMeter, "_lay_out")),
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
         (gripmon.track.edges.settling, "agree"),
@@ -32,11 +37,14 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
         (FingertipMeter, "measure"),
     ),
     "corners": ((gripmon.track.edges.settling, "intersect_edges"),),
+    "see the fingers' ends, one frame in four": ((FingertipMeter, "ends"),),
+    "protection level": ((Weigher, "weigh"),),
     "look at the stream": ((StreamWatch, "add"),),
     "drift test": ((MotionWatch, "add"),),
     "causes": ((CauseAnalysis, "ask"),),
     "update and judge": (
         (Tracker, "update"),
+        (Integrity, "judge"),
         (Monitor, "_evidence"),
         (Monitor, "process"),
         (PoseAverage, "add"),
@@ -44,35 +52,39 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     ),
     "make the record": ((Monitor, "_record"),),
     "encode and publish": ((ZenohPublisher, "transform"),),
+    "learn the gripper's look, after publishing": ((Integrity, "learn"),),
+    "the rest of the loop": ((Daemon, "_handle"),),
 }
 
 
 class StopWatches:
-    """Time of each stage, ns, summed over frames."""
+    """Time of each stage, ns, summed over frames while ``counting``."""
 
     def __init__(self) -> None:
+        self.counting = True
         self.total_ns = dict.fromkeys(STAGES, 0)
         self._inner_ns = [0]
+        self._thread = threading.get_ident()
 
     def wrapped(self, function: Callable[..., Any], stage: str) -> Callable[..., Any]:
-        clock, inner_ns, total_ns = time.perf_counter_ns, self._inner_ns, self.total_ns
+        clock, inner_ns, total_ns, thread = time.perf_counter_ns, self._inner_ns, self.total_ns, self._thread
 
         @functools.wraps(function)
         def timed(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != thread:
+                return function(*args, **kwargs)
             inner_ns.append(0)
             start_ns = clock()
             try:
                 return function(*args, **kwargs)
             finally:
                 elapsed_ns = clock() - start_ns
-                total_ns[stage] += elapsed_ns - inner_ns.pop()
+                own_ns = elapsed_ns - inner_ns.pop()
+                if self.counting:
+                    total_ns[stage] += own_ns
                 inner_ns[-1] += elapsed_ns
 
         return timed
-
-    def reset(self) -> None:
-        for stage in self.total_ns:
-            self.total_ns[stage] = 0
 
 
 @contextmanager

@@ -58,19 +58,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 def measure(plan: Any) -> dict[str, Any]:
     """Everything, in a new process each; plain values."""
-    from benchmarks import latency, machine, wire_runs, wire_slow
+    from benchmarks import machine, rings, wire_runs, wire_slow
 
     results: dict[str, Any] = {"machine": machine.description()}
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
         path = Path(scratch) / "ring.npz"
-        latency.render(plan.size, plan.ring, path)
+        rings.render(plan.size, plan.ring, path)
         for name, function in (
             ("conditions", wire_runs.conditions),
             ("restarts", wire_runs.restarts),
             ("slow", wire_slow.slow_links),
         ):
             print(f"{name} …", file=sys.stderr)
-            results[name] = latency.in_new_process(function, path, plan)
+            results[name] = rings.in_new_process(function, path, plan)
     results["machine"]["load_after"] = machine.load()
     return results
 
@@ -104,7 +104,7 @@ def verdicts(results: dict[str, Any]) -> list[tuple[str, str, bool]]:
 
 def as_text(results: dict[str, Any]) -> str:
     """The whole report."""
-    from benchmarks.report import machine_lines
+    from benchmarks.machine import machine_lines
 
     measured, restarts = results["conditions"], results["restarts"]
     lines = [*machine_lines(results["machine"]), ""]

@@ -206,7 +206,7 @@ def _rss(pid: int) -> int:
 
 def as_text(results: dict[str, Any]) -> str:
     """The whole report."""
-    from benchmarks.report import machine_lines
+    from benchmarks.machine import machine_lines
 
     plan = results["plan"]
     monitors = plan["monitors"]

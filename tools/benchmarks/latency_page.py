@@ -1,0 +1,75 @@
+"""The results of ``tools/bench latency`` as the page docs/results/speed.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.latency_rows import Measured, of_plain
+from benchmarks.machine import machine_lines
+
+PROFILE = "profile"
+_METHOD = """\
+The daemon's own loop (`gripmon.daemon.running.run`, with a Zenoh publisher and a subscriber in another process) gets
+frames of the demo's camera that the simulator rendered beforehand: boxes, cables and print move behind the gripper
+while the mount creeps to and fro. It is timed from a frame handed over until its transform has left, back to back on
+one core. What is compared takes turns with it in the same run, on the same core and the same images: tags printed onto
+both fingers (`cv2.aruco`, family 36h11, sub-pixel corners, `solvePnP`), and ViSP's model-based edge tracker
+(`vpMbGenericTracker` with moving edges, the settings of its tutorial) on images without the lens's distortion, whose
+removal isn't counted. For "hidden" a hand covers the whole view, for "lost" the gripper is outside it, again and
+again, at 60 frames/s. "daemon" is a live camera in a process of its own, with recording; what its loop's thread takes
+is its own processor time. "start" is `gripmon run` with a camera on the network, from the start of the process until a
+subscriber has the first measured transform; "replay" is `gripmon replay`, less the time for reading and decoding files.
+
+What the way to other processes takes is in [The network, measured](network.md), what recording costs in
+[Recording, measured](recording.md)."""
+
+
+def as_markdown(results: dict[str, Any], options: str) -> str:
+    """The page; ``options``: those that it was measured with, as they are typed."""
+    parts = {name: of_plain(part) for name, part in results["parts"].items()}
+    return (
+        "\n\n".join(
+            [
+                "# Speed and memory",
+                f"Written by `tools/bench latency{options} --out docs/results`.",
+                "\n".join(f"- {line}" for line in machine_lines(results["machine"])),
+                _METHOD,
+                _table(parts),
+                _missed(parts),
+                "## Beside the figures",
+                "\n".join(
+                    f"- {name}: {note}" for name, part in parts.items() if name != PROFILE for note in part.notes
+                ),
+                *_profile(parts),
+            ]
+        )
+        + "\n"
+    )
+
+
+def _table(parts: dict[str, Measured]) -> str:
+    lines = ["| `--only` | | measured | to be reached | | beside it |", "| --- | --- | --- | --- | --- | --- |"]
+    for name, part in parts.items():
+        for row in part.rows:
+            lines.append(f"| {name} | {row.what} | {row.figure} | {row.required} | {row.verdict} | {row.note} |")
+            name = ""
+    return "\n".join(lines)
+
+
+def _missed(parts: dict[str, Measured]) -> str:
+    missed = [
+        f"{row.what} ({row.figure}, {row.required})" for part in parts.values() for row in part.rows if row.met is False
+    ]
+    if not missed:
+        return "Nothing is missed."
+    return "\n".join([f"Missed, {len(missed)}:", "", *(f"- {text}" for text in missed)])
+
+
+def _profile(parts: dict[str, Measured]) -> list[str]:
+    """What the time goes into."""
+    if PROFILE not in parts:
+        return []
+    profile = parts[PROFILE]
+    figures = "; ".join(f"{row.what}: {row.figure} ({row.note})" for row in profile.rows)
+    text = "\n".join(profile.notes)
+    return ["## What a frame's time goes into", f"{figures}.", f"```text\n{text}\n```"]
