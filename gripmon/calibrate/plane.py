@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from gripmon.calibrate.bundle import (
     Bundle,
@@ -161,7 +161,7 @@ def calibrate_plane(
     slopes = [_slope(solve(up), solve(down)) for up, down in (*own, *printed, *common)]
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
-    p_value = float(chi2.sf(size, freedom)) if freedom else 1.0
+    p_value = float(chdtrc(freedom, size)) if freedom else 1.0
     if known is None and p_value < IMPOSSIBLE and _misfit(found) > MISSHAPEN:
         raise CalibrationError(_no_rectangle(corners.names, found.residuals_m, p_value))
     enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
@@ -254,7 +254,7 @@ def corners_of(lengths: Array) -> Array:
 def chance(values: Array, covariance: Array) -> float:
     """Probability of values as large by their (perhaps singular) covariance; 1 where nothing is free."""
     size, freedom = _size(values, covariance)
-    return float(chi2.sf(size, freedom)) if freedom else 1.0
+    return float(chdtrc(freedom, size)) if freedom else 1.0
 
 
 def _size(values: Array, covariance: Array) -> tuple[float, int]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from gripmon.calibrate.plane import DOUBTED, Coincidence, corners_of, lengths_of
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS
@@ -74,7 +74,7 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     away = [_away(image, cam_T_grip, lengths) for image in images]
     size = float(sum(a @ i @ a for a, i in zip(away, information, strict=True)))
     freedom = len(total) * (len(images) - 1)
-    consistency_p = float(chi2.sf(size, freedom)) if freedom else None
+    consistency_p = float(chdtrc(freedom, size)) if freedom else None
     warnings = list(_of_images(images, inferred))
     own = np.sum([g @ i.own @ i.own.T @ g.T for g, i in zip(gains, images, strict=True)], axis=0)
     if consistency_p is not None and consistency_p < DOUBTED:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturb, skew
@@ -168,7 +168,7 @@ def refine(
     if count > FEWEST_POSES:
         # The unknowns take their share of the residuals away.
         left = np.sqrt(1.0 - 2.0 / count)
-        used = sizes <= np.sqrt(chi2.isf(FALSE_OUTLIERS / count, 6)) * _scale(sizes, 6) / left
+        used = sizes <= np.sqrt(chdtri(6, FALSE_OUTLIERS / count)) * _scale(sizes, 6) / left
     if used.sum() < FEWEST_POSES:
         raise CalibrationError(f"{int(used.sum())} of {count} poses agree with each other; at least {FEWEST_POSES}")
     cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used.astype(float))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from gripmon.calibrate.bundle import GivenCamera, independent_errors, lens_vector
 from gripmon.calibrate.documents import CalibratedGripper
@@ -92,9 +92,9 @@ def compare_hand_eye(
         rotation_rad=xi[3:],
         rotation_sigma_rad=sigma[3:],
         chi2=_chi2(xi, covariance),
-        p_value=float(chi2.sf(_chi2(xi, covariance), 6)),
-        position_p=float(chi2.sf(_chi2(xi[:3], covariance[:3, :3]), 3)),
-        rotation_p=float(chi2.sf(_chi2(xi[3:], covariance[3:, 3:]), 3)),
+        p_value=float(chdtrc(6, _chi2(xi, covariance))),
+        position_p=float(chdtrc(3, _chi2(xi[:3], covariance[:3, :3]))),
+        rotation_p=float(chdtrc(3, _chi2(xi[3:], covariance[3:, 3:]))),
     )
 
 
@@ -131,7 +131,7 @@ def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArr
         for j in range(i):
             xi = perturbation_between(cam_T_grip[i], cam_T_grip[j])
             apart[i, j] = apart[j, i] = _chi2(xi, np.asarray(covariances[i]) + np.asarray(covariances[j]))
-    agree = apart < chi2.isf(CHANCE, 6)
+    agree = apart < chdtri(6, CHANCE)
     # Of equally many the set that lies closer together.
     spread = np.where(agree, apart, 0.0).sum(axis=1)
     best = np.lexsort((spread, -agree.sum(axis=1)))[0]

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher_f
+from scipy.special import chdtri, fdtri
 
 from gripmon.calibrate.bundle import GivenCamera, lens_vector
 from gripmon.calibrate.sighting import CalibrationError
@@ -116,7 +115,7 @@ def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
     scale = _scale(problem, state)
     state = _minimise(problem, state, _Tukey(scale), _ITERATIONS)
     scale = _scale(problem, state)
-    used = problem.sizes(state) <= float(np.sqrt(chi2.isf(FALSE_OUTLIERS / len(problem), 2))) * scale
+    used = problem.sizes(state) <= float(np.sqrt(chdtri(2, FALSE_OUTLIERS / len(problem)))) * scale
     for _ in range(_SELECTIONS):
         _check_enough(problem, used)
         state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
@@ -156,7 +155,7 @@ def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], sca
     freedom = np.maximum(whole - 2.0 * used, 1.0)
     variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom
     ratio = 0.5 * sizes / np.maximum(variance, _LEAST**2)
-    limit = fisher_f.isf(FALSE_OUTLIERS / len(problem), 2, freedom)
+    limit = float(fdtri(2, freedom, 1.0 - FALSE_OUTLIERS / len(problem)))
     out: NDArray[np.bool_] = np.isfinite(problem.sizes(state)) & ((ratio <= limit) | (whole <= 2))
     return out
 

@@ -17,7 +17,7 @@ from functools import cache
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gripmon.model.records import Array
 
@@ -150,4 +150,4 @@ def robust_scale(sizes: Array, dimensions: int) -> float:
 
 @cache
 def _chi_median(dimensions: int) -> float:
-    return float(np.sqrt(chi2.median(dimensions)))
+    return float(np.sqrt(chdtri(dimensions, 0.5)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from gripmon.judge.recalibrate.stills import StillFrame
 from gripmon.model.geometry import perturbation_between
@@ -131,7 +131,7 @@ def fingers_disagree(pooled: PooledEdges) -> float | None:
         free = len(residual) - more
         if free >= FEWEST_FREE and more > rank:
             ratio = ((left - less) / (more - rank)) / max(less / free, 1.0)
-            chances.append(float(fisher.sf(ratio, more - rank, free)))
+            chances.append(float(fdtrc(more - rank, free, ratio)))
     return min(chances, default=None)
 
 

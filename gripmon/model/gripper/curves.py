@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from gripmon.model.gripper.model import GripperError
 from gripmon.model.records import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 SHORTEST_PIECE_M = 1e-5
 """Points of a curve nearer together than a file's digits tell apart are one point, m."""
@@ -42,6 +45,8 @@ class Curves:
 
 def _bulge(points_m: Array, name: str) -> CubicSpline:
     """Through the points (n, 3), minus the way from the first to the last, by the fraction of the length."""
+    from scipy.interpolate import CubicSpline  # half a second, for a gripper that has a curve
+
     length_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     if not (length_m > SHORTEST_PIECE_M).all():
         raise GripperError(f"edges.{name}.via: two points in turn are the same; different points along the edge")

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from gripmon.model.records import Array
 
 LOG_RISK_SPACING = 0.05
 _LOG_RISK = -LOG_RISK_SPACING * np.arange(281.0)
-SQUARES = stats.chi2.isf(10.0**_LOG_RISK, np.array([[1.0], [3.0]]))
+SQUARES = chdtri(np.array([[1.0], [3.0]]), 10.0**_LOG_RISK)
 """(2, 281) squares that normal errors along one axis, and along three equal ones, exceed with the probabilities 1 to
 1e-14, in even steps of their logarithm.
 """
