@@ -155,7 +155,7 @@ def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], sca
     freedom = np.maximum(whole - 2.0 * used, 1.0)
     variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom
     ratio = 0.5 * sizes / np.maximum(variance, _LEAST**2)
-    limit = float(fdtri(2, freedom, 1.0 - FALSE_OUTLIERS / len(problem)))
+    limit = fdtri(2, freedom, 1.0 - FALSE_OUTLIERS / len(problem))
     out: NDArray[np.bool_] = np.isfinite(problem.sizes(state)) & ((ratio <= limit) | (whole <= 2))
     return out
 
