@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from gripmon.model.records import Frame, FrameRecord
     from gripmon.record.export import export
     from gripmon.teach.api import teach as teach_edges
+    from gripmon.teach.cad import gripper_from_cad
     from gripmon.teach.hand_eye import calibrate_plane
 
 __version__ = "0.1.0"
@@ -56,6 +57,7 @@ _WHERE = {
     "correct": "analyse.api",
     "export": "record.export",
     "forecast": "daemon.forecast",
+    "gripper_from_cad": "teach.cad",
     "load_config": "daemon.config",
     "open_source": "daemon.api",
     "replay": "daemon.replaying",
@@ -85,6 +87,7 @@ __all__ = [
     "correct",
     "export",
     "forecast",
+    "gripper_from_cad",
     "load_config",
     "open_source",
     "replay",

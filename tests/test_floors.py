@@ -46,6 +46,7 @@ HEAVY = (
     "plotly",
     "jinja2",
     "shtab",
+    "trimesh",
 )
 
 

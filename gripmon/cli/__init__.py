@@ -19,6 +19,7 @@ from gripmon.cli import (
     certificates,
     check,
     demo,
+    gripper,
     network,
     recordings,
     replay,
@@ -104,6 +105,7 @@ def build_parser() -> argparse.ArgumentParser:
     methods = calibrate.add_subparsers(title="methods", metavar="METHOD", required=True)
     for method in _METHODS:
         method.add_to(methods)
+    gripper.add_to(commands)
     for command in _LAST:
         command.add_to(commands)
     return parser

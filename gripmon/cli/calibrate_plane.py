@@ -77,18 +77,20 @@ exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated 
 nothing is written then"""
 
 
-def _opening(text: str) -> float:
+def opening(text: str) -> float:
+    """An argument that is a jaw opening, m."""
     value = 0.0 if text.strip() in ("0", "0.0") else positive_number(text)
     if value > 0.5:
         raise argparse.ArgumentTypeError(f"{text} m isn't a jaw opening (millimetres?); metres, 0 to 0.5")
     return value
 
 
-def _range(text: str) -> tuple[float, float]:
+def range_of(text: str) -> tuple[float, float]:
+    """An argument MIN:MAX of jaw openings, m."""
     low, colon, high = text.partition(":")
     if not colon:
         raise argparse.ArgumentTypeError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
-    ends = _opening(low), _opening(high)
+    ends = opening(low), opening(high)
     if not ends[0] < ends[1]:
         raise argparse.ArgumentTypeError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
     return ends
@@ -96,7 +98,7 @@ def _range(text: str) -> tuple[float, float]:
 
 @Command(
     "plane", "camera to gripper, from images of it on a plate", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    target=REQUIRED, jaw_opening=_opening, jaw_range=_range, name={"default": "gripper"}, out=REQUIRED,
+    target=REQUIRED, jaw_opening=opening, jaw_range=range_of, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
 def plane(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate plane``."""

@@ -19,6 +19,7 @@ from gripmon.model.gripper.model import (
     GripperModel,
     JawModel,
     PointModel,
+    RoundModel,
     TableMotion,
     contents_of,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "GripperModel",
     "JawModel",
     "PointModel",
+    "RoundModel",
     "TableMotion",
     "contents_of",
     "gripper_from_dict",

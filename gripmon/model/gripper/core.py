@@ -14,12 +14,14 @@ from gripmon.model.gripper.faces import (
     LARGEST_WARP_M,
     FaceLoop,
     extent_m,
+    inwards,
     normal_of,
     off_plane_m,
     triangles,
 )
 from gripmon.model.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
 from gripmon.model.gripper.motion import motion_table, offset_m
+from gripmon.model.gripper.rounds import Rounds
 from gripmon.model.records import Array
 
 LARGEST_EXTENT_M = 1.0
@@ -63,6 +65,7 @@ class Gripper:
         self.point_finger = np.array([finger_index[p.finger] for p in model.points.values()], dtype=np.intp)
         self._nominal_points_m = np.array([p.xyz_m for p in model.points.values()], dtype=float).reshape(-1, 3)
         self._check_places()
+        self._rounds = Rounds.of(model.points, self._nominal_points_m)
         self.corner_points = np.flatnonzero([p.corner for p in model.points.values()])
         self.corner_ids = tuple(self.point_ids[i] for i in self.corner_points)
         self._corners_outwards = self._from_the_tcp_outwards()
@@ -76,6 +79,7 @@ class Gripper:
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
         self.notes: list[str] = []
         self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
+        self._check_outwards()
         self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._point_faces = self._adjacency()
         self.landmarks = self._stand_for_the_tips()
@@ -91,15 +95,16 @@ class Gripper:
         self._motion = [motion_table(n, f.motion, model.jaw) for n, f in model.fingers.items()]
         self._check()
 
-    def points_grip_m(self, jaw_opening_m: float | None = None) -> Array:
+    def points_grip_m(self, jaw_opening_m: float | None = None, eye_grip_m: Array | None = None) -> Array:
         """All points (p, 3) in the gripper frame at an opening (nominal if None); outside the jaw's range:
-        ValueError.
+        ValueError.  Points on what is round: where ``eye_grip_m`` (3,) sees its outline; as the file has them if None.
         """
         if jaw_opening_m is None or not self.has_jaw:
-            return self._nominal_points_m
+            return self._rounds.seen_from(eye_grip_m, self._nominal_points_m, np.zeros((1, 3)))
         if not self.jaw_min_m - 1e-9 <= jaw_opening_m <= self.jaw_max_m + 1e-9:
             raise ValueError(f"jaw opening {jaw_opening_m:.4f} m is outside {self.jaw_min_m} to {self.jaw_max_m} m")
-        return self._nominal_points_m + self._finger_offsets_m(jaw_opening_m)[self.point_finger]
+        offsets_m = self._finger_offsets_m(jaw_opening_m)[self.point_finger]
+        return self._rounds.seen_from(eye_grip_m, self._nominal_points_m + offsets_m, offsets_m)
 
     def point_motion(self, jaw_opening_m: float) -> Array:
         """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is
@@ -236,15 +241,19 @@ class Gripper:
             raise GripperError(
                 f"faces[{index}].points: '{strange[0]}' is not on finger '{face.finger}'; points of that finger"
             )
-        centre = self._nominal_points_m[self.point_finger == finger_index[face.finger]].mean(axis=0)
         corners = self._nominal_points_m[loop]
-        if np.dot(normal_of(corners), corners.mean(axis=0) - centre) < 0.0:
-            raise GripperError(
-                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside, or, "
-                "for a finger that isn't convex, no faces"
-            )
         finger = finger_index[face.finger]
         return [FaceLoop(finger, loop[list(flat)]) for flat in self._flat(f"faces[{index}].points", corners)]
+
+    def _check_outwards(self) -> None:
+        """Refuse faces that look into their finger; see :func:`gripmon.model.gripper.faces.inwards`."""
+        loops = [tuple(self._point_index[p] for p in face.points) for face in self.model.faces]
+        fingers = [face.finger for face in self.model.faces]
+        wrong = inwards(fingers, loops, self._nominal_points_m)
+        if wrong is not None:
+            raise GripperError(
+                f"faces[{wrong}].points: it looks into the finger; the points counter-clockwise seen from outside"
+            )
 
     def _flat(self, key: str, corners: Array) -> list[tuple[int, ...]]:
         """A face's corners (n, 3) by flat parts, each indices into them."""

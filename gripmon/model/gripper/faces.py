@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,31 @@ def off_plane_m(loop: Array) -> float:
 def extent_m(loop: Array) -> float:
     """Largest distance between two points of a loop (n, 3)."""
     return float(np.linalg.norm(loop[:, None] - loop, axis=2).max())
+
+
+def inwards(fingers: Sequence[str], loops: Sequence[tuple[int, ...]], points_m: Array) -> int | None:
+    """The first face that looks into its finger; None if there is none.
+
+    A face runs through each edge in the way opposite to its neighbour's, and all faces of a finger together bound a
+    positive volume (what is open is closed towards the finger's middle).  So fingers need not be convex, nor closed; a
+    face without neighbours looks away from the middle.
+    """
+    looks_out = []
+    for finger, loop in zip(fingers, loops, strict=True):
+        own = sorted({p for name, other in zip(fingers, loops, strict=True) if name == finger for p in other})
+        corners = points_m[list(loop)]
+        looks_out.append(float(normal_of(corners) @ (corners.mean(axis=0) - points_m[own].mean(axis=0))))
+    sides = [{(a, b) for a, b in zip(loop, (*loop[1:], loop[0]), strict=True)} for loop in loops]
+    for k, finger in enumerate(fingers):
+        if looks_out[k] >= 0.0:
+            continue
+        others = [n for n, name in enumerate(fingers) if name == finger and n != k]
+        against = any(sides[k] & sides[n] for n in others)
+        beside = any((b, a) in sides[n] for n in others for a, b in sides[k])
+        total = sum(looks_out[n] for n in (k, *others))
+        if against or not beside or total < 0.0:
+            return k
+    return None
 
 
 def triangles(loop: Array) -> list[tuple[int, int, int]] | None:

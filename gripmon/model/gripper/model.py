@@ -40,10 +40,22 @@ class FingerModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     motion: dict[str, Any] | None = None
 
 
+class RoundModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a point of an outline lies on: a surface that is round about ``axis`` through ``centre_m``.
+
+    The outline of a cylinder or ball isn't a line on it: it is where the surface turns away from the eye, and wanders
+    as the view changes.  Coordinates as the point's own, at the nominal opening.
+    """
+
+    centre_m: Vector
+    axis: Vector
+
+
 class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     finger: str
     xyz_m: Vector
     corner: bool = False
+    round: RoundModel | msgspec.UnsetType = msgspec.UNSET  # not None: digests of files without it stay as they were
 
 
 class EdgeModel(

@@ -224,8 +224,9 @@ def lay_out(
     With a taught model creases that were taught are used, too.  An edge that shows otherwise than it was taught, as an
     outline or as a crease, counts as not taught: like is compared with like.
     """
-    points_grip_m = gripper.points_grip_m(jaw_opening_m)
-    view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
+    eye_grip_m = invert(cam_T_grip)[:3, 3]
+    points_grip_m = gripper.points_grip_m(jaw_opening_m, eye_grip_m)
+    view = gripper.edge_view(points_grip_m, eye_grip_m)
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     as_taught = np.zeros(len(gripper.edge_ids), dtype=bool)
     if taught is not None:
@@ -302,7 +303,8 @@ def predict(
     behind the camera, have neither a place nor a normal: the prediction's own layout leaves them out.
     """
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
-    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    # An outline that wanders over what is round moves in the image as if it were fixed, to the first order.
+    points_grip_m = gripper.points_grip_m(jaw_opening_m, -translation @ rotation)
     levers = points_grip_m @ rotation.T
     edge = layout.edge
     start, end = gripper.tangents_m(levers, edge, layout.fraction, rotation)

@@ -1,0 +1,110 @@
+"""``gripmon gripper from-cad``: a gripper file from meshes, a URDF or a .cao."""
+
+from __future__ import annotations
+
+import argparse
+
+from gripmon.cli.calibrate_plane import opening, range_of
+from gripmon.cli.common import (
+    REQUIRED,
+    Command,
+    check_outputs,
+    command_line,
+    positive_number,
+    progress_bar,
+    write,
+    write_picture,
+)
+from gripmon.model.errors import InputError
+
+_DESCRIPTION = """\
+A gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one that holds
+both, or one URDF.  Meshes don't say their unit: --unit.  URDF and .cao are metres.
+
+The origin is put at the TCP, the middle of the four innermost fingertip corners: x across the jaws, z
+along --approach, an axis of the CAD frame.  --frame cad leaves the CAD's axes as they are.
+
+How the jaws move comes from the URDF's joint; of meshes, both fingers move by half of an opening in
+--jaw-range.
+
+Convex fingers with flat faces hold for every view.  Of round, hollow or open ones the edges and
+outlines are those that one view shows: --camera with --reference, or with a rough --view.  Make such a
+file again when the camera moves by more than some degrees."""
+
+_OPTIONS = """
+FILE...                 .stl, .obj, .ply, .cao: one a finger, or both in one; or one .urdf
+--out FILE.yaml         gripper file to write
+--unit UNIT             of meshes: m, cm, mm or in
+--approach AXIS         axis of the CAD frame that points out of the gripper: +x, -x, +y, -y, +z or -z (default: +z, of
+                        a URDF where its fingers reach to); -x and the like as --approach=-x
+--frame FRAME           tcp: origin between the fingertips; cad: the CAD's own (default tcp)
+--length M              use only so much of the fingers, from the tips (m)
+--jaw-range MIN:MAX     of meshes: the jaws move in this range (m)
+--jaw-opening M         what the robot reports for the fingers as they are drawn (default: the tips' distance, m)
+--joint NAME            of a URDF: the joint that opens the jaws, where several could
+--camera FILE.yaml      the view's camera: a file of gripmon calibrate intrinsics, or a configuration
+--reference FILE.yaml   where the gripper stands before it: a file of gripmon calibrate plane, or a configuration
+| --view D:TILT         the same roughly: the TCP at distance D (m) in the image's middle, the camera at -y and tilted
+                        by TILT (degrees) against z
+--name NAME             the gripper's name (default: the file's)
+--picture FILE.png      also draw the model in the view
+--force                 replace files that are there
+"""
+
+_EXAMPLES = """\
+  gripmon gripper from-cad left.stl right.stl --unit mm --jaw-range 0:0.06 --out gripper.yaml
+  gripmon gripper from-cad gripper.urdf --camera camera.yaml --view 0.12:30 \\
+      --out gripper.yaml --picture gripper.png
+  gripmon gripper from-cad finger.obj --unit m --approach=-y --camera camera.yaml \\
+      --reference hand_eye.yaml --length 0.04 --out gripper.yaml
+
+exit codes: 0 written; 2 wrong usage or files, one line says what would be right"""
+
+
+def _view(text: str) -> tuple[float, float]:
+    distance, colon, tilt = text.partition(":")
+    try:
+        values = float(distance), float(tilt)
+    except ValueError:
+        values = 0.0, 0.0
+    if not colon or not (0.0 < values[0] <= 2.0 and 0.0 <= values[1] <= 180.0):
+        raise argparse.ArgumentTypeError(f"'{text}' isn't D:TILT; metres and degrees, e.g. 0.12:30")
+    return values
+
+
+@Command(
+    "from-cad", "from STL, OBJ, PLY, URDF or .cao", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    out=REQUIRED, length=positive_number, jaw_range=range_of, jaw_opening=opening, view=_view, frame={"default": "tcp"},
+)  # fmt: skip
+def from_cad(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon gripper from-cad``."""
+    from gripmon.daemon.teaching.views import read_view
+    from gripmon.model.provenance import provenance_of
+    from gripmon.teach.cad import gripper_from_cad
+
+    check_outputs(arguments, "out", "picture")
+    camera, cam_T_grip = read_view(arguments.camera, arguments.reference, arguments.view)
+    if arguments.picture is not None and (camera is None or cam_T_grip is None):
+        raise InputError("--picture: a picture is of a view; with --camera and --reference or --view")
+    missing = [path for path in arguments.file if not path.is_file()]
+    if missing:
+        raise InputError(f"{missing[0]}: there is no such file; a mesh, URDF or .cao")
+    made = gripper_from_cad(
+        arguments.file,
+        unit=arguments.unit,
+        name=arguments.name,
+        camera=camera,
+        cam_T_grip=cam_T_grip,
+        jaw_range_m=arguments.jaw_range,
+        jaw_opening_m=arguments.jaw_opening,
+        joint=arguments.joint,
+        frame=arguments.frame,
+        approach=arguments.approach,
+        length_m=arguments.length,
+        provenance=provenance_of(command_line(arguments), arguments.file),
+        progress=progress_bar,
+    )
+    write(made.text().encode(), arguments.out)
+    if arguments.picture is not None:
+        write_picture(made.picture(), arguments.picture)
+    print("\n".join([*made.summary(), f"written: {arguments.out}"]))

@@ -1,0 +1,53 @@
+"""A camera and where the gripper stands before it, from files or roughly by numbers."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from gripmon.daemon.calibrations import read_calibrated
+from gripmon.daemon.config.yaml_file import read_settings, read_yaml
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record
+from gripmon.model.records import Array
+from gripmon.teach.mounts import Mount, towards
+
+
+def read_view(
+    camera_path: Path | None, reference_path: Path | None, rough: tuple[float, float] | None
+) -> tuple[Camera | None, Array | None]:
+    """Camera and ``cam_T_grip`` (4, 4), None for what wasn't given; a reference's file holds its camera, too.
+
+    ``rough``: distance of the TCP (m) in the image's middle and tilt of the optical axis against the gripper's z
+    (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
+    """
+    lens = None if camera_path is None else _lens(camera_path)
+    cam_T_grip = None
+    if reference_path is not None:
+        found = read_calibrated(reference_path)
+        if found.cam_T_grip is None:
+            right = "a file of gripmon calibrate plane, or a configuration"
+            raise InputError(f"{reference_path}: holds no cam_T_grip; {right}", "reference")
+        cam_T_grip = from_record(found.cam_T_grip)
+        lens = lens or found.lens
+    if rough is not None and lens is None:
+        raise InputError("is missing: a rough view needs one; a file of gripmon calibrate intrinsics", "camera")
+    camera = None if lens is None else make_camera(lens)
+    if rough is not None and camera is not None:
+        middle = 0.5 * (camera.width_px - 1.0), 0.5 * (camera.height_px - 1.0)
+        cam_T_grip = Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).cam_T_grip(towards(camera, middle))
+    return camera, cam_T_grip
+
+
+def _lens(path: Path) -> LensSettings:
+    """Of a calibration or configuration, or the section ``camera`` of one by itself."""
+    if path.is_file() and path.suffix in (".yaml", ".yml"):
+        values = read_yaml(path)
+        if "model" in values and "schema" not in values:
+            settings: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
+            return settings
+    found = read_calibrated(path)
+    if found.lens is None:
+        raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
+    return found.lens

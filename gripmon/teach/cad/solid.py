@@ -1,0 +1,112 @@
+"""Fingers with flat faces that are convex: their points, edges and faces, whatever the view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from gripmon.model.gripper.faces import normal_of
+from gripmon.model.records import Array
+from gripmon.teach.cad.files import Body
+from gripmon.teach.cad.surface import FLAT_M, Surface, surface_of
+
+MOST_FACES = 64
+"""More faces than that, on one finger, are a rounding that was cut coarsely."""
+
+REAR_M = 5e-4
+"""Edges this close to a finger's rear end are where it is mounted: nothing is seen there of its own."""
+
+
+@dataclass(slots=True)
+class Shape:
+    """One finger in the gripper frame: ``points_m`` (p, 3), which are ``corners``, ``edges`` as pairs of points with
+    ``crease`` or not, ``loops`` of faces.  ``round_m``: by point, centre and axis of the rounding that it lies on.
+    ``spread_m``: by edge, how far (standard deviation) what is seen lies beside it; empty for none.
+    ``via_m``: by edge, the points (n, 3) that a curved one passes between its ends; empty where none is curved.
+    """
+
+    points_m: Array
+    corners: set[int]
+    edges: list[tuple[int, int]]
+    crease: list[bool]
+    loops: list[list[int]] = field(default_factory=list)
+    round_m: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    spread_m: list[float] = field(default_factory=list)
+    via_m: list[Array] = field(default_factory=list)
+
+
+def is_solid(surface: Surface) -> bool:
+    """Whether a finger is a convex solid of flat faces, which a gripper file holds for all views."""
+    faces = int(surface.patch.max(initial=-1)) + 1
+    if not 4 <= faces <= MOST_FACES or not surface.closed or not surface.flat() or len(surface.lines):
+        return False
+    normals = np.array([surface.normals[surface.patch == k].mean(axis=0) for k in range(faces)])
+    first = np.array([surface.points_m[surface.triangles[surface.patch == k][0, 0]] for k in range(faces)])
+    used = surface.points_m[np.unique(surface.triangles)]
+    above = used @ normals.T - np.einsum("fi,fi->f", first, normals)
+    return bool(above.max() <= 2.0 * FLAT_M)
+
+
+def cut(surface: Surface, lowest_m: float) -> Surface:
+    """The part of a convex solid above z = ``lowest_m``, closed there."""
+    points = surface.points_m[np.unique(surface.triangles)]
+    ends = surface.points_m[surface.edges]
+    below, above = (np.take_along_axis(ends, k[:, None, None], 1)[:, 0] for k in _by_height(ends))
+    crossing = (below[:, 2] < lowest_m) & (above[:, 2] > lowest_m)
+    share = (lowest_m - below[crossing, 2]) / (above[crossing, 2] - below[crossing, 2])
+    rim = below[crossing] + share[:, None] * (above[crossing] - below[crossing])
+    kept = np.concatenate([points[points[:, 2] >= lowest_m], rim])
+    hull = ConvexHull(kept)
+    outwards = np.einsum("ti,ti->t", _normals(kept, hull.simplices), hull.equations[:, :3]) > 0.0
+    triangles = np.where(outwards[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.intp)
+    return surface_of(Body("", kept, triangles, np.zeros((0, 2), np.intp)))
+
+
+def _by_height(ends: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    upper = np.argmax(ends[:, :, 2], axis=1)
+    return 1 - upper, upper
+
+
+def _normals(points: Array, triangles: NDArray[np.intp]) -> Array:
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def solid_shape(surface: Surface, mounted: bool) -> Shape:
+    """Points where three faces meet, edges where two do, and the faces.  ``mounted``: z points to the tip, and at its
+    other end the finger is held; then corners are those of the front half.
+    """
+    patches_at: dict[int, set[int]] = {}
+    for triangle, patch in zip(surface.triangles.tolist(), surface.patch.tolist(), strict=True):
+        for point in triangle:
+            patches_at.setdefault(point, set()).add(patch)
+    vertices = sorted(p for p, patches in patches_at.items() if len(patches) >= 3)
+    vertices.sort(key=lambda p: -round(float(surface.points_m[p, 2]), 6))
+    number = {p: k for k, p in enumerate(vertices)}
+    loops = [_loop(surface, patch, number) for patch in range(int(surface.patch.max()) + 1)]
+    points = surface.points_m[vertices]
+    pairs = sorted({(min(a, b), max(a, b)) for loop in loops for a, b in zip(loop, [*loop[1:], loop[0]], strict=True)})
+    foremost, rear = float(points[:, 2].max()), float(points[:, 2].min())
+    edges = [(a, b) for a, b in pairs if not (mounted and (points[[a, b], 2] <= rear + REAR_M).all())]
+    corners = {k for k, z in enumerate(points[:, 2].tolist()) if z > 0.5 * (foremost + rear) or not mounted}
+    return Shape(points, corners, edges, [False] * len(edges), loops)
+
+
+def _loop(surface: Surface, patch: int, number: dict[int, int]) -> list[int]:
+    """A flat face's corners, counter-clockwise seen from outside."""
+    own = surface.triangles[surface.patch == patch]
+    sides = np.concatenate([own[:, [0, 1]], own[:, [1, 2]], own[:, [2, 0]]]).tolist()
+    there = {(a, b) for a, b in sides}
+    after = {a: b for a, b in sides if (b, a) not in there}
+    start = next(iter(after))
+    loop, at = [start], after[start]
+    while at != start and len(loop) <= len(after):
+        loop.append(at)
+        at = after[at]
+    loop = [p for p in loop if p in number]
+    if normal_of(surface.points_m[loop]) @ surface.normals[surface.patch == patch][0] < 0.0:
+        loop.reverse()
+    return [number[p] for p in loop]

@@ -1,0 +1,186 @@
+"""A body's surface: which triangles are neighbours, what turns sharply between them, what is flat, and where it is
+round by how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from gripmon.model.records import Array
+from gripmon.teach.cad.files import Body
+
+SHARP_RAD = 0.524
+"""Two triangles that turn by more than this (30 degrees) meet in an edge.  Exports cut roundings finer: Open CASCADE's
+mesher, which FreeCAD and others use, by 0.5 rad unless it is told otherwise."""
+
+FLAT_M = 5e-6
+"""A patch whose points lie this close to a plane is a face: float32 coordinates of a metre are off by 0.03 of it."""
+
+WELD_M = 2e-6
+"""Points on borders that are this near are one: exports write single precision, or six digits of millimetres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """``points_m`` (p, 3), ``triangles`` (t, 3) with unit ``normals`` (t, 3).  ``edges`` (e, 2) points, ``sides``
+    (e, 2) their triangles, -1 where there is none; ``sharp`` (e,): an edge of the body, or its border.  ``patch`` (t,):
+    what is connected without crossing a sharp edge.  ``alike`` (e,): its two triangles are turned alike.  ``lines``
+    (l, 2) edges without triangles.
+    """
+
+    points_m: Array
+    triangles: NDArray[np.intp]
+    normals: Array
+    edges: NDArray[np.intp]
+    sides: NDArray[np.intp]
+    sharp: NDArray[np.bool_]
+    alike: NDArray[np.bool_]
+    patch: NDArray[np.intp]
+    lines: NDArray[np.intp]
+
+    @property
+    def border(self) -> NDArray[np.bool_]:
+        """(e,) edges with a triangle on one side only."""
+        return np.asarray(self.sides[:, 1] < 0)
+
+    @property
+    def closed(self) -> bool:
+        """Whether it bounds a solid, its triangles turned outwards."""
+        if not len(self.triangles) or self.border.any() or not self.alike.all():
+            return False
+        a, b, c = np.moveaxis(self.points_m[self.triangles], 1, 0)
+        return bool(np.einsum("ti,ti->", a, np.cross(b, c)) > 0.0)
+
+    def shifted(self, offset_m: Array) -> Surface:
+        """Moved by ``offset_m`` (3,)."""
+        return replace(self, points_m=self.points_m + offset_m)
+
+    def flat(self) -> bool:
+        """Whether every patch is flat."""
+        return all(self.off_plane_m(k) <= FLAT_M for k in range(int(self.patch.max(initial=-1)) + 1))
+
+    def off_plane_m(self, patch: int) -> float:
+        """How far a patch's points lie off its mean plane, at most."""
+        own = self.patch == patch
+        corners = self.points_m[self.triangles[own]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+        height = corners.reshape(-1, 3) @ (normal / max(float(np.linalg.norm(normal)), 1e-30))
+        return float(0.5 * np.ptp(height))
+
+
+def surface_of(body: Body) -> Surface:
+    """A body's surface: its points welded, triangles without area left out; a solid that is turned inside out is turned
+    back.
+    """
+    body = _welded(body)
+    a, b, c = np.moveaxis(body.points_m[body.triangles] - body.points_m.mean(axis=0), 1, 0)
+    if np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0:
+        body = replace(body, triangles=body.triangles[:, ::-1])
+    corners = body.points_m[body.triangles]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(area, axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    # Flat to the rounding of single precision: such a sliver has no normal.
+    kept = size > 2e-7 * longest * np.maximum(longest, 1e-3)
+    triangles, normals = body.triangles[kept], area[kept] / size[kept, None]
+    edges, sides, alike = _neighbours(triangles)
+    turn = np.einsum("ei,ei->e", normals[sides[:, 0]], normals[sides[:, 1]]) * np.where(alike, 1.0, -1.0)
+    sharp = (sides[:, 1] < 0) | (turn < np.cos(SHARP_RAD))
+    smooth = sides[~sharp]
+    graph = coo_matrix((np.ones(len(smooth), np.int8), smooth.T), shape=(len(triangles),) * 2)
+    patch = connected_components(graph, directed=False)[1].astype(np.intp) if len(triangles) else np.zeros(0, np.intp)
+    return Surface(body.points_m, triangles, normals, edges, sides, sharp, alike, patch, body.lines)
+
+
+def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    """Edges (e, 2), the two triangles of each (e, 2), and whether these run through it in opposite ways, as the sides
+    of one surface do.  An edge with more than two triangles counts as one for each pair.
+    """
+    if not len(triangles):
+        return np.zeros((0, 2), np.intp), np.zeros((0, 2), np.intp), np.zeros(0, bool)
+    ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    owner = np.tile(np.arange(len(triangles)), 3)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    order = np.lexsort((owner, high, low))
+    low, high, owner, forward = low[order], high[order], owner[order], (ends[:, 0] < ends[:, 1])[order]
+    same = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
+    # The first of a run pairs with the second, a third one with a fourth.
+    starts = np.flatnonzero(np.concatenate([[True], ~same]))
+    rank = np.arange(len(low)) - np.repeat(starts, np.diff(np.append(starts, len(low))))
+    first = np.flatnonzero(rank % 2 == 0)
+    paired = (first + 1 < len(low)) & np.append(same, False)[first]
+    after = np.minimum(first + 1, len(low) - 1)
+    sides = np.column_stack([owner[first], np.where(paired, owner[after], -1)])
+    alike = forward[first] != forward[after]
+    return np.column_stack([low[first], high[first]]), sides, alike | ~paired
+
+
+def _welded(body: Body) -> Body:
+    """Points on borders joined where they coincide."""
+    edges, sides, _ = _neighbours(body.triangles)
+    border = np.unique(edges[sides[:, 1] < 0])
+    if len(border) < 2:
+        return body
+    close = cKDTree(body.points_m[border]).query_pairs(WELD_M, output_type="ndarray")
+    if not len(close):
+        return body
+    count = len(body.points_m)
+    graph = coo_matrix((np.ones(len(close), np.int8), border[close].T), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    _, first, back = np.unique(label, return_index=True, return_inverse=True)
+    triangles, lines = back[body.triangles], back[body.lines]
+    whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return Body(body.name, body.points_m[first], triangles[whole], lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Shading:
+    """A surface's smooth normals: ``corner`` (t, 3) indices into ``normals`` (n, 3), one a point and patch."""
+
+    corner: NDArray[np.intp]
+    normals: Array
+
+
+def shading_of(surface: Surface) -> Shading:
+    """Normals at the points of each patch, triangles weighted by their angle there (Thürmer and Wüthrich 1998)."""
+    triangles = surface.triangles
+    key = surface.patch[:, None] * np.intp(len(surface.points_m)) + triangles
+    _, corner = np.unique(key, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    places = surface.points_m[triangles]
+    out, back = np.roll(places, -1, axis=1) - places, np.roll(places, 1, axis=1) - places
+    lengths = np.linalg.norm(out, axis=2) * np.linalg.norm(back, axis=2)
+    angle = np.arccos(np.clip(np.einsum("tki,tki->tk", out, back) / lengths, -1.0, 1.0))
+    normals = np.zeros((int(corner.max(initial=-1)) + 1, 3))
+    for k in range(3):
+        weighted = angle[:, k, None] * surface.normals
+        for i in range(3):
+            normals[:, i] += np.bincount(corner[:, k], weighted[:, i], minlength=len(normals))
+    return Shading(corner, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None])
+
+
+def radius_m(places: Array, normals: Array, direction: Array) -> Array:
+    """How a surface is rounded along ``direction`` (n, 3): radii (n,), infinite where flat, negative where hollow.
+
+    ``places``, ``normals`` (n, 3, 3): the corners of triangles on it.  The derivative of the normal along the surface
+    is linear in the direction (the shape operator); it follows from the three sides of a triangle (Rusinkiewicz 2004).
+    """
+    sides = np.roll(places, -1, axis=1) - places
+    change = np.roll(normals, -1, axis=1) - normals
+    mean = normals.mean(axis=1)
+    u = direction / np.linalg.norm(direction, axis=1)[:, None]
+    v = np.cross(mean / np.linalg.norm(mean, axis=1)[:, None], u)
+    along, across = np.einsum("nki,ni->nk", sides, u), np.einsum("nki,ni->nk", sides, v)
+    turned = np.einsum("nki,ni->nk", change, u)
+    # Least squares of turned = a * along + b * across over the three sides: a is the curvature that is sought.
+    aa, bb, ab = (along**2).sum(axis=1), (across**2).sum(axis=1), (along * across).sum(axis=1)
+    at, bt = (along * turned).sum(axis=1), (across * turned).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curvature = (at * bb - bt * ab) / (aa * bb - ab**2)
+        return np.where(np.abs(curvature) > 1e-6, 1.0 / curvature, np.inf)

@@ -1,0 +1,69 @@
+"""The library of widespread grippers: each loads, keeps its sources' numbers, is checked and is tracked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from support.meters import difference
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import pose_of, reference_of
+
+from gripmon.cli import main
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import load_gripper
+from gripmon.model.records import Origin
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, JawScript
+
+GRIPPERS = Path(__file__).resolve().parent.parent / "configs" / "grippers"
+LIBRARY = ("adaptive_two_finger_85", "parallel_two_finger_80", "printed_fixed_jaw")
+NEAR = (0.0004, 0.0013, 0.115)
+
+
+def test_the_adaptive_gripper_has_its_sources_stroke_and_arc():
+    gripper = load_gripper(GRIPPERS / "adaptive_two_finger_85.yaml")
+    tip = gripper.point_ids.index("R_in_near")
+    places = np.array([gripper.points_grip_m(float(o))[tip] for o in np.linspace(0.0, 0.085, 86)])
+    np.testing.assert_allclose(places[:, 0], np.linspace(0.0, 0.0425, 86), atol=1e-6)
+    # The pivot bar of the MuJoCo model when it is open by 85.4 mm: from the spring link's joint to the follower's.
+    bar = np.array([0.055 - 0.018, 0.0375 + 0.0065])
+    radius, sine = np.hypot(*bar), bar[0] / np.hypot(*bar) + (places[:, 0] - 0.0427) / np.hypot(*bar)
+    height = radius * np.sqrt(1.0 - sine**2)
+    np.testing.assert_allclose(places[:, 2] - places[0, 2], height - height[0], atol=2.5e-5)  # rows lie 4.25 mm apart
+    assert np.ptp(gripper.points_grip_m()[:, 1]) == pytest.approx(0.022)
+
+
+@pytest.mark.parametrize("name", LIBRARY)
+def test_a_library_gripper_passes_check_in_a_simulated_view(name: str, tmp_path: Path):
+    config = yaml.safe_load((GRIPPERS.parent / "demo.yaml").read_text())
+    config["gripper"] = str(GRIPPERS / f"{name}.yaml")
+    if not load_gripper(GRIPPERS / f"{name}.yaml").has_jaw:
+        del config["jaw"]
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(config))
+    assert main(["check", str(path), "--verbose"]) == 0
+
+
+@pytest.mark.parametrize("name", LIBRARY)
+def test_a_library_gripper_is_tracked(name: str):
+    gripper = load_gripper(GRIPPERS / f"{name}.yaml")
+    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip(tcp_m=NEAR)
+    middle = gripper.jaw_nominal_m
+    jaw = JawScript(knots=((0.0, middle), (1.0, middle + 0.004))) if gripper.has_jaw else JawScript()
+    scenario = Scenario(name="library", duration_s=2.0, fps=30.0, jaw=jaw, background=Background(kind="speckle"))
+    simulator = Simulator(camera, gripper, pose, scenario, 1)
+    monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(pose))
+    errors = []
+    for k in range(simulator.frame_count):
+        record, truth = monitor.process(simulator.frame(k)), simulator.truth(k)
+        if record.cam_T_grip is not None and record.source is not Origin.HELD:
+            errors.append(difference(pose_of(record.cam_T_grip), truth.cam_T_grip))
+    assert len(errors) >= 0.98 * simulator.frame_count
+    across, along = np.linalg.norm(np.array(errors)[:, :2], axis=1), np.abs(np.array(errors)[:, 2])
+    assert np.quantile(across, 0.95) < 1e-4
+    # One jaw of 8 mm by itself hardly tells its distance, and is never valid: its file says so.
+    assert np.quantile(along, 0.95) < (3e-4 if gripper.has_jaw else 3e-3)
