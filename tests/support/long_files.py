@@ -24,6 +24,7 @@ LONGEST = (
     "test_accuracy_forecast",
     "test_search",
     "test_monitor",
+    "test_gripper_cad_tracked",
     "test_fleet_load",
     "test_network_camera",
     "test_run_on_the_network",

@@ -234,8 +234,8 @@ def _met(
     ends: Array, px: Array, label: NDArray[np.intp], straight: NDArray[np.bool_], apart_m: float
 ) -> tuple[int, NDArray[np.intp]]:
     """Loose ends of two straight edges with no more than a few pixels of a tight curve between them, joined where
-    their lines meet to ``apart_m`` (``ends`` are moved there): at this distance that is a corner.  The number of points,
-    and each end's (e,).
+    their lines meet to ``apart_m``: at this distance that is a corner.  ``ends`` are moved there.  The number of
+    points, and each end's (e,).
     """
     loose = np.flatnonzero((np.bincount(label)[label] == 1) & straight)
     for a, b in cKDTree(px[loose]).query_pairs(LARGEST_GAP_PX) if len(loose) > 1 else ():
