@@ -196,6 +196,7 @@ class Settler:
         self._prior = self._prior_reported
         self._laid_out: tuple[EdgeLayout, Array] | None = None
         self._prediction: Prediction | None = None
+        self._geometry: tuple[Prediction, CornerGeometry] | None = None
 
     def _settle(self, image: Image, expected: Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
@@ -228,7 +229,8 @@ class Settler:
                 votes, consensus, uncertainty = found
         if consensus is not moved:
             expected = self._moved(prediction, consensus.xi, expected)
-        corners = intersect_edges(votes, consensus, uncertainty.line_weight, self._geometry, settings.corners)
+        geometry = self._geometry_of(prediction)
+        corners = intersect_edges(votes, consensus, uncertainty.line_weight, geometry, settings.corners)
         return Measurement(
             prediction,
             votes.candidates,
@@ -283,8 +285,12 @@ class Settler:
         if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
             self._laid_out = self._lay_out(expected), self._corner_pixels(expected)
         self._prediction = self._predict(self._laid_out[0], expected)
-        self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
         return self._prediction, np.zeros(len(self._prior))
+
+    def _geometry_of(self, prediction: Prediction) -> CornerGeometry:
+        if self._geometry is None or self._geometry[0] is not prediction:
+            self._geometry = prediction, CornerGeometry.of(self._gripper, prediction, self._settings.corners)
+        return self._geometry[1]
 
     def _lay_out(self, expected: Expected) -> EdgeLayout:
         sampling = self._settings.sampling
