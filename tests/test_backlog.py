@@ -111,7 +111,7 @@ def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monke
         ran_in.append(threading.current_thread().name)
         return search_poses(*args)
 
-    monkeypatch.setattr("gripmon.monitor.searching.search_poses", watched)
+    monkeypatch.setattr("gripmon.track.edges.measure.search_poses", watched)
     for number, frame in enumerate(frames[:40]):
         record = monitor.process(frame if number < 5 else replaced(frame, image=noise))
         assert (record.source is Origin.HELD) == (number >= 5)

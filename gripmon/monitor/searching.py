@@ -9,13 +9,14 @@ from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.track.edges import Expected, FingertipMeter, Measurement, Patience, SearchSettings, Sought
 
 EAGER_RESULT_AFTER_S = 0.05
-"""The same for the first searches after the gripper was seen: what was knocked away, and still rings, has to be found
+"""The same for the searches right after the first: what was knocked away, and still rings, has to be found
 in an image that isn't older than need be.  A search takes 25 to 50 ms.
 """
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, followed in a later frame.
+    """One search at a time: begun with one frame's image, followed in a later frame.  Only the first one for a gripper
+    that was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for
     some times one after the other, then in one of several frames.
@@ -55,12 +56,15 @@ class GripperSearch:
         )
 
     def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
-        """Places to follow in this frame: what was found in an earlier one; else none, and a search begins with a copy
-        of the image.
+        """Places to follow in this frame: what was found in an earlier one, or here if the gripper is just lost; else
+        none, and a search begins with a copy of the image.
         """
         if self._found is not None:
             self._asked = image, expected, sought
             return self._found
+        if sought.lost and self._searches == 0:
+            self._searches = 1
+            return self._meter.searched(image, expected, sought)
         self._begin(image, expected, sought)
         return ()
 

@@ -107,6 +107,9 @@ class Tracker:
         """The same with the opening's error as earlier frames have shown it."""
         if reported_m is None or not self._gripper.has_jaw:
             return measurement
+        if self._jaw.exact:
+            measurement.jaw_known_m, measurement.jaw_known_sigma_m = reported_m, 0.0
+            return measurement
         fused = self._jaw.fuse(measurement.jaw_reported_m, measurement.jaw_opening_m, measurement.covariance)
         covariance = measurement.covariance.copy()
         covariance[:6, :6] = fused.covariance
