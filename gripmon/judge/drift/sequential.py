@@ -157,27 +157,26 @@ class SequentialTest(ByArithmetic):
         if self._frames == 0:
             self._reported = np.array(covariance)
             self.scatter.begin(covariance)
-        usual = by.report(self._reported, covariance, REPORTED_MEMORY)
         if self._stale:
             self._refresh()
         # The median of three frames: no single frame can decide, and a step is late by one.  In axes in which errors
         # are independent: medians of others need not be a shift that any of the frames makes likely.
-        self.windows.add(
+        mean, difference = self.windows.add(
             by.steady(
-                shift, usual, self._seen, self._sure, self._last_two, self._to_reported, self._from_reported
+                shift, covariance, REPORTED_MEMORY, self._reported, self._seen, self._sure, self._last_two,
+                self._to_reported, self._from_reported,
             )
         )  # fmt: skip
         self._frames, self._since_restart = self._frames + 1, self._since_restart + 1
         if self._since_restart < 3:
             # Of fewer than three frames there is no middle one.
             self.windows.keep(self._seen < 3, 0)
-        mean, difference = self.windows.means()
-        beyond = by.beyond(
+        beyond, found = by.decide(
             mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
-            self._tolerated, WORTH, SWEEPS,
+            self._tolerated, WORTH, SWEEPS, LENGTHS.index(at_least),
         )  # fmt: skip
         self._seen_last = mean, difference, beyond, learn
-        return Finding(*by.decide(beyond, LENGTHS.index(at_least), _LENGTHS))
+        return Finding(*found)
 
     def learn(self) -> None:
         """What the newest frame teaches for those to come; :meth:`add` does it first if it hasn't been done."""
