@@ -200,7 +200,7 @@ def test_what_is_read_off_a_measurement_is_what_numpy_reads():
 ENTRIES = {
     "fit", "assess", "contradictions_without", "read_profiles", "low_third_difference", "find_candidates", "worth",
     "_fit_lines", "_intersect", "largest_motion", "usual_width", "corner_rms", "agreeing_shares", "edge_means",
-    "sampled_ranges", "levers", "across_edges", "maps", "ideal_lines",
+    "sampled_ranges", "levers", "across_edges", "maps", "ideal_lines", "gains",
 }  # fmt: skip
 
 

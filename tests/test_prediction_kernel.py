@@ -43,7 +43,7 @@ def test_both_predict_the_same(lens: object, gripper: str, way: str, monkeypatch
     np.testing.assert_array_equal(one.layout.edge, other.layout.edge)
     np.testing.assert_allclose(one.layout.fraction, other.layout.fraction, atol=CLOSE)
     assert way != "as expected" or len(one.layout.edges) >= 6
-    for name in ("uv_px", "normal", "jacobian", "along", "gain", "line_origin", "line_direction"):
+    for name in ("uv_px", "normal", "jacobian", "xy", "way_xy", "along", "gain", "line_origin", "line_direction"):
         own = getattr(other, name)
         scale = np.nanmax(np.abs(own), initial=1.0)
         np.testing.assert_allclose(getattr(one, name), own, rtol=0.0, atol=CLOSE * scale, err_msg=name)

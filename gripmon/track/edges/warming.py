@@ -59,13 +59,14 @@ def warm_up() -> float:
 
 def _predict(prediction: Prediction) -> None:
     """The geometry behind such a prediction."""
-    layout, ends, d_uv = prediction.layout, np.ones((1, 2, 3)), np.ones((4, 2, 3))
+    by, layout, ends, d_uv = prediction_kernel, prediction.layout, np.ones((4, 3)), np.ones((4, 2, 3))
     translation, places = prediction.cam_T_grip[:3, 3], np.zeros((1, 2, 2))
-    prediction_kernel.sampled_ranges(places, np.ones((1, 2), dtype=bool), np.ones(1, dtype=bool), 0.0, 1.0)
-    lever, points_cam_m = prediction_kernel.levers(ends, layout.edge, layout.fraction, translation)
-    prediction_kernel.across_edges(d_uv, ends, layout.edge, lever, np.zeros((1, 3)), True)
-    prediction_kernel.maps(prediction.uv_px, prediction.normal, *np.zeros((2, 3), dtype=np.float32))
-    prediction_kernel.ideal_lines(points_cam_m, prediction.normal, d_uv, layout.edge, layout.edges, layout.first, 1)
+    by.sampled_ranges(places, np.ones((1, 2), dtype=bool), np.ones(1, dtype=bool), 0.0, 1.0)
+    lever, points_cam_m = by.levers(ends, ends, layout.fraction, translation)
+    by.across_edges(d_uv, ends, ends, lever, layout.edge, np.zeros((1, 3)), True)
+    by.maps(prediction.uv_px, prediction.normal, *np.zeros((2, 3), dtype=np.float32))
+    _, way_xy, *_ = by.ideal_lines(points_cam_m, layout.edge, layout.edges, layout.first, 1)
+    by.gains(points_cam_m, prediction.normal, d_uv, way_xy)
 
 
 def _of_one_edge() -> Prediction:
