@@ -174,7 +174,8 @@ class Monitor:
         not looked at after that.
         """
         self.learn()
-        frame = in_full_scale(frame, self._settings.bit_depth)
+        if self._settings.bit_depth < 16:
+            frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
         self._analysis.catch_up(self._now_s)
         faults = self._look_at_stream(frame)

@@ -86,7 +86,8 @@ class Tracker:
         """The gripper was where it was measured: that is what it usually shows, and the report's error."""
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
-        self._jaw.learn()
+        if not self._jaw.exact:
+            self._jaw.learn()
 
     def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""

@@ -228,12 +228,13 @@ class Weigher:
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
-        proven, of which their ends' edges say nothing: each side may be misread as an end may.
+        proven, of which their ends' edges say nothing: each side may be misread as an end may.  Before anything is
+        proven, to exclude one just now.
         """
-        assert self.anchor is not None
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._tracker.along[edge]).sum())
-        knocked = self._knocked(now_s - self.anchor.now_s, hidden=True)
+        unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
+        knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_END**sides <= self._policy.integrity_risk
 
     def _not_as_expected(self, away: Array) -> Protection:
