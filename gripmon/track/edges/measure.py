@@ -218,6 +218,10 @@ class FingertipMeter(FingerMeter):
             if other.consensus.share > beat and self._fitting_zoom(other) == zoom:
                 best, chosen = other, zoom
         self._zoom_to(chosen)
+        if best.consensus.share > 0.0:
+            # What is sampled there is chosen anew: it was for a place that may be poor.
+            self._prediction.pop(chosen, None)
+            self._laid_out.pop(chosen, None)
         return best
 
     def _trusted(self, image: Image, measurement: Measurement, usual_share: float) -> bool:
