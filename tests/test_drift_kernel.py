@@ -61,6 +61,19 @@ def test_each_frame_is_found_alike(noise: Callable[..., np.ndarray]):
     assert_alike(found, expected)
 
 
+def test_it_is_one_whether_a_frame_teaches_at_once_or_with_the_next():
+    """What is learnt after the transform has left is what the next frame would have learnt first."""
+    at_once, later = (SequentialTest(DriftSettings()) for _ in range(2))
+    for shift in autocorrelated(np.random.default_rng(6), 400, 1):
+        one, other = at_once.add(shift, claimed(1)), later.add(shift, claimed(1))
+        at_once.learn()
+        at_once.learn()  # a second time teaches nothing
+        assert one.moved == other.moved and one.excess == other.excess
+    assert at_once.refreshes - later.refreshes in (0, 1) and later.refreshes > 20
+    later.learn()
+    np.testing.assert_array_equal(at_once.scatter.of_differences, later.scatter.of_differences)
+
+
 @pytest.mark.slow("30 s; the same with limits that are assumed is in the default run")
 def test_learnt_limits_are_alike():
     found, expected = pair(DriftSettings(), 1)

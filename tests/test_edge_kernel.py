@@ -39,7 +39,7 @@ from gripmon.track.edges import (
     evidence,
     kernel,
     lines,
-    prediction,
+    prediction_kernel,
     profile_kernel,
     settling,
     warm_up,
@@ -200,12 +200,13 @@ def test_what_is_read_off_a_measurement_is_what_numpy_reads():
 ENTRIES = {
     "fit", "assess", "contradictions_without", "read_profiles", "low_third_difference", "find_candidates", "worth",
     "_fit_lines", "_intersect", "largest_motion", "usual_width", "corner_rms", "agreeing_shares", "edge_means",
+    "sampled_ranges", "levers", "across_edges", "maps", "ideal_lines", "gains",
 }  # fmt: skip
 
 
 def signatures() -> dict[str, int]:
     """For how many combinations of types each function that Python calls is compiled."""
-    rooms = (kernel, profile_kernel, lines, prediction, settling, evidence)
+    rooms = (kernel, profile_kernel, lines, prediction_kernel, settling, evidence)
     functions = {name: f for room in rooms for name, f in vars(room).items() if hasattr(f, "signatures")}
     return {name: len(functions[name].signatures) for name in ENTRIES}
 

@@ -77,6 +77,16 @@ def run(mask: Mask, measurement: str = "edges", first: int = 0, frames: int = WH
     return records
 
 
+def test_before_anything_is_proven_a_place_can_be_asked_for_its_sides():
+    """A first frame that is displaced is held against the reference's place, when there is no anchor yet."""
+    monitor = Monitor(
+        make_camera(PAPER_LENS), box_gripper(), MonitorSettings(), reference_of(nominal_cam_T_grip())
+    )  # fmt: skip
+    frame, weigher = Frame(0, 0, picture(SCENE, 0), 0.034), monitor._trust._weigher
+    measurement = monitor._tracker.measure_held(frame, nominal_cam_T_grip(), np.full(6, 1e-3))
+    assert weigher.anchor is None and weigher.held_across(measurement, 0.0)
+
+
 def covariance_of(record: FrameRecord) -> np.ndarray:
     return np.reshape(record.covariance, (6, 6))  # type: ignore[arg-type]
 

@@ -76,6 +76,11 @@ def test_fits_are_those_of_numpy(m: int, seed: int):
     anchor = shifts(rng, 1)[0], covariances(rng, 1)[0]
     for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
         agree(kernel.with_pose(*sums, *anchor, off)[1:], plain.with_pose(*sums, *anchor, off)[1:], 1.0 / SIZE)
+        one, other = (by.with_and_without(*of, *anchor, off, 1.44) for by in (kernel, plain))
+        assert one[0] and other[0]
+        for found, expected in zip(one[1:3], other[1:3], strict=True):
+            agree(found, expected)
+        np.testing.assert_allclose(one[3], other[3], rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -146,6 +151,8 @@ def test_what_no_root_has_is_left_to_numpy():
     assert not kernel.follow(*average, *Separation(frame.shift, 3.0 * frame.covariance, frame.of_model), none)[0]
     bad = Separation(frame.shift, 1e3 * frame.covariance, frame.of_model)
     assert not kernel.telling(*average, none, none, *bad, rows, 12.0)[0]
+    of, anchor = normal_equations(rng, 7), (shifts(rng, 1)[0], -covariances(rng, 1)[0])
+    assert not kernel.with_and_without(*of, *anchor, of_the_model(rng, 1)[0], 1.0)[0]
     told = separation.telling(average, none, none, bad, rows, 12.0)
     agree(told, plain.telling(*average, none, none, *bad, rows, 12.0)[1:])
 

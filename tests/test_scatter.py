@@ -18,9 +18,8 @@ def learnt(shifts: np.ndarray, every: int = 4) -> Scatter:
     windows, scatter = Windows(streams), Scatter(streams)
     scatter.begin(claimed(streams))
     for number, values in enumerate(shifts):
-        windows.add(values)
+        _, difference = windows.add(values)
         if number % every == 0:
-            _, difference = windows.means()
             _, usable = windows.full()
             scatter.learn(difference, np.zeros(usable.shape), usable, every)
     return scatter

@@ -6,7 +6,7 @@ import numpy as np
 
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Frame, Refusal
+from gripmon.model.records import Frame, Image, Refusal
 
 _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 """Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
@@ -14,8 +14,20 @@ _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 _FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
 
 
-def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, str] | None:
-    """None if the frame may be measured; else the reason, and in words what came and what would be right."""
+FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): 1.0}
+"""Largest grey level of the types that images may have."""
+
+
+def sparse(image: Image) -> Image:
+    """Some 1,700 pixels all over an image (h, w) or (h, w, 3), whatever its size; a copy."""
+    return image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)].copy()
+
+
+def inspect(frame: Frame, camera: Camera, gripper: Gripper, pixels: Image | None = None) -> tuple[Refusal, str] | None:
+    """None if the frame may be measured; else the reason, and in words what came and what would be right.
+
+    ``pixels``: the image's :func:`sparse` ones, where they are at hand.
+    """
     image = frame.image
     if image is None or not isinstance(image, np.ndarray):
         return frame.refusal, frame.fault or "there is no image"
@@ -27,23 +39,21 @@ def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, st
             Refusal.WRONG_SIZE,
             f"{size} pixels; {camera.width_px}x{camera.height_px} as the camera's calibration says",
         )
-    if image.dtype not in (np.uint8, np.uint16, np.float32):
+    if image.dtype not in FULL_SCALE:
         return Refusal.WRONG_TYPE, f"pixels of type {image.dtype}; uint8, uint16 or float32 in 0 to 1"
-    return _grey_levels(image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]) or _jaw(
-        frame, gripper
-    )
+    return _grey_levels(sparse(image) if pixels is None else pixels) or _jaw(frame, gripper)
 
 
-def _grey_levels(sparse: np.ndarray) -> tuple[Refusal, str] | None:
-    low, high = float(sparse.min()), float(sparse.max())
-    scale = 1.0 if sparse.dtype == np.float32 else float(np.iinfo(sparse.dtype).max)
+def _grey_levels(pixels: Image) -> tuple[Refusal, str] | None:
+    low, high = float(pixels.min()), float(pixels.max())
+    scale = FULL_SCALE[pixels.dtype]
     if not (np.isfinite(low) and np.isfinite(high)):
         return Refusal.NOT_FINITE, "pixels that are NaN or infinite; float images in 0 to 1"
     if low < 0.0 or high > scale:
         return Refusal.WRONG_TYPE, f"float pixels from {low:g} to {high:g}; float images in 0 to 1"
     if high <= _DARK * scale:
         said = f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
-        return Refusal.BLACK, said + (_FEWER_BITS if sparse.dtype == np.uint16 and high > 0.0 else "")
+        return Refusal.BLACK, said + (_FEWER_BITS if pixels.dtype == np.uint16 and high > 0.0 else "")
     if low >= _BRIGHT * scale:
         return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
     if high - low <= _FLAT * scale:

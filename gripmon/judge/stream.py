@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from gripmon.judge.inspection import FULL_SCALE, sparse
+from gripmon.model.compiled import COMPILES, compiled
 from gripmon.model.records import Cause, Frame, Image
 
 _NS = 1_000_000_000
@@ -120,6 +121,11 @@ class StreamWatch:
         return tuple(fault for fault in faults if fault is not None)
 
     @property
+    def pixels(self) -> Image | None:
+        """The last image's sparse pixels; None before the first image."""
+        return self._frozen.pixels
+
+    @property
     def repeats(self) -> bool:
         """Whether the last frame's image was seen a few frames ago: it says nothing new, frozen or not yet."""
         return self._frozen.repeats
@@ -137,7 +143,7 @@ class _Frozen:
 
     def __init__(self, settings: StreamSettings):
         self._settings = settings
-        self._sample: NDArray[Any] | None = None
+        self.pixels: Image | None = None
         self._coded = 0
         self._before: deque[int] = deque(maxlen=SEEN_BEFORE)
         self._run = 0
@@ -153,13 +159,13 @@ class _Frozen:
         image = frame.image
         if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
             return None
-        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)].copy()
+        sample = sparse(image)
         number = hash(sample.tobytes())
         again = number in self._before
         self._before.append(number)
         if self._coded < SURE_FRAMES and not again:
-            self._coded += _stands_in_large_parts(sample, self._sample)
-        self._sample = sample
+            self._coded += _stands_in_large_parts(sample, self.pixels)
+        self.pixels = sample
         # An even image shows no noise, and is another fault.
         if not again or sample.size == 0 or sample.min() == sample.max():
             self._longest = self._longest if self._frozen else max(self._longest, self._run)
@@ -178,16 +184,43 @@ class _Frozen:
         return StreamFault("frozen", Cause.CAMERA_FROZEN, text)
 
 
-def _stands_in_large_parts(sample: NDArray[Any], before: NDArray[Any] | None) -> bool:
+def _stands_in_large_parts(sample: Image, before: Image | None) -> bool:
     """Whether two samples of images differ, but in few of the pixels; those cut off at black or white always stand."""
     if before is None or before.shape != sample.shape or before.dtype != sample.dtype:
         return False
+    if sample.size < FEWEST_INNER:
+        return False
+    if COMPILES and sample.dtype in FULL_SCALE:
+        count, standing = inner_pixels(sample.ravel(), before.ravel())
+        return bool(count >= FEWEST_INNER and STOOD_SHARE * count <= standing)
     stands = sample == before
     if np.count_nonzero(stands) < STOOD_SHARE * FEWEST_INNER:
         return False  # too few, whichever of them count
     inner = (sample > sample.min()) & (sample < sample.max())
     count = int(np.count_nonzero(inner))
     return count >= FEWEST_INNER and STOOD_SHARE * count <= int(np.count_nonzero(inner & stands))
+
+
+@compiled
+def inner_pixels(sample: Any, before: Any) -> tuple[int, int]:
+    """How many pixels (n,) are neither the darkest nor the brightest, and how many of them are as ``before`` (n,)."""
+    darkest, brightest = sample[0], sample[0]
+    for value in sample:
+        if value != value:
+            return 0, 0
+        darkest, brightest = min(darkest, value), max(brightest, value)
+    count, standing = 0, 0
+    for k in range(len(sample)):
+        if darkest < sample[k] < brightest:
+            count += 1
+            standing += sample[k] == before[k]
+    return count, standing
+
+
+def warm_up() -> None:
+    """Compile what a frame needs, or load what was compiled."""
+    pixels = np.zeros((36, 48), dtype=np.uint8)
+    _stands_in_large_parts(pixels, pixels)
 
 
 class _Clock:
@@ -328,14 +361,14 @@ class _Kind:
     """Size and type of the images, which a camera doesn't change by itself."""
 
     def __init__(self) -> None:
-        self._own: tuple[tuple[int, ...], str] | None = None
-        self._candidate: tuple[tuple[int, ...], str] | None = None
+        self._own: tuple[tuple[int, ...], np.dtype[Any]] | None = None
+        self._candidate: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._run = 0
 
     def add(self, image: Image | None) -> StreamFault | None:
         if not isinstance(image, np.ndarray):
             return None
-        kind = image.shape, image.dtype.name
+        kind = image.shape, image.dtype
         self._run = self._run + 1 if kind == self._candidate else 1
         self._candidate = kind
         if self._own is None:
@@ -347,9 +380,9 @@ class _Kind:
         return StreamFault("replaced", Cause.CAMERA_REPLACED, text)
 
 
-def _words(kind: tuple[tuple[int, ...], str]) -> str:
+def _words(kind: tuple[tuple[int, ...], np.dtype[Any]]) -> str:
     shape, dtype = kind
     if len(shape) < 2:
         return f"arrays of shape {shape}"
     colours = f" in {shape[2]} channels" if len(shape) == 3 else ""
-    return f"{shape[1]}x{shape[0]} px{colours} of type {dtype}"
+    return f"{shape[1]}x{shape[0]} px{colours} of type {dtype.name}"

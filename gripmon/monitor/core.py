@@ -174,11 +174,12 @@ class Monitor:
         not looked at after that.
         """
         self.learn()
-        frame = in_full_scale(frame, self._settings.bit_depth)
+        if self._settings.bit_depth < 16:
+            frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
         self._analysis.catch_up(self._now_s)
         faults = self._look_at_stream(frame)
-        refusal = inspect(frame, self._camera, self._gripper) or frozen(faults)
+        refusal = inspect(frame, self._camera, self._gripper, self._stream.pixels) or frozen(faults)
         if refusal is not None:
             self._newest = None
             return self._unmeasured(
@@ -247,6 +248,7 @@ class Monitor:
         has.
         """
         self._trust.learn()
+        self._watch.learn()
 
     @property
     def pending(self) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, normalised_squares
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, with_and_without
 
 INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
@@ -32,6 +32,16 @@ class Anchored(NamedTuple):
 
     fits: Separation
     surprise: Array
+
+
+class Known(NamedTuple):
+    """The anchor as a measurement: its pose (4, 4), the covariance (6, 6), and by how much it is off by the model,
+    (f, 6) or (1, 6) of zeros.
+    """
+
+    anchor_T: Array
+    covariance: Array
+    of_model: Array
 
 
 class ModelError(NamedTuple):
@@ -59,39 +69,42 @@ def protection_of(doubts: Doubts, risk: float) -> Protection:
 
 
 class Refits:
-    """One measurement's fits under h hypotheses."""
+    """One measurement's fits under h hypotheses, alone and with what is ``known`` from the anchor."""
 
-    def __init__(self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError):
+    def __init__(
+        self,
+        measurement: Measurement,
+        hypotheses: Hypotheses,
+        floor: Array,
+        model: ModelError,
+        known: Known | None = None,
+    ):
         """``floor`` (6, 6): covariance of the error that no averaging removes."""
         self.hypotheses, self._floor = hypotheses, floor
         normal = self._normal = measurement.normal
         xi = measurement.consensus.xi
         self._fit_T = perturb(measurement.prediction.cam_T_grip, xi[:6])
         count, m = len(hypotheses.name), len(xi)
-        known, pull = _vague(count, m).copy(), np.zeros((count, m))
+        held, pull = _vague(count, m).copy(), np.zeros((count, m))
         if m == 7:
             fitted_m = measurement.prediction.jaw_opening_m + float(xi[6])
-            known[~hypotheses.opening, 6, 6] = max(measurement.jaw_known_sigma_m, 1e-6) ** -2
-            pull[:, 6] = known[:, 6, 6] * (measurement.jaw_known_m - fitted_m)
+            held[~hypotheses.opening, 6, 6] = max(measurement.jaw_known_sigma_m, 1e-6) ** -2
+            pull[:, 6] = held[:, 6, 6] * (measurement.jaw_known_m - fitted_m)
         pulls = model.pulls(normal, self._fit_T[:3, :3])
-        self._sums = Sums.of_kept(
-            normal.pull, normal.information, normal.middle, pulls, hypotheses.keep, known, pull
-        )  # fmt: skip
-        self._free = self._sums.fits()
+        of = normal.pull, normal.information, normal.middle, pulls, hypotheses.keep, held, pull
+        self.anchored: Anchored | None = None
+        """The same with the anchor; None where nothing is known of one."""
+        if known is None:
+            self._free = Sums.of_kept(*of).fits()
+        else:
+            at, covariance = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor
+            # The free fit's distance from the anchor, in units of both covariances.
+            self._free, fits, surprise = with_and_without(*of, at, covariance, known.of_model, INFLATION**2)
+            self.anchored = Anchored(fits, surprise)
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
         """(h, f, 6) of how those are off where a finger is longer by its standard deviation."""
-
-    def anchored(self, anchor_T: Array, covariance: Array, of_model: Array) -> Anchored:
-        """The fits with the gripper known to be at ``anchor_T`` (4, 4) but for ``covariance`` (6, 6), and off by the
-        model by ``of_model`` (f, 6).
-        """
-        covariance, free = covariance + self._floor, self._free
-        at = perturbation_between(self._fit_T, anchor_T)
-        fits = self._sums.with_pose(at, covariance, of_model).fits()
-        # The free fit's distance from the anchor, in units of both covariances.
-        return Anchored(fits, normalised_squares(free.shift, at, free.covariance, INFLATION**2, covariance))
 
     @property
     def edges(self) -> NDArray[np.intp]:

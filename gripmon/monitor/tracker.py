@@ -39,8 +39,9 @@ class Tracker:
         """By how much the model may have each finger out of its place; teaching measures that."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # where it was seen last
         self._usual_share = USUAL_SHARE
-        self.searching = GripperSearch(camera, gripper, settings.corners.search)
-        # Its own, since it may run beside a measurement.
+        # Of their own, since they may run beside a measurement.
+        searcher = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
+        self.searching = GripperSearch(searcher, settings.corners.search)
         self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
 
     @property
@@ -63,7 +64,7 @@ class Tracker:
             patience,
             jaw_reported=frame.jaw_opening_m is not None,
             rivals=rivals,
-            search=self.searching.poses,
+            search=self.searching.places,
         )
         self.searching.end_frame(measurement)
         if measurement.trusted:
@@ -85,7 +86,8 @@ class Tracker:
         """The gripper was where it was measured: that is what it usually shows, and the report's error."""
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
-        self._jaw.learn()
+        if not self._jaw.exact:
+            self._jaw.learn()
 
     def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""
@@ -105,6 +107,9 @@ class Tracker:
     def with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
         """The same with the opening's error as earlier frames have shown it."""
         if reported_m is None or not self._gripper.has_jaw:
+            return measurement
+        if self._jaw.exact:
+            measurement.jaw_known_m, measurement.jaw_known_sigma_m = reported_m, 0.0
             return measurement
         fused = self._jaw.fuse(measurement.jaw_reported_m, measurement.jaw_opening_m, measurement.covariance)
         covariance = measurement.covariance.copy()

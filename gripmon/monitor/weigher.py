@@ -18,7 +18,16 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
 from gripmon.monitor.anchor import DISPLACED, Anchor, Lasting
-from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
+from gripmon.monitor.refits import (
+    UNBOUNDED_M,
+    UNBOUNDED_RAD,
+    Anchored,
+    Known,
+    ModelError,
+    Refits,
+    larger,
+    protection_of,
+)
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement
@@ -44,6 +53,8 @@ that the rate of knocks over all the time says too little.
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
+
+NOT_OFF = np.zeros((1, 6))
 
 CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
@@ -92,7 +103,7 @@ class Weigher:
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
-        self._newest: tuple[Measurement, float, Refits, Anchored] | None = None
+        self._newest: tuple[Measurement, float, Refits] | None = None
         self.swing: Array = np.zeros(6)
         """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         self.anchor: Anchor | None = None
@@ -217,12 +228,13 @@ class Weigher:
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
-        proven, of which their ends' edges say nothing: each side may be misread as an end may.
+        proven, of which their ends' edges say nothing: each side may be misread as an end may.  Before anything is
+        proven, to exclude one just now.
         """
-        assert self.anchor is not None
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._tracker.along[edge]).sum())
-        knocked = self._knocked(now_s - self.anchor.now_s, hidden=True)
+        unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
+        knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_END**sides <= self._policy.integrity_risk
 
     def _not_as_expected(self, away: Array) -> Protection:
@@ -248,14 +260,16 @@ class Weigher:
         and for another pose that it allows.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
-            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model)
             expected_T, covariance = self.expected
-            of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
+            of_model = NOT_OFF if self.anchor is None else self.anchor.of_model
             covariance = covariance.copy()
             covariance.flat[::7] += self._wander(now_s)
-            anchored = fits.anchored(expected_T, covariance, of_model)
-            self._newest = measurement, now_s, fits, anchored
-        return self._newest[2:]
+            known = Known(expected_T, covariance, of_model)
+            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model, known)
+            self._newest = measurement, now_s, fits
+        fits = self._newest[2]
+        assert fits.anchored is not None
+        return fits, fits.anchored
 
     def _about(self, edges: NDArray[np.intp]) -> tuple[Hypotheses, NDArray[np.intp]]:
         """What may be wrong with a fit of ``edges`` (v,), and which of it is what may have been wrong all along."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -48,8 +48,15 @@ class _Usual:
         if self.usual is None:
             self._first.append(value)
             if len(self._first) == LEARNT:
-                self.usual, self.scatter = statistics.median(self._first), statistics.pstdev(self._first)
-        return statistics.median(self._newest)
+                self.usual, self.scatter = _middle(self._first), statistics.pstdev(self._first)
+        return _middle(self._newest)
+
+
+def _middle(values: Collection[float]) -> float:
+    """The median, as the standard library has it with many checks."""
+    ordered = sorted(values)
+    half, odd = divmod(len(ordered), 2)
+    return ordered[half] if odd else 0.5 * (ordered[half - 1] + ordered[half])
 
 
 class BlurWatch:

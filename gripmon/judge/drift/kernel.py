@@ -116,7 +116,7 @@ def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int
 
 
 @compiled
-def report(reported: Array, covariance: Array, memory: float) -> Array:
+def _report(reported: Array, covariance: Array, memory: float) -> Array:
     """Follow the reported covariances (s, 6, 6); the usual variances over this frame's, 1 at most, on average (s,)."""
     usual = np.empty(len(reported))
     for s in range(len(reported)):
@@ -131,9 +131,20 @@ def report(reported: Array, covariance: Array, memory: float) -> Array:
 
 @compiled
 def steady(
-    shift: Array, usual: Array, seen: Ints, sure: Array, last_two: Array, to_reported: Array, from_reported: Array
+    shift: Array,
+    covariance: Array,
+    memory: float,
+    reported: Array,
+    seen: Ints,
+    sure: Array,
+    last_two: Array,
+    to_reported: Array,
+    from_reported: Array,
 ) -> Array:
-    """Shifts (s, 6) as far as they are sure; of those the median of three frames, in axes that err independently."""
+    """Shifts (s, 6) with their covariances as far as they are sure, beside those reported with a ``memory``; of those
+    the median of three frames, in axes that err independently.
+    """
+    usual = _report(reported, covariance, memory)
     out, white = np.zeros((len(shift), 6)), np.zeros((3, 6))
     for s in range(len(shift)):
         for i in range(6):
@@ -158,9 +169,14 @@ def steady(
 
 
 @compiled
-def means(ring: Array, newest: int, lengths: Ints) -> tuple[Array, Array]:
-    """Means (k, s, 6) over the last n frames, and those less the means over the n before, from a ring of sums."""
+def slide(ring: Array, newest: int, values: Array, lengths: Ints) -> tuple[Array, Array]:
+    """Means (k, s, 6) over the last n frames, and those less the means over the n before, from a ring of sums that has
+    the ``newest`` place for one frame's values (s, 6).
+    """
     streams = ring.shape[1]
+    for s in range(streams):
+        for i in range(6):
+            ring[newest, s, i] = ring[(newest - 1) % len(ring), s, i] + values[s, i]
     mean, difference = np.empty((len(lengths), streams, 6)), np.empty((len(lengths), streams, 6))
     for k in range(len(lengths)):
         n = lengths[k]
@@ -173,7 +189,7 @@ def means(ring: Array, newest: int, lengths: Ints) -> tuple[Array, Array]:
 
 
 @compiled
-def beyond(
+def _beyond(
     mean: Array,
     difference: Array,
     frames: Ints,
@@ -185,9 +201,7 @@ def beyond(
     worth: float,
     sweeps: int,
 ) -> Array:
-    """(2, k, s) squares of means, but for what is tolerated, and of differences, over their limits; 0 for windows that
-    reach back too far.
-    """
+    """See :func:`decide`."""
     out = np.zeros(limit.shape)
     for k in range(len(lengths)):
         for s in range(len(frames)):
@@ -204,8 +218,26 @@ def beyond(
 
 
 @compiled
-def decide(beyond: Array, first: int, lengths: Ints) -> tuple[Bools, Ints, Bools, Array]:
-    """What a :class:`~gripmon.judge.drift.sequential.Finding` holds, by windows from the number ``first`` on."""
+def decide(
+    mean: Array,
+    difference: Array,
+    frames: Ints,
+    lengths: Ints,
+    whitening: Array,
+    limit: Array,
+    most_tolerated: Array,
+    tolerated: Array,
+    worth: float,
+    sweeps: int,
+    first: int,
+) -> tuple[Array, tuple[Bools, Ints, Bools, Array]]:
+    """(2, k, s) squares of means, but for what is tolerated, and of differences, over their limits; 0 for windows that
+    reach back too far.  And what a :class:`~gripmon.judge.drift.sequential.Finding` holds, by windows from the number
+    ``first`` on.
+    """
+    beyond = _beyond(
+        mean, difference, frames, lengths, whitening, limit, most_tolerated, tolerated, worth, sweeps
+    )  # fmt: skip
     streams = beyond.shape[2]
     moved, stepped = np.zeros(streams, dtype=np.bool_), np.zeros(streams, dtype=np.bool_)
     length, excess = np.full(streams, lengths[first]), np.zeros(streams)
@@ -216,7 +248,7 @@ def decide(beyond: Array, first: int, lengths: Ints) -> tuple[Bools, Ints, Bools
             excess[s] = max(excess[s], largest)
             if largest > 1.0:
                 moved[s], length[s], stepped[s] = True, lengths[k], beyond[1, k, s] > 1.0
-    return moved, length, stepped, excess
+    return beyond, (moved, length, stepped, excess)
 
 
 @compiled

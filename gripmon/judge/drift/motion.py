@@ -164,6 +164,10 @@ class MotionWatch:
         )
         return self._last
 
+    def learn(self) -> None:
+        """Learn from the newest frame what nothing waits for; :meth:`add` does it first if nobody has."""
+        self.test.learn()
+
     @property
     def vibrates_anew(self) -> bool:
         """Whether it vibrates, and what was learnt of the stream's noise doesn't hold that yet."""

@@ -47,15 +47,24 @@ def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int
     return True, float(least_squares(whitening_of(covariance), shift, tolerated, sweeps))
 
 
-def report(reported: Array, covariance: Array, memory: float) -> Array:
+def _report(reported: Array, covariance: Array, memory: float) -> Array:
     reported += memory * (covariance - reported)
     variances = np.einsum("sii->si", covariance) / np.einsum("sii->si", reported)
     return np.asarray(1.0 / np.maximum(variances.mean(axis=1), 1.0))
 
 
 def steady(
-    shift: Array, usual: Array, seen: Ints, sure: Array, last_two: Array, to_reported: Array, from_reported: Array
+    shift: Array,
+    covariance: Array,
+    memory: float,
+    reported: Array,
+    seen: Ints,
+    sure: Array,
+    last_two: Array,
+    to_reported: Array,
+    from_reported: Array,
 ) -> Array:
+    usual = _report(reported, covariance, memory)
     fresh = (seen == 0)[:, None]
     sure[:] = np.where(fresh, shift, sure + usual[:, None] * (shift - sure))
     last = np.where(fresh, sure, last_two)
@@ -65,14 +74,15 @@ def steady(
     return _apply(from_reported, np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three)))
 
 
-def means(ring: Array, newest: int, lengths: Ints) -> tuple[Array, Array]:
+def slide(ring: Array, newest: int, values: Array, lengths: Ints) -> tuple[Array, Array]:
+    np.add(ring[newest - 1], values, out=ring[newest])
     ago, twice_ago = ring[(newest - lengths) % len(ring)], ring[(newest - 2 * lengths) % len(ring)]
     count = lengths[:, None, None]
     mean = (ring[newest] - ago) / count
     return mean, mean - (ago - twice_ago) / count
 
 
-def beyond(
+def _beyond(
     mean: Array,
     difference: Array,
     frames: Ints,
@@ -94,13 +104,26 @@ def beyond(
     return np.where(full, found / limit, 0.0)
 
 
-def decide(beyond: Array, first: int, lengths: Ints) -> tuple[Bools, Ints, Bools, Array]:
-    beyond = beyond[:, first:]
+def decide(
+    mean: Array,
+    difference: Array,
+    frames: Ints,
+    lengths: Ints,
+    whitening: Array,
+    limit: Array,
+    most_tolerated: Array,
+    tolerated: Array,
+    worth: float,
+    sweeps: int,
+    first: int,
+) -> tuple[Array, tuple[Bools, Ints, Bools, Array]]:
+    every = _beyond(mean, difference, frames, lengths, whitening, limit, most_tolerated, tolerated, worth, sweeps)
+    beyond = every[:, first:]
     excess = beyond.max(axis=(0, 1))
     # The shortest window that is beyond its threshold dates the motion best.
     index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
     stepped = beyond[1, index, np.arange(beyond.shape[2])] > 1.0
-    return excess > 1.0, lengths[first:][index], stepped, excess
+    return every, (excess > 1.0, lengths[first:][index], stepped, excess)
 
 
 def extremes(

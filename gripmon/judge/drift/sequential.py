@@ -121,6 +121,7 @@ class SequentialTest(ByArithmetic):
         self._surge = np.ones((len(LENGTHS), streams))
         self._tail = np.full((len(LENGTHS), streams), STUDENT_TAIL)
         self._stale = True
+        self._seen_last: tuple[Array, Array, Array, np.ndarray | None] | None = None
         self._threshold = 1.0
         self._inflation: Array | None = None
         self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
@@ -152,28 +153,36 @@ class SequentialTest(ByArithmetic):
         fewer than ``at_least`` frames decide nothing now.
         """
         by = self._by
+        self.learn()
         if self._frames == 0:
             self._reported = np.array(covariance)
             self.scatter.begin(covariance)
-        usual = by.report(self._reported, covariance, REPORTED_MEMORY)
-        if self._stale or self._frames % REFRESH_FRAMES == 0:
+        if self._stale:
             self._refresh()
         # The median of three frames: no single frame can decide, and a step is late by one.  In axes in which errors
         # are independent: medians of others need not be a shift that any of the frames makes likely.
-        self.windows.add(
+        mean, difference = self.windows.add(
             by.steady(
-                shift, usual, self._seen, self._sure, self._last_two, self._to_reported, self._from_reported
+                shift, covariance, REPORTED_MEMORY, self._reported, self._seen, self._sure, self._last_two,
+                self._to_reported, self._from_reported,
             )
         )  # fmt: skip
         self._frames, self._since_restart = self._frames + 1, self._since_restart + 1
         if self._since_restart < 3:
             # Of fewer than three frames there is no middle one.
             self.windows.keep(self._seen < 3, 0)
-        mean, difference = self.windows.means()
-        beyond = by.beyond(
+        beyond, found = by.decide(
             mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
-            self._tolerated, WORTH, SWEEPS,
+            self._tolerated, WORTH, SWEEPS, LENGTHS.index(at_least),
         )  # fmt: skip
+        self._seen_last = mean, difference, beyond, learn
+        return Finding(*found)
+
+    def learn(self) -> None:
+        """What the newest frame teaches for those to come; :meth:`add` does it first if it hasn't been done."""
+        if self._seen_last is None:
+            return
+        (mean, difference, beyond, learn), self._seen_last = self._seen_last, None
         if self._frames % EXTREME_FRAMES == 0:
             usable = np.stack(self.windows.full()) & (beyond[1] <= FAR).all(axis=0)
             self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
@@ -181,7 +190,8 @@ class SequentialTest(ByArithmetic):
             # An offset that stays says nothing against what differences show.
             usable = self.windows.full()[1] & ~(beyond[1] > 1.0).any(axis=0)
             self._learn(difference, usable if learn is None else usable & learn)
-        return Finding(*by.decide(beyond, LENGTHS.index(at_least), _LENGTHS))
+        if self._frames % REFRESH_FRAMES == 0 and not self._stale:
+            self._refresh()
 
     def level(self, frames: int) -> tuple[Array, Array]:
         """Mean shift (s, 6) over the last ``frames`` frames, and its covariance (s, 6, 6) (that of the next shorter
@@ -211,6 +221,7 @@ class SequentialTest(ByArithmetic):
 
     def restart(self, streams: np.ndarray, keep: np.ndarray | int = 0) -> None:
         """Forget the frames of some streams (s,) but the last ``keep``; what was learnt about the noise stays."""
+        self.learn()
         self.windows.keep(streams, keep)
         self._seen = np.where(streams & (np.asarray(keep) == 0), 0, self._seen)
         self._since_restart = 0

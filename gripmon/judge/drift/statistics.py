@@ -64,34 +64,26 @@ class Windows(ByArithmetic):
         super().__init__(by)
         self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
         self._lengths = np.array(LENGTHS)
-        self._frames = np.zeros(streams, dtype=np.intp)
         self._newest = 0
 
-    @property
-    def frames(self) -> np.ndarray:
+        self.frames = np.zeros(streams, dtype=np.intp)
         """(s,) frames in the windows of each stream."""
-        return self._frames
 
-    def add(self, values: Array) -> None:
-        """One frame's values (s, 6)."""
-        following = (self._newest + 1) % len(self._ring)
-        np.add(self._ring[self._newest], values, out=self._ring[following])
-        self._newest = following
-        self._frames += 1
-
-    def means(self) -> tuple[Array, Array]:
-        """Means (k, s, 6) of the last n frames, for every n of :data:`LENGTHS`, and by how much they differ from those
-        of the n before.
+    def add(self, values: Array) -> tuple[Array, Array]:
+        """One frame's values (s, 6); the means (k, s, 6) of the last n frames, for every n of :data:`LENGTHS`, and by
+        how much they differ from those of the n before.
 
         What reaches back beyond the first frame is meaningless; see :meth:`full`.
         """
-        of: tuple[Array, Array] = self._by.means(self._ring, self._newest, self._lengths)
+        self._newest = (self._newest + 1) % len(self._ring)
+        self.frames += 1
+        of: tuple[Array, Array] = self._by.slide(self._ring, self._newest, values, self._lengths)
         return of
 
     def full(self) -> tuple[np.ndarray, np.ndarray]:
         """(k, s) whether the last n frames, and the last 2 n, lie within the stream."""
         count = self._lengths[:, None]
-        return self._frames >= count, self._frames >= 2 * count
+        return self.frames >= count, self.frames >= 2 * count
 
     def mean_of_last(self, frames: int) -> Array:
         """(s, 6) mean over the last ``frames`` frames, 1 to 4096."""
@@ -99,7 +91,7 @@ class Windows(ByArithmetic):
 
     def keep(self, streams: np.ndarray, frames: np.ndarray | int) -> None:
         """Forget all but the last ``frames`` frames of some streams (s,) bool."""
-        self._frames = np.where(streams, np.minimum(self._frames, frames), self._frames)
+        self.frames = np.where(streams, np.minimum(self.frames, frames), self.frames)
 
 
 PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3

@@ -74,6 +74,8 @@ class Gripper:
         through = [self._through(n, e, p) for (n, e), p in zip(model.edges.items(), self.edge_points, strict=True)]
         self._curves = Curves(through, self.edge_ids)
         self.edge_curved, self.has_curves = self._curves.curved, bool(self._curves.curved.any())
+        at_corner = (self.edge_points[None] == self.corner_points[:, None, None]).any(axis=2)
+        self._edges_at_corner = [np.flatnonzero(at_it & ~self.edge_curved) for at_it in at_corner]
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
@@ -168,8 +170,7 @@ class Gripper:
         """Indices of the straight edges that end in a corner (index into ``corner_ids``): those that can be
         intersected.
         """
-        at_it = (self.edge_points == self.corner_points[corner]).any(axis=1)
-        return np.flatnonzero(at_it & ~self.edge_curved)
+        return self._edges_at_corner[corner]
 
     def innermost_corners(self, among: NDArray[np.bool_], count: int | None) -> NDArray[np.bool_]:
         """(c,) at most ``count`` (None: all) of the corners ``among`` (c,): the nearest to the TCP, fingers taking
@@ -303,7 +304,8 @@ class Gripper:
         out = np.zeros(len(self.faces) + 1, dtype=bool)
         if self.faces:
             first = points_grip_m[self._face_span]
-            normals = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+            (ax, ay, az), (bx, by, bz) = (first[:, 1] - first[:, 0]).T, (first[:, 2] - first[:, 0]).T
+            normals = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
             np.greater(np.einsum("ij,ij->i", normals, eye_grip_m - first[:, 0]), 0.0, out=out[:-1])
         return out
 

@@ -44,7 +44,11 @@ def offset_m(table: Array, opening_m: float) -> Array:
     """Of a finger (3,) in the gripper frame at an opening."""
     if len(table) == 1:
         return table[0, 1:]
-    return np.array([np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)])
+    k = int(table[:, 0].searchsorted(opening_m, "right")) - 1
+    if k < 0 or k + 1 == len(table):
+        return table[max(k, 0), 1:]
+    way = (table[k + 1, 1:] - table[k, 1:]) / (table[k + 1, 0] - table[k, 0])
+    return np.asarray(table[k, 1:] + way * (opening_m - table[k, 0]))
 
 
 def _convert(value: Any, kind: type[_T], key: str) -> _T:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
@@ -17,10 +18,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.compiled import COMPILES
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
+from gripmon.track.edges import prediction_kernel, prediction_plain
 
 if TYPE_CHECKING:
     from gripmon.track.edges.taught import TaughtEdges
@@ -61,6 +63,14 @@ FEWEST_SAMPLES = 4
 
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
+
+SHORTEST_PX = 8.0
+"""Less of an edge isn't sampled."""
+
+PLACES = 65
+"""Places of an edge, evenly spaced, at which it is seen whether it lies in the image."""
+
+_by: ModuleType = prediction_kernel if COMPILES else prediction_plain
 
 
 @dataclass(frozen=True)
@@ -156,7 +166,10 @@ class Prediction:
         """Scale of the image at the gripper: median over the edge points, across their edges (px/m); 0 without any."""
         if not len(self.uv_px):
             return 0.0
-        return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
+        square = np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3])
+        below, above = (len(square) - 1) // 2, len(square) // 2
+        middle = np.sqrt(np.partition(square, (below, above))[[below, above]])
+        return 0.5 * float(middle[0] + middle[1])
 
     @cached_property
     def bevel_px(self) -> Array:
@@ -193,21 +206,7 @@ class Prediction:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
         linearisation pose.
         """
-        if COMPILES:
-            return float(largest_motion(self.jacobian, xi))
-        return float(np.abs(self.jacobian[:, : len(xi)] @ xi).max(initial=0.0))
-
-
-@compiled
-def largest_motion(jacobian: Any, xi: Any) -> float:
-    """:meth:`Prediction.moved_px`, compiled."""
-    largest = 0.0
-    for n in range(len(jacobian)):
-        moved = 0.0
-        for i in range(len(xi)):
-            moved += jacobian[n, i] * xi[i]
-        largest = max(largest, abs(moved))
-    return largest
+        return float(_by.largest_motion(self.jacobian, xi))
 
 
 def lay_out(
@@ -232,16 +231,10 @@ def lay_out(
     if taught is not None:
         as_taught = taught.known & (view.crease == taught.crease)
     wanted = view.visible & (settings.creases | ~view.crease | as_taught)
-    coarse = np.linspace(0.0, 1.0, 65)
-    along_m = gripper.outlines_m(points_cam_m, np.arange(len(gripper.edge_ids)), len(coarse), cam_T_grip[:3, :3])
-    uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, len(coarse), 2)
-    inside = _inside(camera, uv, settings.reach_px)
-    step_px = np.linalg.norm(np.diff(uv, axis=1), axis=2)
-    ranges = [
-        _sampled_range(coarse, inside[e], step_px[e], settings.end_margin_px) if wanted[e] else None
-        for e in range(len(uv))
-    ]
-    lengths = np.array([r[2] if r else 0.0 for r in ranges])
+    along_m = gripper.outlines_m(points_cam_m, np.arange(len(gripper.edge_ids)), PLACES, cam_T_grip[:3, :3])
+    uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
+    ranges = _by.sampled_ranges(uv, _inside(camera, uv, settings.reach_px), wanted, settings.end_margin_px, SHORTEST_PX)
+    lengths = ranges[:, 2]
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
         # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most
@@ -250,7 +243,7 @@ def lay_out(
         counts = np.minimum(np.round(settings.samples * share / share.sum()), lengths).astype(int)
     counts[counts < FEWEST_SAMPLES] = 0
     edges = np.flatnonzero(counts)
-    fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges, counts, strict=True) if n and r]
+    fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges.tolist(), counts.tolist(), strict=True) if n]
     first = np.concatenate([[0], np.cumsum(counts[edges])[:-1]]).astype(np.intp) if len(edges) else np.zeros(0, np.intp)
     return EdgeLayout(
         np.repeat(edges, counts[edges]),
@@ -260,25 +253,6 @@ def lay_out(
         view.visible,
         as_taught,
     )
-
-
-def _sampled_range(
-    coarse: Array, inside: NDArray[np.bool_], step_px: Array, margin_px: float
-) -> tuple[float, float, float] | None:
-    """First and last fraction and length in px of the longest run of an edge inside the image, less the margin; None
-    if nothing is left.
-    """
-    if not inside.any():
-        return None
-    change = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
-    starts, stops = change[::2], change[1::2] - 1
-    travelled = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step_px))])
-    run = int(np.argmax(travelled[stops] - travelled[starts]))
-    low, high = travelled[starts[run]] + margin_px, travelled[stops[run]] - margin_px
-    if high - low < 8.0:
-        return None
-    fractions = np.interp([low, high], travelled, coarse)
-    return float(fractions[0]), float(fractions[1]), float(high - low)
 
 
 def _inside(camera: Camera, uv_px: Array, margin_px: float) -> NDArray[np.bool_]:
@@ -305,29 +279,17 @@ def predict(
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
     # An outline that wanders over what is round moves in the image as if it were fixed, to the first order.
     points_grip_m = gripper.points_grip_m(jaw_opening_m, -translation @ rotation)
-    levers = points_grip_m @ rotation.T
     edge = layout.edge
-    start, end = gripper.tangents_m(levers, edge, layout.fraction, rotation)
-    way = end - start
-    lever = start + layout.fraction[:, None] * way
-    points_cam_m = lever + translation
+    start, end = gripper.tangents_m(points_grip_m @ rotation.T, edge, layout.fraction, rotation)
+    rate = gripper.point_motion(jaw_opening_m) @ rotation.T if jaw_unknown else np.zeros_like(points_grip_m)
+    lever, points_cam_m = _by.levers(start, end, layout.fraction, translation)
     uv, d_uv = camera.project_with_jacobian(points_cam_m)
-    tangent = np.einsum("nij,nj->ni", d_uv, way)
-    tangent /= np.sqrt(np.einsum("ni,ni->n", tangent, tangent))[:, None]
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    gradient = np.einsum("ni,nij->nj", normal, d_uv)
+    of_edge = rate[gripper.edge_points[:, 0]]
+    normal, gradient, jacobian = _by.across_edges(d_uv, start, end, lever, edge, of_edge, jaw_unknown)
     mapped = np.isfinite(gradient).all(axis=1)
     if not mapped.all():
         kept = layout.only(mapped)
         return predict(camera, gripper, kept, cam_T_grip, jaw_opening_m, offsets_px, jaw_unknown, taught)
-    jacobian = np.empty((len(edge), 7 if jaw_unknown else 6))
-    jacobian[:, :3] = gradient
-    for i, j, k in ((3, 1, 2), (4, 2, 0), (5, 0, 1)):  # lever x gradient, without np.cross's overhead
-        jacobian[:, i] = lever[:, j] * gradient[:, k] - lever[:, k] * gradient[:, j]
-    rate = np.zeros_like(levers)
-    if jaw_unknown:
-        rate = gripper.point_motion(jaw_opening_m) @ rotation.T
-        jacobian[:, 6] = np.einsum("ni,ni->n", gradient, rate[gripper.edge_points[edge, 0]])
     # A bevel moves its edge by anything up to its width.
     edge_spread_m: Array = gripper.edge_bevel_m / math.sqrt(12.0)
     if taught is not None:
@@ -336,18 +298,17 @@ def predict(
         spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
         edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0)
-    xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
-    along, origin, direction = _ideal_lines(xy, layout, len(gripper.edge_ids))
-    way_xy = direction[edge]
+    xy, way_xy, along, origin, direction = _by.ideal_lines(
+        points_cam_m, edge, layout.edges, layout.first, len(gripper.edge_ids)
+    )
     if gripper.has_curves:
         curved = gripper.edge_curved[edge]
-        way_xy[curved] = _unit((way[:, :2] - xy * way[:, 2:])[curved])
+        way_xy[curved] = _unit(((end - start)[:, :2] - xy * (end - start)[:, 2:])[curved])
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
-    offsets = offsets_px.astype(np.float32)
-    uv32, normal32 = uv.astype(np.float32), normal.astype(np.float32)
     # Rows as far apart as the profiles' pixels: noise and fine texture differ, the edge doesn't.
     spacing_px = (offsets_px[1] - offsets_px[0]) / STEP_PX if len(offsets_px) > 1 else 1.0
-    along32 = (spacing_px * np.arange(-(ROWS // 2), ROWS // 2 + 1, dtype=np.float32))[:, None, None].astype(np.float32)
+    rows_px = (spacing_px * np.arange(-(ROWS // 2), ROWS // 2 + 1, dtype=np.float32)).astype(np.float32)
+    map_x, map_y = _by.maps(uv, normal, offsets_px.astype(np.float32), rows_px)
     return Prediction(
         cam_T_grip=cam_T_grip,
         jaw_opening_m=jaw_opening_m,
@@ -358,12 +319,12 @@ def predict(
         xy=xy,
         way_xy=way_xy,
         along=along,
-        gain=_gain(points_cam_m, normal, d_uv, way_xy),
+        gain=_by.gains(points_cam_m, normal, d_uv, way_xy),
         line_origin=origin,
         line_direction=direction,
         ok=ok,
-        map_x=(uv32[:, 0:1] + normal32[:, 0:1] * offsets) + along32 * normal32[:, 1:2],
-        map_y=(uv32[:, 1:2] + normal32[:, 1:2] * offsets) - along32 * normal32[:, 0:1],
+        map_x=map_x,
+        map_y=map_y,
         corners=corners,
         edge_spread_m=edge_spread_m,
     )
@@ -388,34 +349,6 @@ def _predict_corners(
     )
 
 
-def _ideal_lines(xy: Array, layout: EdgeLayout, edge_count: int) -> tuple[Array, Array, Array]:
-    """The edges as straight lines in ideal coordinates, and where on them (n,) the sample points ``xy`` (n, 2) lie.
-
-    Lines of edges that are not sampled are NaN; a curved edge's is that from its first sample to its last.
-    """
-    origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
-    if len(layout.edges) == 0:
-        return np.zeros(0), origin, direction
-    last = np.append(layout.first[1:], len(xy)) - 1
-    origin[layout.edges] = 0.5 * (xy[layout.first] + xy[last])
-    direction[layout.edges] = _unit(xy[last] - xy[layout.first])
-    edge = layout.edge
-    return np.einsum("ni,ni->n", xy - origin[edge], direction[edge]), origin, direction
-
-
 def _unit(ways: Array) -> Array:
     """(n, 2) of length 1."""
     return np.asarray(ways / np.sqrt(np.einsum("ni,ni->n", ways, ways))[:, None])
-
-
-def _gain(points_cam_m: Array, normal: Array, d_uv: Array, way_xy: Array) -> Array:
-    """(n,) by how much an offset of a pixel along the image normal moves a point off its edge in ideal coordinates.
-
-    ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal
-    coordinates.
-    """
-    lens = d_uv[:, :, :2] * points_cam_m[:, 2][:, None, None]
-    determinant = lens[:, 0, 0] * lens[:, 1, 1] - lens[:, 0, 1] * lens[:, 1, 0]
-    step_x = (lens[:, 1, 1] * normal[:, 0] - lens[:, 0, 1] * normal[:, 1]) / determinant
-    step_y = (lens[:, 0, 0] * normal[:, 1] - lens[:, 1, 0] * normal[:, 0]) / determinant
-    return np.asarray(step_y * way_xy[:, 0] - step_x * way_xy[:, 1])

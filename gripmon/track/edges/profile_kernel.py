@@ -11,7 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.model.compiled import compiled
+from gripmon.model.compiled import COMPILES, compiled
+
+if COMPILES:
+    from llvmlite import ir
+    from numba.core import types
+    from numba.extending import intrinsic
 
 BLUE, GREEN, RED = 0.114, 0.587, 0.299
 """Luma weights of ITU-R BT.601."""
@@ -126,22 +131,48 @@ def _cut_out(image: Any, left: int, top: int, width: int, height: int, patch: An
             patch[v * width + u] = grey
 
 
+def _four_sums(patch: Any, at: Any, width: Any, above: float, here: float, below: float, under: float) -> Any:
+    """Sums down four neighbouring columns of a patch from the pixel ``at`` on, in rows of ``width``: with the weights
+    of four rows, as a processor adds up four numbers at once.
+    """
+    rows = [patch[at + k * width : at + k * width + 4] for k in range(4)]
+    return above * rows[0] + here * rows[1] + below * rows[2] + under * rows[3]
+
+
+def _write_four_sums(
+    context: Any, patch: Any, at: Any, width: Any, above: Any, here: Any, below: Any, under: Any
+) -> Any:
+    """:func:`_four_sums` for numba: its type, and what writes its code.  Of Python's loops it adds number by number."""
+
+    def write(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        patch = context.make_array(signature.args[0])(context, builder, values[0])
+        four = ir.VectorType(ir.DoubleType(), 4)
+        place, total = values[1], None
+        for weight in values[3:]:
+            address = builder.bitcast(builder.gep(patch.data, [place]), four.as_pointer())
+            single = builder.insert_element(ir.Constant(four, ir.Undefined), weight, ir.IntType(32)(0))
+            each = builder.shuffle_vector(single, single, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
+            part = builder.fmul(each, builder.load(address, align=8))
+            total = part if total is None else builder.fadd(total, part)
+            place = builder.add(place, values[2])
+        columns = [builder.extract_element(total, ir.IntType(32)(k)) for k in range(4)]
+        return context.make_tuple(builder, signature.return_type, columns)
+
+    four_numbers: Any = types.UniTuple(types.float64, 4)  # type: ignore[no-untyped-call]
+    return four_numbers(patch, at, width, above, here, below, under), write
+
+
+if COMPILES:
+    _four_sums = intrinsic(_write_four_sums)  # type: ignore[assignment]
+
+
 @compiled
 def _interpolate(patch: Any, base: Any, width: int, across: Any, down: Any, grey: Any) -> None:
     """Sixteen pixels of a patch each, weighted down its columns and then across."""
     for q in range(len(base)):
-        a = _at(base[q])
-        b = a + _at(width)
-        c = b + _at(width)
-        d = c + _at(width)
-        above, here, below, under = down[0, q], down[1, q], down[2, q], down[3, q]
-        first = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
-        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
-        second = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
-        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
-        third = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
-        a, b, c, d = a + _at(1), b + _at(1), c + _at(1), d + _at(1)
-        fourth = above * patch[a] + here * patch[b] + below * patch[c] + under * patch[d]
+        first, second, third, fourth = _four_sums(
+            patch, _at(base[q]), _at(width), down[0, q], down[1, q], down[2, q], down[3, q]
+        )
         grey[q] = (across[0, q] * first + across[1, q] * second) + (across[2, q] * third + across[3, q] * fourth)
 
 

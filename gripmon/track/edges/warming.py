@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from gripmon.model.compiled import COMPILES
+from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.consensus import ConsensusSettings, Prior, agree
 from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
@@ -52,7 +53,20 @@ def warm_up() -> float:
     corner_rms(corners.xy, corners.usable, points_m, here, here, prediction.corners.d_uv_d_xy)
     agreeing_shares(np.zeros(1, dtype=np.intp), edge, prediction.ok, consensus.supported, 1)
     edge_means(candidates.sample, consensus.weight, consensus.residual_px, edge, 1)
+    _predict(prediction)
     return time.perf_counter() - begin_s
+
+
+def _predict(prediction: Prediction) -> None:
+    """The geometry behind such a prediction."""
+    by, layout, ends, d_uv = prediction_kernel, prediction.layout, np.ones((4, 3)), np.ones((4, 2, 3))
+    translation, places = prediction.cam_T_grip[:3, 3], np.zeros((1, 2, 2))
+    by.sampled_ranges(places, np.ones((1, 2), dtype=bool), np.ones(1, dtype=bool), 0.0, 1.0)
+    lever, points_cam_m = by.levers(ends, ends, layout.fraction, translation)
+    by.across_edges(d_uv, ends, ends, lever, layout.edge, np.zeros((1, 3)), True)
+    by.maps(prediction.uv_px, prediction.normal, *np.zeros((2, 3), dtype=np.float32))
+    _, way_xy, *_ = by.ideal_lines(points_cam_m, layout.edge, layout.edges, layout.first, 1)
+    by.gains(points_cam_m, prediction.normal, d_uv, way_xy)
 
 
 def _of_one_edge() -> Prediction:

@@ -2,7 +2,7 @@
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
 from gripmon.track.integrity.quantiles import bounds
-from gripmon.track.integrity.separation import Doubts, Separation, Sums, follow, normalised_squares, telling, warm_up
+from gripmon.track.integrity.separation import Doubts, Separation, Sums, follow, telling, warm_up, with_and_without
 
 __all__ = [
     "Doubts",
@@ -12,7 +12,7 @@ __all__ = [
     "bounds",
     "follow",
     "hypotheses_of",
-    "normalised_squares",
     "telling",
     "warm_up",
+    "with_and_without",
 ]

@@ -178,6 +178,36 @@ def squares(shift: Array, at: Array, covariance: Array, times: float, more: Arra
 
 
 @compiled
+def with_and_without(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    finger: Ints,
+    fingers: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+    at: Array,
+    covariance: Array,
+    off: Array,
+    times: float,
+) -> tuple[bool, tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
+    """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
+    besides, and the normalised squares (h,) of the former's distance from that.
+    """
+    sums, normal, spread, of_model = add_up(
+        pull, information, middle, model, finger, fingers, keep, known, known_pull
+    )  # fmt: skip
+    rooted, shift, own, by_model = separate(sums, normal, spread, of_model, 6)
+    known_pose, sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
+    solved, shift_with, own_with, by_model_with = separate(sums, normal, spread, of_model, 6)
+    comparable, out = squares(shift, at, own, times, covariance)
+    found = rooted and known_pose and solved and comparable
+    return found, (shift, own, by_model), (shift_with, own_with, by_model_with), out
+
+
+@compiled
 def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
     """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
 

@@ -53,6 +53,27 @@ def squares(shift: Array, at: Array, covariance: Array, times: float, more: Arra
     return True, np.einsum("hi,hi->h", away, np.linalg.solve(times * covariance + more, away[:, :, None])[:, :, 0])
 
 
+def with_and_without(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    finger: Ints,
+    fingers: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+    at: Array,
+    covariance: Array,
+    off: Array,
+    times: float,
+) -> tuple[bool, tuple[Array, ...], tuple[Array, ...], Array]:
+    sums = add_up(pull, information, middle, model, finger, fingers, keep, known, known_pull)
+    alone = separate(*sums, 6)[1:]
+    together = separate(*with_pose(*sums, at, covariance, off)[1:], 6)[1:]
+    return True, alone, together, squares(alone[0], at, alone[1], times, covariance)[1]
+
+
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
     parts = shift.reshape(-1, 2, 3)
     covariance = inflation**2 * covariance + np.einsum("hfi,hfj->hij", of_model, of_model)

@@ -72,21 +72,32 @@ class Sums(NamedTuple):
         pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
         return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
 
-    def with_pose(self, at: Array, covariance: Array, of_model: Array) -> Sums:
-        """With the first six unknowns known to be ``at`` (6,) but for a ``covariance`` (6, 6), and off by ``of_model``
-        (f, 6), or (1, 6) of zeros.
-        """
-        return Sums(*_first_that_can(kernel.with_pose, plain.with_pose, *self, at, covariance, of_model))
-
     def fits(self, unknowns: int = 6) -> Separation:
         """The fits' first ``unknowns``.  Where nothing determines a direction, ``known`` must: LinAlgError else."""
         return Separation(*_first_that_can(kernel.separate, plain.separate, *self, unknowns))
 
 
-def normalised_squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> Array:
-    """(h,) of shifts (h, 6) from ``at`` (6,), by ``times`` the covariances (h, 6, 6) and ``more`` (6, 6)."""
-    [squares] = _first_that_can(kernel.squares, plain.squares, shift, at, covariance, times, more)
-    return squares
+def with_and_without(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: tuple[Array, NDArray[np.intp], int],
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+    at: Array,
+    covariance: Array,
+    of_model: Array,
+    times: float,
+) -> tuple[Separation, Separation, Array]:
+    """The fits of six unknowns by what :meth:`Sums.of_kept` is made of, and the same with these known to be ``at`` (6,)
+    but for a ``covariance`` (6, 6), and off by ``of_model`` (f, 6), or (1, 6) of zeros.  And the normalised squares
+    (h,) of the former's distances from there, by ``times`` their own covariances and that one.
+    """
+    pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
+    of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
+    alone, together, squares = _first_that_can(kernel.with_and_without, plain.with_and_without, *of)
+    return Separation(*alone), Separation(*together), squares
 
 
 def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:
@@ -174,10 +185,9 @@ def warm_up() -> None:
     for m in (6, 7):
         each = np.tile(np.eye(m), (2, 1, 1))
         model = np.zeros((2, m)), np.zeros(2, dtype=np.intp), 1
-        alone = Sums.of_kept(np.zeros((2, m)), each, each, model, whole, each, np.zeros((2, m)))
-        fits = alone.fits()
-        fits = alone.with_pose(none, np.eye(6), fits.of_model[0]).fits()
-    normalised_squares(fits.shift, none, fits.covariance, 1.0, np.eye(6))
+        of = np.zeros((2, m)), each, each, model, whole, each, np.zeros((2, m))
+        fits = Sums.of_kept(*of).fits()
+        with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
     told = telling(averages, none, none, fits, np.arange(2), 1.0)
     Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)

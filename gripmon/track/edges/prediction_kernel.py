@@ -1,0 +1,162 @@
+"""The geometry of a prediction in machine code: what ``prediction`` does with NumPy, where each step's reason stands;
+both are held together by a test.
+
+n samples, s places along each profile, r rows of them, e edges of the gripper, v of them sampled.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gripmon.model.compiled import compiled
+
+
+@compiled
+def largest_motion(jacobian: Any, xi: Any) -> float:
+    """``Prediction.moved_px``."""
+    largest = 0.0
+    for n in range(len(jacobian)):
+        moved = 0.0
+        for i in range(len(xi)):
+            moved += jacobian[n, i] * xi[i]
+        largest = max(largest, abs(moved))
+    return largest
+
+
+@compiled
+def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
+    """``prediction._sampled_ranges`` of edges (e, c, 2) whose c places are ``inside`` (e, c): (e, 3)."""
+    edges, places = inside.shape
+    out, travelled = np.zeros((edges, 3)), np.empty(places)
+    for e in range(edges):
+        if not wanted[e]:
+            continue
+        travelled[0] = 0.0
+        for k in range(1, places):
+            dx, dy = uv_px[e, k, 0] - uv_px[e, k - 1, 0], uv_px[e, k, 1] - uv_px[e, k - 1, 1]
+            step_px = math.sqrt(dx * dx + dy * dy)
+            travelled[k] = travelled[k - 1] + (step_px if step_px == step_px else 0.0)
+        first, last, longest, begin = 0, -1, -1.0, 0
+        for k in range(places):
+            if not inside[e, k]:
+                begin = k + 1
+            elif (k + 1 == places or not inside[e, k + 1]) and travelled[k] - travelled[begin] > longest:
+                first, last, longest = begin, k, travelled[k] - travelled[begin]
+        if last < first:
+            continue
+        low, high = travelled[first] + margin_px, travelled[last] - margin_px
+        if high - low >= shortest_px:
+            out[e, 0], out[e, 1], out[e, 2] = _fraction(travelled, low), _fraction(travelled, high), high - low
+    return out
+
+
+@compiled
+def _fraction(travelled: Any, at_px: float) -> float:
+    """Where (0 to 1) an edge has ``travelled`` so far, its places being evenly spaced."""
+    last, k = len(travelled) - 1, 0
+    if at_px >= travelled[last]:
+        return 1.0
+    while travelled[k + 1] <= at_px:
+        k += 1
+    return (k + (at_px - travelled[k]) / (travelled[k + 1] - travelled[k])) / last
+
+
+@compiled
+def levers(start: Any, end: Any, fraction: Any, translation: Any) -> tuple[Any, Any]:
+    """Samples (n, 3) at the ``fraction`` of the way from ``start`` to ``end`` (n, 3), which are given from the
+    gripper's origin; and the same from the camera's.
+    """
+    lever, points_cam_m = np.empty(start.shape), np.empty(start.shape)
+    for n in range(len(start)):
+        for i in range(3):
+            lever[n, i] = start[n, i] + fraction[n] * (end[n, i] - start[n, i])
+            points_cam_m[n, i] = lever[n, i] + translation[i]
+    return lever, points_cam_m
+
+
+@compiled
+def across_edges(
+    d_uv: Any, start: Any, end: Any, lever: Any, edge: Any, rate: Any, jaw_unknown: bool
+) -> tuple[Any, Any, Any]:
+    """Normals (n, 2) of edges that go from ``start`` to ``end`` (n, 3), gradients (n, 3) of the motion along them by a
+    point's, and Jacobian (n, 6 or 7); ``rate`` (e, 3): motion of the edges by the opening.
+    """
+    count = len(edge)
+    normal, gradient, jacobian = np.empty((count, 2)), np.empty((count, 3)), np.empty((count, 7 if jaw_unknown else 6))
+    for n in range(count):
+        tangent_u, tangent_v = 0.0, 0.0
+        for i in range(3):
+            span = end[n, i] - start[n, i]
+            tangent_u += d_uv[n, 0, i] * span
+            tangent_v += d_uv[n, 1, i] * span
+        length = math.sqrt(tangent_u * tangent_u + tangent_v * tangent_v)
+        normal[n, 0], normal[n, 1] = -tangent_v / length, tangent_u / length
+        for i in range(3):
+            gradient[n, i] = normal[n, 0] * d_uv[n, 0, i] + normal[n, 1] * d_uv[n, 1, i]
+            jacobian[n, i] = gradient[n, i]
+        x, y, z = lever[n, 0], lever[n, 1], lever[n, 2]
+        jacobian[n, 3] = y * gradient[n, 2] - z * gradient[n, 1]
+        jacobian[n, 4] = z * gradient[n, 0] - x * gradient[n, 2]
+        jacobian[n, 5] = x * gradient[n, 1] - y * gradient[n, 0]
+        if jaw_unknown:
+            own = rate[edge[n]]
+            jacobian[n, 6] = gradient[n, 0] * own[0] + gradient[n, 1] * own[1] + gradient[n, 2] * own[2]
+    return normal, gradient, jacobian
+
+
+@compiled
+def maps(uv_px: Any, normal: Any, offsets_px: Any, rows_px: Any) -> tuple[Any, Any]:
+    """Where ``r`` rows of each profile are read, (r, n, s) each, in single precision as it is kept."""
+    map_x = np.empty((len(rows_px), len(uv_px), len(offsets_px)), np.float32)
+    map_y = np.empty(map_x.shape, np.float32)
+    for r in range(len(rows_px)):
+        for n in range(len(uv_px)):
+            u, v = np.float32(uv_px[n, 0]), np.float32(uv_px[n, 1])
+            x, y = np.float32(normal[n, 0]), np.float32(normal[n, 1])
+            for k in range(len(offsets_px)):
+                map_x[r, n, k] = (u + x * offsets_px[k]) + rows_px[r] * y
+                map_y[r, n, k] = (v + y * offsets_px[k]) - rows_px[r] * x
+    return map_x, map_y
+
+
+@compiled
+def ideal_lines(
+    points_cam_m: Any, edge: Any, edges: Any, first: Any, edge_count: int
+) -> tuple[Any, Any, Any, Any, Any]:
+    """``prediction_plain.ideal_lines``."""
+    count = len(edge)
+    xy, way_xy, along = np.empty((count, 2)), np.empty((count, 2)), np.empty(count)
+    origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
+    for n in range(count):
+        for i in range(2):
+            xy[n, i] = points_cam_m[n, i] / points_cam_m[n, 2]
+    for v in range(len(edges)):
+        a, b, e = first[v], (first[v + 1] if v + 1 < len(first) else count) - 1, edges[v]
+        square = 0.0
+        for i in range(2):
+            origin[e, i], direction[e, i] = 0.5 * (xy[a, i] + xy[b, i]), xy[b, i] - xy[a, i]
+            square += direction[e, i] * direction[e, i]
+        for i in range(2):
+            direction[e, i] /= math.sqrt(square)
+    for n in range(count):
+        e = edge[n]
+        way_xy[n, 0], way_xy[n, 1] = direction[e, 0], direction[e, 1]
+        along[n] = (xy[n, 0] - origin[e, 0]) * direction[e, 0] + (xy[n, 1] - origin[e, 1]) * direction[e, 1]
+    return xy, way_xy, along, origin, direction
+
+
+@compiled
+def gains(points_cam_m: Any, normal: Any, d_uv: Any, way_xy: Any) -> Any:
+    """``prediction_plain.gains``."""
+    gain = np.empty(len(normal))
+    for n in range(len(normal)):
+        z = points_cam_m[n, 2]
+        a, b, c, d = d_uv[n, 0, 0] * z, d_uv[n, 0, 1] * z, d_uv[n, 1, 0] * z, d_uv[n, 1, 1] * z
+        determinant = a * d - b * c
+        step_x = (d * normal[n, 0] - b * normal[n, 1]) / determinant
+        step_y = (a * normal[n, 1] - c * normal[n, 0]) / determinant
+        gain[n] = step_y * way_xy[n, 0] - step_x * way_xy[n, 1]
+    return gain
