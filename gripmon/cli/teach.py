@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
-import sys
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
+    PAGE_PORT,
+    PORT_OPTIONS,
     Command,
     check_outputs,
     command_line,
     make_directory,
     positive_number,
     refuse_without,
-    whole_number,
+    serve_page,
     write,
 )
 from gripmon.model.errors import InputError, NoResultError
@@ -59,9 +58,9 @@ _OPTIONS = """
 --into-config       also write the line that names it into the configuration
 """
 
-_BY_HAND = """
+_BY_HAND = f"""
 --page              teach on a local web page
---corners FILE      without a page: rough corners, `corners: {name: [u, v], …}`
+--corners FILE      without a page: rough corners, `corners: {{name: [u, v], …}}`
 --live DEVICE       with --page: a camera instead of images, as in source.device
 --live-wait S       give up when this camera has shown nothing for so long (s); default: never, the page says what is
                     wrong
@@ -70,10 +69,11 @@ _BY_HAND = """
 --reference FILE    without --config: calibration of hand and eye, if there is
 --jaw-source        in the configuration written: where jaw openings come from; zenoh: the robot says them (default:
                     frames with a timestamps.csv that has them, else fixed)
+--source SOURCE     in the configuration written: where frames come from, a folder, a video, a device,
+                    zenoh:WIDTHxHEIGHT[:KEY] or ros2:WIDTHxHEIGHT:TOPIC (default: the images' folder)
 --robot NAME        the robot's name in the configuration written
 --camera-name NAME  the camera's name in it
---port N            port of the page (default: any free one)
---no-browser        print the page's address, but open no browser
+{PORT_OPTIONS.strip()}
 """
 
 _EXAMPLES = """\
@@ -92,10 +92,8 @@ a new robot, without any configuration: put corners on the fingertips, on a page
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
 from, and why: nothing is written then"""
 
-_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source")
+_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source")
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
-_LOOK_S = 0.2
-_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def _key(text: str) -> str:
@@ -110,7 +108,7 @@ def _key(text: str) -> str:
     {"corners by hand": (None, _BY_HAND)},
     jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
     jaw_source={"choices": ("fixed", "frames", "zenoh")},
-    port={"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (any free one) to 65535"), "default": 0},
+    port=PAGE_PORT,
 )  # fmt: skip
 def teach(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach``."""
@@ -187,8 +185,9 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
         return
     files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
     inputs = read_inputs(
-        images, command=command_line(arguments), **files, live=arguments.live, jaw_opening_m=arguments.jaw_opening,
-        jaw_source=arguments.jaw_source, robot=arguments.robot, camera_name=arguments.camera_name,
+        images, command=command_line(arguments), **files, live=arguments.live, source=arguments.source,
+        jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
+        robot=arguments.robot, camera_name=arguments.camera_name,
     )  # fmt: skip
     make_directory(inputs.folder)
     if arguments.page:
@@ -207,6 +206,8 @@ def _misuse(arguments: argparse.Namespace) -> str:
     images, page, config, live = arguments.image, arguments.page, arguments.config, arguments.live
     if page and arguments.corners is not None:
         return "--page and --corners are two ways of the same; one of them"
+    if arguments.source is not None and (live is not None or config is not None):
+        return "--source: --live or --config says where frames come from; leave it out"
     if live is not None and (images or not page):
         return "--live goes with --page, without images; image files otherwise"
     if arguments.live_wait is not None and live is None:
@@ -235,26 +236,16 @@ def _say(saved: Saved) -> None:
 
 def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> None:
     """Until the person is done."""
-    from gripmon.teach.page_server import PageServer
+    from gripmon.teach.page_server import TeachSite
+
+    def look() -> None:
+        dark_s, why = session.dark()
+        if arguments.live_wait is not None and dark_s > arguments.live_wait:
+            raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
 
     try:
-        server = PageServer(session, arguments.port)
-    except OSError as error:
-        session.close()
-        wrong = f"can't be listened on ({error.strerror}); another one, or none"
-        raise InputError(f"--port {arguments.port}: {wrong}") from None
-    try:
-        print(f"teach on this page: {server.url}", flush=True)
-        print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
-        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
-        if not arguments.no_browser and displayed:
-            webbrowser.open(server.url)
-        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
-            dark_s, why = session.dark()
-            if arguments.live_wait is not None and dark_s > arguments.live_wait:
-                raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
+        serve_page(arguments, TeachSite(session), "teach", look)
     finally:
-        server.close()
         session.close()
 
 

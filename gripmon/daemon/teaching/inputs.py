@@ -21,7 +21,8 @@ from gripmon.daemon.config.checks import covariance_of, predict_view, reference_
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import read_settings, read_yaml
-from gripmon.io.sources import FolderSettings, LiveSettings
+from gripmon.daemon.teaching.source import named_source
+from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
@@ -46,7 +47,7 @@ class Inputs:
     pictures: tuple[Picture, ...]
     gripper_path: Path
     folder: Path
-    source: FolderSettings | LiveSettings | None
+    source: SourceSettings | None
     config: Config | None
     robot: str
     camera_name: str
@@ -66,6 +67,7 @@ def read_inputs(
     gripper: Path | None = None,
     reference: Path | None = None,
     live: str | None = None,
+    source: str | None = None,
     jaw_opening_m: float | None = None,
     jaw_source: str | None = None,
     robot: str | None = None,
@@ -73,7 +75,7 @@ def read_inputs(
 ) -> Inputs:
     """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what
     is to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of
-    images.
+    images, ``source`` where the configuration's frames come from (None: that camera, or the images' folder).
     """
     cv2.setNumThreads(1)
     given = None
@@ -91,14 +93,23 @@ def read_inputs(
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = setup.settings.bit_depth
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
-    source = live_settings(live, setup.camera) if live is not None else FolderSettings(path=str(images[0].parent))
+    frames: SourceSettings
+    try:
+        if live is not None:
+            frames = live_settings(live, setup.camera)
+        elif source is not None:
+            frames = named_source(source, (setup.camera.width_px, setup.camera.height_px))
+        else:
+            frames = FolderSettings(path=str(images[0].parent))
+    except SourceError as error:
+        raise InputError(str(error), "source") from None
     calibrations = {"camera": camera, "reference": reference}
     return Inputs(
         setup=setup,
         pictures=pictures,
         gripper_path=gripper_path,
         folder=out or (Path() if given is None else given.directory),
-        source=source if given is None else None,
+        source=frames if given is None else None,
         config=given,
         robot=robot or ROBOT,
         camera_name=camera_name or CAMERA_NAME,
