@@ -240,10 +240,14 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class TeachSite:
-    """The teaching page on one session.  ``back``: where the page goes when the person is done, None: nowhere."""
+    """The teaching page on one session.  ``back``: where the page goes when the person is done, None: nowhere;
+    ``saves``: which files it offers, None: all.
+    """
 
-    def __init__(self, session: TeachSession | OutlineSession, back: str | None = None):
-        self._session, self._back = session, back
+    def __init__(
+        self, session: TeachSession | OutlineSession, back: str | None = None, saves: tuple[str, ...] | None = None
+    ):
+        self._session, self._back, self._saves = session, back, saves
         self._files = web_files(
             "index.html", "style.css", "icon.svg", "main.js", "stage.js", "panel.js", "history.js", "server.js"
         )
@@ -252,7 +256,8 @@ class TeachSite:
         if path in self._files:
             return self._files[path]
         if path == "state":
-            state = msgspec.structs.replace(self._session.state(), back=self._back)
+            state = self._session.state()
+            state = msgspec.structs.replace(state, back=self._back, saves=self._saves or state.saves)
             return msgspec.json.encode(state), "application/json"
         if path.partition("?")[0] == "live.jpg":
             return self._session.live(), "image/jpeg"

@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -26,7 +27,7 @@ from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, Source
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import ReferenceRecord, to_json
+from gripmon.model.records import ReferenceRecord, Transform, to_json
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_any, read_picture
 from gripmon.teach.corner_pose import CameraError, corners_fault
@@ -173,7 +174,11 @@ def _calibrations(
     lens, error = (None, None) if camera_path is None else _read_lens(camera_path)
     reference = None
     if reference_path is not None:
-        lens, reference = _hand_eye(reference_path, lens, gripper)
+        values = read_yaml(reference_path)
+        if lens is not None and "cam_T_grip" in values and "schema" not in values:
+            reference = _section(reference_path, values)
+        else:
+            lens, reference = _hand_eye(reference_path, lens, gripper)
     if lens is None:
         right = "a file of gripmon calibrate intrinsics, or a configuration"
         raise InputError(f"is missing; {right}", "camera")
@@ -209,6 +214,14 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
     digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
     name = f"config-{digest}"  # as the configuration that names the file will call it
     return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
+
+
+def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
+    """A reference as a configuration has it, in a file by itself: a robot's own hand/eye calibration."""
+    settings = read_settings(path, ReferenceSettings, values)
+    transform = Transform(settings.cam_T_grip.translation_m, settings.cam_T_grip.rotation_xyzw)
+    digest = hashlib.sha256(to_json(transform)).hexdigest()[:8]
+    return ReferenceRecord(f"config-{digest}", 0, 0, "configuration", transform, covariance_of(settings))
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:
