@@ -26,6 +26,7 @@ from gripmon.teach.messages import BadRequest, encoded
 
 MOST_IMAGES = 60
 _GREEN = (80, 220, 60)
+_READY = "ready to be taken"
 
 
 class Captured(msgspec.Struct, frozen=True, kw_only=True):
@@ -88,7 +89,10 @@ class Capture:
             self._thread.join(10.0)
 
     def by_itself(self, on: bool) -> None:
+        """Take images by itself from now on, or no longer; what is shown of a folder is the first of them."""
         with self._lock:
+            if on and not self._itself and self._note == _READY and self._newest is not None:
+                self._note = f"taken: {self._keep(*self._newest)}"
             self._itself = on
             self._lock.notify_all()
 
@@ -208,8 +212,8 @@ class Capture:
             self._newest, self._shown = (frame, view), self._shown + 1
             height, width = frame.image.shape[:2]
             self._size_px = width, height
-            self._note = view.fault or (self._hold(frame.image, view) if live else "") or "ready to be taken"
-            if self._itself and self._note == "ready to be taken":
+            self._note = view.fault or (self._hold(frame.image, view) if live else "") or _READY
+            if self._itself and self._note == _READY:
                 try:
                     self._note = f"taken: {self._keep(frame, view)}"
                 except (BadRequest, InputError) as error:

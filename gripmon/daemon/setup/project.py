@@ -164,8 +164,8 @@ class Project:
             return ("done" if count else "ready"), f"{count} image{'' if count == 1 else 's'}"
         if not all(self._there(name) for name in files):
             return "ready", ""
-        made = min((self.folder / name).stat().st_mtime_ns for name in files)
-        newer = [name for name in needed(step, self.values) if (self.folder / name).stat().st_mtime_ns > made]
+        made = min(self._made_ns(name) for name in files)
+        newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
         # What was inferred together with the hand/eye calibration is as old as that.
         newer = [name for name in newer if name not in files]
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
@@ -178,6 +178,12 @@ class Project:
     def _there(self, name: str) -> bool:
         path = self.folder / name
         return self._count(name) > 0 if path.is_dir() else path.exists()
+
+    def _made_ns(self, name: str) -> int:
+        """When a file was written; of a folder its newest image."""
+        path = self.folder / name
+        each = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES] if path.is_dir() else []
+        return max((p.stat().st_mtime_ns for p in each), default=path.stat().st_mtime_ns)
 
     def _count(self, folder: str) -> int:
         path = self.folder / folder
