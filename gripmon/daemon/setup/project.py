@@ -155,7 +155,8 @@ class Project:
             done = self._accepted.get(step.name) == self._said(step)
             return ("done", "") if done else ("ready", "")
         if not needs_doing:
-            return "skipped", self._why_skipped(step)
+            inferred = step.name == "gripper" and self._there("gripper.yaml")
+            return "done" if inferred else "skipped", self._why_skipped(step)
         for name in needed(step, self.values):
             if not self._there(name):
                 return "waits", f"first: {self._maker(name)} ({name})"
@@ -168,6 +169,10 @@ class Project:
         newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
         # What was inferred together with the hand/eye calibration is as old as that.
         newer = [name for name in newer if name not in files]
+        if step.name == "intrinsics" and self.values["intrinsics_by"] != steps.FROM_FILE and not newer:
+            made_with, now = read_yaml(self.folder / "camera.yaml").get("target"), name_of(target_in(self.values))
+            if made_with != now:
+                return "stale", f"made with {made_with}, and the target is {now}: do this again"
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
 
     def _why_skipped(self, step: Step) -> str:

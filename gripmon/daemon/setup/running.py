@@ -29,6 +29,7 @@ from gripmon.teach.messages import BadRequest
 _LINES = 200
 _ASK_EVERY_S, _ANSWER_S, _ENDS_S = 0.2, 2.0, 20.0
 _STAMP = re.compile(r"^\d{4}-\d\d-\d\d \S+ ")
+_OWN_QUESTIONS = "command snapshot: done"
 _OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
 _LOST: Colour = (80, 80, 255)
 _CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
@@ -52,7 +53,7 @@ class Seen(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MonitorProcess:
-    """At most one at a time; it is asked for its newest frame over its own Zenoh endpoint (``gripmon send snapshot``)."""
+    """At most one at a time; it is asked for its newest frame as ``gripmon send snapshot`` does."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -124,7 +125,8 @@ class MonitorProcess:
     def _listen(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None
         for line in process.stderr:
-            self._lines.append(_STAMP.sub("", line.rstrip()))
+            if _OWN_QUESTIONS not in line:
+                self._lines.append(_STAMP.sub("", line.rstrip()))
 
     def _ask(self, process: subprocess.Popen[str], config: Config) -> None:
         settings = config.settings

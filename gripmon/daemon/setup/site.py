@@ -23,7 +23,7 @@ from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite,
 from gripmon.teach.session import TeachSession
 
 _Name = Annotated[str, Meta(max_length=40)]
-_Said = dict[Annotated[str, Meta(max_length=40)], Annotated[str, Meta(max_length=2000)]]
+_Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
 _PICTURES = {"camera.png": "image/png", "hand_eye.png": "image/png", "target.pdf": "application/pdf"}
 
 
@@ -31,7 +31,7 @@ class Do(Request, frozen=True):
     """A step to be carried out with what stands in its fields."""
 
     step: _Name
-    values: Annotated[_Said, Meta(max_length=40)] = {}
+    values: _Said = msgspec.field(default_factory=dict)
 
 
 class CaptureOrder(Request, frozen=True):
@@ -39,7 +39,7 @@ class CaptureOrder(Request, frozen=True):
 
     step: _Name
     action: Literal["start", "stop", "by_itself", "by_hand", "take", "next", "drop"]
-    values: Annotated[_Said, Meta(max_length=40)] = {}
+    values: _Said = msgspec.field(default_factory=dict)
     name: Annotated[str, Meta(max_length=200)] = ""
 
 

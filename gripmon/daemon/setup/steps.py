@@ -21,7 +21,7 @@ DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
 """Mostly light, so that dark fingers show before it, and small enough for A5."""
 INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
 ON_PLATE, BY_CORNERS = "on the plate", "from corners alone"
-_WITHOUT = "the taught page then takes the reference from the corners, less exactly"
+_WITHOUT = "when teaching, less exactly"
 
 
 @dataclass(frozen=True)
@@ -161,14 +161,15 @@ STEPS = (
     ),
     Step(
         "target", "Target", "A flat pattern of known size.  Print it at 100 %, glue it onto something flat, and hold a "
-        "ruler against the bar.", "form", "Make it", (), ("setup.yaml",), _target,
+        "ruler against the bar.", "form", "Make it", (), ("setup.yaml", "target.pdf"), _target,
         (
             Field("have", "target", PRINT_IT, choices=(PRINT_IT, HAVE_ONE)),
             Field("target", "pattern", DEFAULT_TARGET, "circles:COLUMNSxROWS:SPACING:DIAMETER, "
                   "chequerboard:COLUMNSxROWS:SQUARE (inner corners) or charuco:COLUMNSxROWS:SQUARE:MARKER; metres"),
-            Field("paper", "paper", "a4", "a5 to a0, letter, legal, tabloid, or WIDTHxHEIGHT in mm", (), ("have", (PRINT_IT,))),
-            Field("bar_measured", "the bar measures (mm)", "", "empty: exactly what stands beside it; else the pattern's "
-                  "size follows the ruler", (), ("have", (PRINT_IT,))),
+            Field("paper", "paper", "a4", "a5 to a0, letter, legal, tabloid, or WIDTHxHEIGHT in mm", (),
+                  ("have", (PRINT_IT,))),
+            Field("bar_measured", "the bar measures (mm)", "", "empty: exactly what stands beside it; else the "
+                  "pattern's size follows the ruler", (), ("have", (PRINT_IT,))),
         ),
     ),
     Step(
@@ -183,8 +184,10 @@ STEPS = (
         (
             Field("intrinsics_by", "lens", "from the images", choices=("from the images", FROM_FILE)),
             Field("model", "model", "brown_conrady", "auto: the one that the images support best",
-                  ("auto", "brown_conrady", "brown_conrady_5", "fisheye", "paper"), ("intrinsics_by", ("from the images",))),
-            Field("camera_file", "file", "", "of ROS, Kalibr, OpenCV or mrcal", (), ("intrinsics_by", (FROM_FILE,))),
+                  ("auto", "brown_conrady", "brown_conrady_5", "fisheye", "paper"),
+                  ("intrinsics_by", ("from the images",))),
+            Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or mrcal", (),
+                  ("intrinsics_by", (FROM_FILE,))),
         ), "camera.png",
     ),
     Step(
@@ -194,7 +197,8 @@ STEPS = (
             Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_FILE)),
             Field("gripper_file", "file", "", "a gripper file; with CAD a mesh, with images their folder", (),
                   ("gripper", (FROM_FILE, FROM_CAD, FROM_IMAGES))),
-            Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (), ("gripper", (INFERRED,))),
+            Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
+                  ("gripper", (INFERRED,))),
         ),
     ),
     Step(
@@ -202,10 +206,11 @@ STEPS = (
         "images, put down again for each; the jaws stay as they are.", "capture", "Start", ("camera.yaml",),
         ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
         (
-            Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}", (ON_PLATE, FROM_FILE, BY_CORNERS)),
+            Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}",
+                  (ON_PLATE, FROM_FILE, BY_CORNERS)),
             Field("standing_source", "images from", "", _PLATE_SOURCE, (), ("reference_by", (ON_PLATE,))),
-            Field("reference_file", "file", "", "of gripmon calibrate plane, or of the robot: cam_T_grip, or flange_T_cam "
-                  "and flange_T_tcp", (), ("reference_by", (FROM_FILE,))),
+            Field("reference_file", "file", "", "of gripmon calibrate plane, or of the robot: cam_T_grip, or "
+                  "flange_T_cam and flange_T_tcp", (), ("reference_by", (FROM_FILE,))),
         ),
     ),
     Step(

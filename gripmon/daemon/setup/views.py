@@ -100,10 +100,9 @@ def moved(before: Image, now: Image) -> float | None:
     """
     if before.shape != now.shape:
         return None
-    found = cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 10.0)
-    if found is None:
+    start = np.asarray(cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 10.0), np.float32)
+    if start.ndim != 3:  # it found none
         return None
-    start = np.asarray(found, np.float32)
     end, status, _ = cv2.calcOpticalFlowPyrLK(before, now, start, np.zeros_like(start))
     good = np.ravel(status) > 0
     if 2 * np.count_nonzero(good) < len(good):

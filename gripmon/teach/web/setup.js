@@ -72,9 +72,9 @@ function showFields() {
   }));
 }
 
-function button(text, act, kind = "", id = text) {
-  const node = element("button", text, { type: "button", class: kind, id: `do-${id.toLowerCase().replaceAll(" ", "-")}` });
-  node.disabled = Boolean(state.busy);
+function button(text, act, kind, id, can = true) {
+  const node = element("button", text, { type: "button", class: kind, id: `do-${id}` });
+  node.disabled = Boolean(state.busy) || !can;
   node.addEventListener("click", () => order(act));
   return node;
 }
@@ -92,7 +92,7 @@ function buttonsOf({ kind, button: name, state: { progress } }) {
   if (!now?.running || now.ended) return [button(now?.ended ? "Start again" : name, () => post("capture", { step: chosen, action: "start", values: said() }), "main", "step")];
   return [
     now.itself ? button("Stop taking", order_("by_hand"), "ask", "by-hand") : button("Take by themselves", order_("by_itself"), "main", "by-itself"),
-    button("Take this one", order_("take"), "", "take"),
+    button("Take this one", order_("take"), "", "take", now.shown > 0),
     ...(now.live ? [] : [button("Next image", order_("next"), "", "next")]),
     button("Stop the camera", order_("stop"), "", "stop"),
   ];
@@ -124,7 +124,7 @@ function status() {
     const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
     return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
   }
-  if (taking && (taking.running || taking.ended)) return [`${taking.note}. ${taking.images.length} taken.`, /^(taken|ready|no more)/.test(taking.note) ? "good" : "warn"];
+  if (taking && (taking.running || taking.ended)) return [taking.ended ? taking.note : `${taking.note}; ${taking.images.length} taken`, /^(taken|ready|no more)/.test(taking.note) ? "good" : "warn"];
   const words = { done: "done", stale: now.note, waits: now.note, skipped: `not needed: ${now.note}`, ready: "" };
   const text = words[now.progress] || "";
   return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || "not done yet", { done: "good", stale: "warn" }[now.progress] ?? ""];
@@ -174,16 +174,15 @@ function showMonitor() {
 
 function showResult() {
   const card = step();
-  $("#said").replaceChildren(...card.said.map(({ text, level }) => {
+  const lines = state.busy === chosen ? [] : card.said;
+  $("#said").replaceChildren(...lines.filter(({ level }) => level).map(({ text, level }) => {
     const item = element("li", "", { "data-level": level });
-    if (level) item.append(element("b", level), element("span", text)); else item.textContent = text;
+    item.append(element("b", level), element("span", text));
     return item;
   }));
-  if (chosen === "target" && card.state.progress === "done" && card.said.some((line) => line.text.startsWith("written"))) {
-    const item = element("li");
-    item.append(element("a", "open target.pdf", { href: "file/target.pdf", target: "_blank" }));
-    $("#said").append(item);
-  }
+  const output = lines.filter(({ level }) => !level).map(({ text }) => text).join("\n");
+  if ($("#output").textContent !== output) $("#output").textContent = output;
+  $("#file").hidden = chosen !== "target" || !card.state.files.includes("target.pdf");
   const image = $("#result img");
   $("#result").hidden = !card.picture || Boolean(state.busy);
   if (card.picture && !state.busy) {
@@ -210,7 +209,7 @@ function show() {
   showResult();
   document.body.dataset.busy = Boolean(state.busy);
   if (capture()) load($("#live"), "live.jpg", capture().shown, "live");
-  if (step().kind === "run") load($("#overlay"), "monitor.jpg", state.monitor.shown, "monitor");
+  if (step().kind === "run") load($("#shown"), "monitor.jpg", state.monitor.shown, "monitor");
 }
 
 async function order(act) {
