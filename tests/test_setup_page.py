@@ -33,10 +33,11 @@ def driver() -> Iterator[Any]:
     opened.quit()
 
 
+Walked = tuple[Path, dict[str, Any]]
+
+
 @pytest.fixture(scope="module")
-def walked(
-    user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Any]]:
+def walked(user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Walked:
     """The project of a person who went the whole way, and what the page looked like after each step."""
     wait_for_default_port()
     folder, seen = tmp_path_factory.mktemp("way") / "arm1", {}

@@ -26,6 +26,8 @@ _MARGIN_MM = 7.0
 """What common printers leave white at a border is 3 to 6.4 mm."""
 _FOOT_MM = 16.0
 """Below the pattern, for the bar and the text."""
+_DESCENT_MM = 1.0
+"""Of letters of 8 points below their line."""
 _BAR_MM = (200.0, 150.0, 100.0, 50.0)
 _POINTS_PER_MM = 72.0 / 25.4
 _ROUND = 4.0 / 3.0 * (np.sqrt(2.0) - 1.0)
@@ -159,7 +161,7 @@ class _Page:
 
 def _foot(target: Target, paper_mm: tuple[float, float], bar_mm: float) -> list[str]:
     """A bar with a tick at each centimetre, what it has to measure, and the target as commands take it."""
-    page, left, low = _Page(paper_mm), _MARGIN_MM, paper_mm[1] - _MARGIN_MM
+    page, left, low = _Page(paper_mm), _MARGIN_MM, paper_mm[1] - _MARGIN_MM - _DESCENT_MM
     lines = [page.shape(("box", (0.0, 0.0, bar_mm, 0.3)), left, low - 8.0)]
     for tick in range(round(bar_mm / 10.0) + 1):
         high = 3.0 if tick in (0, round(bar_mm / 10.0)) else 1.5
