@@ -7,11 +7,14 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -21,11 +24,13 @@ from support.loopback import free_endpoint, wait_until
 
 from gripmon.calibrate.sighting import Sighting
 from gripmon.cli import main
+from gripmon.daemon.config import load_config
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.daemon.setup import STEPS, Project
+from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.project import Line
 from gripmon.daemon.setup.robot_file import reference_text
+from gripmon.daemon.setup.site import Do
 from gripmon.daemon.setup.steps import defaults, target_in
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
@@ -34,7 +39,7 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import read_image
 from gripmon.model.records import Frame, Image
 from gripmon.model.targets import parse_target
-from gripmon.teach.messages import BadRequest
+from gripmon.teach.messages import BadRequest, Nothing, Put, SaveOrder
 
 TARGET = parse_target(new_user.TARGET)
 
@@ -312,3 +317,74 @@ def test_steps_as_commands(images: Path, tmp_path: Path, capsys: pytest.CaptureF
     with pytest.raises(NoResultError, match="none of 12 images shows the target"):
         project.do("intrinsics")
     assert (folder / "camera.yaml").read_bytes() == before
+
+
+def test_a_gripper_of_the_library_and_every_kind_of_reference(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Corners by name on the teaching page; then a plate, the robot's own file, or these corners alone."""
+    monkeypatch.chdir(tmp_path)
+    given = f"calibrate intrinsics {images / 'plate'} --target {new_user.TARGET} --model paper --out given.yaml"
+    assert main(given.split()) == 0
+    project = Project(tmp_path)
+    project.keep({"gripper": "two_box_fingers", "source": str(images / "standing"), "have": "I have one"})
+    project.keep({"intrinsics_by": "a file", "camera_file": "given.yaml"})
+    with pytest.raises(InputError, match=r"first: Lens \(camera.yaml\)"):
+        project.do("reference")
+    for step in ("camera", "target", "intrinsics", "gripper"):
+        project.do(step)
+    for folder in ("standing", "teaching"):
+        (tmp_path / folder).mkdir()
+        shutil.copy(images / "standing" / "0.png", tmp_path / folder / "000.png")
+    site, truth = SetupSite(project), json.loads((images / "standing" / "truth.json").read_text())
+    opening_m, rng, corners = truth["jaw_opening_m"], np.random.default_rng(7), {}
+    for name in ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far"):
+        u, v = (np.array(truth["corners"][name]) + rng.uniform(-4.0, 4.0, 2)).tolist()
+        corners[f"{name[0].upper()}_in_{name.rpartition('_')[2]}"] = u, v
+    try:
+        assert _sent(site, "open", Do(step="corners")) == {"url": "page/"}
+        assert _shown(site)["saves"] == ["corners"]
+        put = Put(corners=corners, image=0, jaw_opening_m=opening_m)
+        order = SaveOrder(put=put, robot="arm1", camera_name="wrist", config=False, taught=False)
+        assert _sent(site, "page/save", order).written == {"standing/corners.yaml": "the corners"}
+        _sent(site, "page/done", Nothing())
+        assert site.get("page/state") is None
+        project.keep({"jaw_opening": str(opening_m)})
+        project.do("reference")
+        found, true = read_yaml(tmp_path / "hand_eye.yaml")["cam_T_grip"], np.array(truth["cam_T_grip"])
+        np.testing.assert_allclose(found["translation_m"], true[:3, 3], atol=5e-5)
+        (tmp_path / "robot.yaml").write_text(yaml.safe_dump({"cam_T_grip": found}))
+        project.keep({"reference_by": "a file", "reference_file": "robot.yaml"})
+        project.do("reference")
+        _sent(site, "open", Do(step="teach"))
+        assert _shown(site)["needed"] == 0  # the reference is known
+        put = Put(corners={}, image=0, jaw_opening_m=opening_m)
+        saved = _sent(site, "page/save", SaveOrder(put=put, robot="arm1", camera_name="wrist"))
+        assert "the configuration" in saved.written.values()
+        assert load_config(tmp_path / "config.yaml").reference.covariance[0] == pytest.approx(1e-6)  # (1 mm)²
+        assert {line.level for line in project.do("check")} <= {"OK", "WARN"} and project.checked()
+        project.keep({"reference_by": "from corners alone"})
+        states = {state.name: state for state in project.states()}
+        assert states["reference"].progress == "skipped" and "--reference" not in states["teach"].command
+        _sent(site, "open", Do(step="teach"))
+        assert _shown(site)["needed"] == 4
+        with pytest.raises(BadRequest, match="no step nose"):
+            _sent(site, "open", Do(step="nose"))
+        project.keep({"gripper": "from the plate"})
+        with pytest.raises(InputError, match="that is inferred needs its images on the target"):
+            project.do("standing")
+    finally:
+        site.close()
+
+
+def _shown(site: SetupSite) -> dict[str, Any]:
+    found = site.get("page/state")
+    assert found is not None
+    state: dict[str, Any] = msgspec.json.decode(found[0])
+    return state
+
+
+def _sent(site: SetupSite, path: str, order: Any) -> Any:
+    action = site.post(path)
+    assert action is not None and isinstance(order, action[0])
+    return action[1](order)

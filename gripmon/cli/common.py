@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
 import shlex
 import sys
-import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -21,7 +19,6 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.model.records import Image
-    from gripmon.teach.page_server import Site
 
 REQUIRED = {"required": True}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
@@ -35,8 +32,6 @@ _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
-_LOOK_S = 0.2
-_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 PORT_OPTIONS = """
 --port N            port of the page (default: any free one)
 --no-browser        print the page's address, but open no browser
@@ -217,25 +212,10 @@ def network_errors(arguments: argparse.Namespace) -> Iterator[None]:
         raise InputError(f"{arguments.command.prog}: {option}: {error.text}") from None
 
 
-def serve_page(arguments: argparse.Namespace, site: Site, verb: str, look: Callable[[], None] = lambda: None) -> None:
-    """Serve it to this machine until the person is done; ``look`` is called now and then."""
-    from gripmon.teach.page_server import PageServer
-
-    try:
-        server = PageServer(site, arguments.port)
-    except OSError as error:
-        wrong = f"can't be listened on ({error.strerror}); another one, or none"
-        raise InputError(f"--port {arguments.port}: {wrong}") from None
-    try:
-        print(f"{verb} on this page: {server.url}", flush=True)
-        print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
-        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
-        if not arguments.no_browser and displayed:
-            webbrowser.open(server.url)
-        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
-            look()
-    finally:
-        server.close()
+def announcer(verb: str) -> Callable[[str], None]:
+    """What tells a person where the page is."""
+    key = "its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it"
+    return lambda url: print(f"{verb} on this page: {url}\n{key}", flush=True)
 
 
 def make_directory(path: Path, option: str = "--out") -> Path:

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Command, check_outputs, make_directory, serve_page, write
+from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Command, announcer, check_outputs, make_directory, write
 from gripmon.model.errors import InputError
 
 _DESCRIPTION = """\
@@ -37,17 +37,16 @@ exit codes: 0 done; 2 wrong usage or files; 3 a step gives nothing, and why; 130
 def setup(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon setup``."""
     from gripmon.daemon.setup import Project, SetupSite
+    from gripmon.teach.page_server import serve
 
     with contextlib.chdir(make_directory(arguments.dir, "DIR")):
         project = Project(Path())
-        if arguments.source is not None:
-            project.keep({"source": arguments.source})
+        project.keep({} if arguments.source is None else {"source": arguments.source})
         if arguments.step is not None:
-            for line in project.do_here(arguments.step, print):
-                print(f"{line.level:<5} {line.text}".strip())
+            print("\n".join(f"{line.level:<5} {line.text}".strip() for line in project.do_here(arguments.step, print)))
             return
         with contextlib.closing(SetupSite(project)) as site:
-            serve_page(arguments, site, "set up")
+            serve(site, arguments.port, announcer("set up"), open_browser=not arguments.no_browser)
 
 
 _TARGET = """\

@@ -12,12 +12,12 @@ from gripmon.cli.common import (
     PAGE_PORT,
     PORT_OPTIONS,
     Command,
+    announcer,
     check_outputs,
     command_line,
     make_directory,
     positive_number,
     refuse_without,
-    serve_page,
     write,
 )
 from gripmon.model.errors import InputError, NoResultError
@@ -236,7 +236,7 @@ def _say(saved: Saved) -> None:
 
 def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> None:
     """Until the person is done."""
-    from gripmon.teach.page_server import TeachSite
+    from gripmon.teach.page_server import TeachSite, serve
 
     def look() -> None:
         dark_s, why = session.dark()
@@ -244,7 +244,8 @@ def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession
             raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
 
     try:
-        serve_page(arguments, TeachSite(session), "teach", look)
+        announce, browser = announcer("teach"), not arguments.no_browser
+        serve(TeachSite(session), arguments.port, announce, open_browser=browser, look=look)
     finally:
         session.close()
 

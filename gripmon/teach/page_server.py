@@ -13,8 +13,11 @@ from __future__ import annotations
 import contextlib
 import importlib.resources
 import logging
+import os
 import secrets
+import sys
 import threading
+import webbrowser
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -27,6 +30,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
@@ -51,6 +55,8 @@ ADDRESS = "127.0.0.1"
 LONGEST_REQUEST = 1_000_000
 _SILENT_S = 30.0
 _TOKEN_BYTES = 24
+_LOOK_S = 0.2
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 _KINDS = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -109,6 +115,33 @@ class PageServer:
         self._http.shutdown()
         self._http.server_close()
         self._thread.join()
+
+
+def serve(
+    site: Site,
+    port: int,
+    announce: Callable[[str], object],
+    *,
+    open_browser: bool,
+    look: Callable[[], object] = lambda: None,
+) -> None:
+    """Serve it until the person is done.  ``announce`` hears its address; ``look`` is called now and then.
+
+    Raises :class:`~gripmon.model.errors.InputError` for a port that is taken.
+    """
+    try:
+        server = PageServer(site, port)
+    except OSError as error:
+        raise InputError(f"{port}: can't be listened on ({error.strerror}); another one, or none", "port") from None
+    try:
+        announce(server.url)
+        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
+        if open_browser and displayed:
+            webbrowser.open(server.url)
+        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
+            look()
+    finally:
+        server.close()
 
 
 class _Http(ThreadingHTTPServer):
