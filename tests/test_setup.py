@@ -271,6 +271,29 @@ def test_steps_are_a_chain(tmp_path: Path):
     assert [state.progress for state in Project(tmp_path).states()][:3] == ["ready", "ready", "waits"]
 
 
+def test_grippers_from_cad_and_images_are_commands(tmp_path: Path):
+    project = Project(tmp_path)
+    (tmp_path / "camera.yaml").write_text("")
+    project.keep(
+        {"gripper": "from CAD", "gripper_file": "l.stl 'my r.stl'", "gripper_options": "--unit mm --view 0.12:30"}
+    )
+    project.keep({"jaw_range": "0:0.06"})
+    words, written = (
+        "gripmon gripper from-cad l.stl 'my r.stl' --jaw-range 0:0.06 --unit mm",
+        "--out gripper.yaml --force",
+    )
+    view = "--view 0.12:30 --camera camera.yaml --picture gripper.png"
+    assert project.states()[4].command == f"{words} {view} {written}" and project.states()[4].progress == "ready"
+    project.keep({"gripper": "from images", "gripper_file": "free", "gripper_options": "--distance 0.12:0.003"})
+    words = "gripmon gripper from-images free --camera camera.yaml --distance 0.12:0.003 --picture gripper.png"
+    assert project.states()[4].command == f"{words} --reference-out hand_eye.yaml {written}"
+    project.keep({"gripper_options": "'"})
+    assert "words as on a command line" in project.states()[4].note
+    project.keep({"gripper": "two_box_fingers", "reference_by": "with the gripper's images"})
+    with pytest.raises(InputError, match="no images gave this gripper"):
+        project.do("standing")
+
+
 def test_what_the_ruler_says_scales_the_target(tmp_path: Path):
     project = Project(tmp_path)
     project.keep({"bar_measured": "153"})

@@ -273,6 +273,8 @@ class Project:
         by = self.values["reference_by"]
         if by != steps.ON_PLATE and self.values["gripper"] == steps.INFERRED:
             raise InputError("a gripper that is inferred needs its images on the target; these, or another gripper")
+        if by == steps.BY_IMAGES and self.values["gripper"] != steps.FROM_IMAGES:
+            raise InputError("no images gave this gripper; another reference")
         return [Line(f"reference: {by}", "OK")]
 
     def _reference(self) -> list[Line] | None:

@@ -24,7 +24,9 @@ from gripmon.teach.session import TeachSession
 
 _Name = Annotated[str, Meta(max_length=40)]
 _Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
-_PICTURES = {"camera.png": "image/png", "hand_eye.png": "image/png", "target.pdf": "application/pdf"}
+_PICTURES = {
+    "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png", "target.pdf": "application/pdf"
+}  # fmt: skip
 
 
 class Do(Request, frozen=True):
@@ -304,6 +306,5 @@ class SetupSite:
 
 def _founders() -> tuple[str, ...]:
     """Ways to a gripper file whose commands this installation has."""
-    if importlib.util.find_spec("gripmon.cli.gripper") is None:
-        return ()
-    return steps.FROM_CAD, steps.FROM_IMAGES
+    ways = ((steps.FROM_CAD, "gripper_cad"), (steps.FROM_IMAGES, "gripper_images"))
+    return tuple(way for way, module in ways if importlib.util.find_spec(f"gripmon.cli.{module}") is not None)

@@ -4,6 +4,7 @@ the same in the project's folder.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ Kind = Literal["form", "capture", "page", "run"]
 DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
 """Mostly light, so that dark fingers show before it, and small enough for A5."""
 INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
-ON_PLATE, BY_CORNERS = "on the plate", "from corners alone"
+ON_PLATE, BY_CORNERS, BY_IMAGES = "on the plate", "from corners alone", "with the gripper's images"
 _WITHOUT = "when teaching, less exactly"
 
 
@@ -106,13 +107,27 @@ def _gripper(values: Values) -> list[str] | None:
     which = values["gripper"]
     if which == INFERRED:
         return None
-    if which == FROM_CAD:
-        return ["gripmon", "gripper", "from-cad", values["gripper_file"], "--out", "gripper.yaml", "--force"]
-    if which == FROM_IMAGES:
-        words = ["gripmon", "gripper", "from-images", values["gripper_file"], "--camera", "camera.yaml"]
-        return [*words, "--out", "gripper.yaml", "--force"]
+    if which in (FROM_CAD, FROM_IMAGES):
+        return ["gripmon", "gripper", *_founded(values), "--out", "gripper.yaml", "--force"]
     path = values["gripper_file"] if which == FROM_FILE else str(grippers().get(which, which))
     return ["cp", path, "gripper.yaml"]
+
+
+def _founded(values: Values) -> list[str]:
+    """A model from CAD, or from images, from which a reference follows, too."""
+    try:
+        files, options = shlex.split(values["gripper_file"]), shlex.split(values["gripper_options"])
+    except ValueError as error:
+        raise InputError(f"gripper: {error}; words as on a command line") from None
+    if not files:
+        raise InputError("no file is named; a mesh, URDF or .cao for CAD, a folder for images")
+    picture, reference = ["--picture", "gripper.png"], ["--reference-out", "hand_eye.yaml"]
+    if values["gripper"] == FROM_IMAGES:
+        return ["from-images", *files, "--camera", "camera.yaml", *options, *picture, *reference]
+    jaws = ["--jaw-range", values["jaw_range"]] if values["jaw_range"] else []
+    # Only with a view there is something to draw.
+    viewed = any(word.startswith(("--view", "--reference")) for word in options)
+    return ["from-cad", *files, *jaws, *options, *(["--camera", "camera.yaml", *picture] if viewed else [])]
 
 
 def _on_plate(values: Values) -> bool:
@@ -195,11 +210,13 @@ STEPS = (
         "images of the gripper standing on the target.", "form", "Use it", (), ("gripper.yaml",), _gripper,
         (
             Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_FILE)),
-            Field("gripper_file", "file", "", "a gripper file; with CAD a mesh, with images their folder", (),
-                  ("gripper", (FROM_FILE, FROM_CAD, FROM_IMAGES))),
+            Field("gripper_file", "file", "", "a gripper file; of CAD meshes, a URDF or .cao; of images their folder",
+                  (), ("gripper", (FROM_FILE, FROM_CAD, FROM_IMAGES))),
+            Field("gripper_options", "options", "", "of the command below, e.g. --unit mm --view 0.12:30, or "
+                  "--distance 0.12:0.003", (), ("gripper", (FROM_CAD, FROM_IMAGES))),
             Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
-                  ("gripper", (INFERRED,))),
-        ),
+                  ("gripper", (INFERRED, FROM_CAD))),
+        ), "gripper.png",
     ),
     Step(
         "standing", "Gripper on the target", "The fingertips stand on the target, as flat as they can.  Three to ten "
@@ -207,7 +224,7 @@ STEPS = (
         ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
         (
             Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}",
-                  (ON_PLATE, FROM_FILE, BY_CORNERS)),
+                  (ON_PLATE, FROM_FILE, BY_CORNERS, BY_IMAGES)),
             Field("standing_source", "images from", "", _PLATE_SOURCE, (), ("reference_by", (ON_PLATE,))),
             Field("reference_file", "file", "", "of gripmon calibrate plane, or of the robot: cam_T_grip, or "
                   "flange_T_cam and flange_T_tcp", (), ("reference_by", (FROM_FILE,))),
@@ -253,7 +270,7 @@ def needed(step: Step, values: Values) -> tuple[str, ...]:
     names = step.needs
     if step.name == "intrinsics" and values["intrinsics_by"] == FROM_FILE:
         names = ()
-    if step.name == "gripper" and values["gripper"] == FROM_IMAGES:
+    if step.name == "gripper" and values["gripper"] in (FROM_CAD, FROM_IMAGES):
         names = ("camera.yaml",)
     if step.name == "teach" and values["reference_by"] == BY_CORNERS:
         names = tuple(name for name in names if name != "hand_eye.yaml")
