@@ -30,7 +30,7 @@ from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.project import Line
 from gripmon.daemon.setup.robot_file import reference_text
-from gripmon.daemon.setup.site import Do
+from gripmon.daemon.setup.site import CaptureOrder, Do
 from gripmon.daemon.setup.steps import defaults, target_in
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
@@ -391,6 +391,7 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         assert states["reference"].progress == "skipped" and "--reference" not in states["teach"].command
         _sent(site, "open", Do(step="teach"))
         assert _shown(site)["needed"] == 4
+        _started_and_stopped(site, tmp_path)
         with pytest.raises(BadRequest, match="no step nose"):
             _sent(site, "open", Do(step="nose"))
         project.keep({"gripper": "from the plate"})
@@ -398,6 +399,25 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
             project.do("standing")
     finally:
         site.close()
+
+
+def _started_and_stopped(site: SetupSite, folder: Path) -> None:
+    """The monitor waits for a camera that isn't there, until it is told to end."""
+    values = read_yaml(folder / "config.yaml")
+    values["source"], values["publish"] = {"kind": "live", "device": "/dev/video987"}, {"listen": [free_endpoint()]}
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    _sent(site, "start", Nothing())
+    wait_until(lambda: any("/dev/video987" in line for line in site.state().monitor.lines), "what the monitor says")
+    assert site.state().monitor.running and site.state().monitor.ended is None
+    with pytest.raises(BadRequest, match="runs already"):
+        _sent(site, "start", Nothing())
+    with pytest.raises(BadRequest, match="the monitor has the camera"):
+        _sent(site, "capture", CaptureOrder(step="teaching", action="start"))
+    _sent(site, "stop", Nothing())
+    assert (site.state().monitor.running, site.state().monitor.ended) == (False, "stopped")
+    (folder / "config.yaml").write_text("robot: [\n")
+    with pytest.raises(BadRequest, match=r"config\.yaml"):
+        _sent(site, "start", Nothing())
 
 
 def _shown(site: SetupSite) -> dict[str, Any]:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gripmon.teach.measure import Taught
     from gripmon.teach.messages import Saved
     from gripmon.teach.page_server import OutlineSession
-    from gripmon.teach.session import Evaluation, TeachSession
+    from gripmon.teach.session import TeachSession
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
@@ -167,7 +167,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach --page`` and ``--corners``."""
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
-    from gripmon.daemon.teaching import outline_session, page_session, read_inputs, teach_from_file
+    from gripmon.daemon.teaching import in_words, outline_session, page_session, read_inputs, teach_from_file
 
     images = arguments.image
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
@@ -194,7 +194,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
-    print("\n".join(_table(found)))
+    print("\n".join(in_words(found)))
     saved = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
@@ -248,38 +248,3 @@ def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession
         serve(TeachSite(session), arguments.port, announce, open_browser=browser, look=look)
     finally:
         session.close()
-
-
-def _table(found: Evaluation) -> list[str]:
-    """What was seen, for a person."""
-    snapped = found.snapped
-    width = max(len(corner.name) for corner in snapped.corners)
-    lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]
-    for corner in snapped.corners:
-        agree = "" if corner.inliers is None else f"{100.0 * corner.inliers:4.0f} %"
-        if corner.uv_px is None or corner.sigma_px is None:
-            lines.append(f"{corner.name:<{width}}  not measured: {corner.reason}")
-            continue
-        u, v = corner.uv_px.tolist()
-        lines.append(f"{corner.name:<{width}}  ({u:7.2f}, {v:7.2f})  {corner.sigma_px:7.3f}  {agree}")
-    if found.reference is not None and found.pose is not None:
-        sigmas = ", ".join(f"{1e3 * found.reference.covariance[k] ** 0.5:.3f}" for k in (0, 7, 14))
-        by = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
-        lines.append(f"reference by {by}, TCP to {sigmas} mm: less exact than with a plate (gripmon calibrate plane)")
-        if found.pose.rival:
-            rival = "another pose explains these corners as well; a corner outside of their plane would tell"
-            lines.append(f"note: {rival}")
-    expected = found.expected
-    if expected is not None:
-        lines.append(f"expected of a frame   {_axes(expected.sigma)}")
-        lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
-        lines.append(f"promise               {expected.promise}")
-    return lines
-
-
-def _axes(values: object) -> str:
-    import numpy as np
-
-    x, y, z, a, b, c = np.asarray(values, dtype=float).tolist()
-    turns = ", ".join(f"{math.degrees(v):.3f}" for v in (a, b, c))
-    return f"TCP x {1e3 * x:.3f}, y {1e3 * y:.3f}, z {1e3 * z:.3f} mm, turns {turns}°"

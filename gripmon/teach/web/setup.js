@@ -119,7 +119,8 @@ function status() {
   if (state.busy) return state.busy === chosen ? ["at work …", ""] : [`at work on another step (${state.busy}) …`, ""];
   if (wrong) return [wrong, "bad"];
   if (chosen === "run" && (monitor.running || monitor.ended)) {
-    if (monitor.verdict === null) return [monitor.running ? "starting …" : monitor.ended, monitor.running ? "" : "bad"];
+    const last = monitor.lines.at(-1) ?? "";
+    if (monitor.verdict === null) return monitor.running ? [last || "starting …", ""] : [last ? `${monitor.ended}: ${last}` : monitor.ended, "bad"];
     const why = monitor.reason ? `: ${monitor.reason}` : "", bound = monitor.bound ? `, error at most ${monitor.bound}` : "";
     const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
     return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
