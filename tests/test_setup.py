@@ -20,16 +20,17 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 from support import new_user
-from support.loopback import free_endpoint, wait_until
+from support.loopback import frame_record, free_endpoint, wait_until
 
 from gripmon.calibrate.sighting import Sighting
 from gripmon.cli import main
-from gripmon.daemon.config import load_config
+from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.project import Line
 from gripmon.daemon.setup.robot_file import reference_text
+from gripmon.daemon.setup.running import overlay
 from gripmon.daemon.setup.site import CaptureOrder, Do
 from gripmon.daemon.setup.steps import defaults, target_in
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
@@ -37,7 +38,7 @@ from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, FolderSource, LiveSettings, NetworkSettings, SourceError, Waiting
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import read_image
-from gripmon.model.records import Frame, Image
+from gripmon.model.records import Frame, Image, Transform, Verdict
 from gripmon.model.targets import parse_target
 from gripmon.teach.messages import BadRequest, Nothing, Put, SaveOrder
 
@@ -384,7 +385,9 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         put = Put(corners={}, image=0, jaw_opening_m=opening_m)
         saved = _sent(site, "page/save", SaveOrder(put=put, robot="arm1", camera_name="wrist"))
         assert "the configuration" in saved.written.values()
-        assert load_config(tmp_path / "config.yaml").reference.covariance[0] == pytest.approx(1e-6)  # (1 mm)²
+        config = load_config(tmp_path / "config.yaml")
+        assert config.reference.covariance[0] == pytest.approx(1e-6)  # (1 mm)²
+        _drawn_where_it_is(config, truth, tmp_path / "teaching" / "000.png")
         assert {line.level for line in project.do("check")} <= {"OK", "WARN"} and project.checked()
         project.keep({"reference_by": "from corners alone"})
         states = {state.name: state for state in project.states()}
@@ -399,6 +402,23 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
             project.do("standing")
     finally:
         site.close()
+
+
+def _drawn_where_it_is(config: Config, truth: dict[str, Any], path: Path) -> None:
+    """The overlay's colour is at the simulator's corners, and nowhere without a transform."""
+    image, true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.array(truth["cam_T_grip"])
+    x, y, z, w = Rotation.from_matrix(true[:3, :3]).as_quat().tolist()
+    places = np.rint([truth["corners"][name] for name in truth["corners"] if "inner" in name]).astype(int)
+    for verdict, transform in ((Verdict.VALID, true), (Verdict.SUSPECT, true), (Verdict.UNKNOWN, None)):
+        pose = None if transform is None else Transform(tuple(transform[:3, 3].tolist()), (x, y, z, w))
+        changes = {"verdict": verdict, "cam_T_grip": pose, "corners": (), "jaw_opening_m": truth["jaw_opening_m"]}
+        jpeg = overlay(config, frame_record(**changes), np.asarray(image))
+        blue, green, red = np.moveaxis(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int), 2, 0)
+        coloured = {"valid": green - red > 60, "suspect": red - blue > 60, "unknown": abs(red - blue) > 60}[
+            verdict.value
+        ]
+        near = [coloured[v - 3 : v + 4, u - 3 : u + 4].any() for u, v in places]
+        assert all(near) if transform is not None else not coloured.any(), verdict
 
 
 def _started_and_stopped(site: SetupSite, folder: Path) -> None:

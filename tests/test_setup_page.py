@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -157,5 +158,48 @@ def test_bad_input_is_one_line_and_nothing_is_lost(user: new_user.NewUser, drive
         visitor.press("step")
         visitor.refused("config.yaml")
         assert all("400" in line for line in visitor.complaints())  # the browser notes each refusal
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+
+
+def test_later_steps_refuse_in_one_line_and_keep_what_is_there(walked: Walked, driver: Any, tmp_path: Path):
+    folder = tmp_path / "later"
+    shutil.copytree(walked[0], folder, copy_function=shutil.copy2)
+    kept = {name: (folder / name).read_bytes() for name in ("hand_eye.yaml", "gripper.yaml", "config.yaml")}
+    small = np.zeros((48, 64), np.uint8)
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        visitor.go("gripper")
+        visitor.fill(jaw_range="wide")
+        visitor.press("step")
+        visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "the gripper")
+        visitor.go("reference")
+        visitor.press("step")
+        visitor.refused("--jaw-range", "isn't a range")
+        visitor.go("standing")
+        visitor.fill(reference_by="a file")
+        visitor.press("step")
+        visitor.refused("that is inferred needs its images")
+        visitor.fill(reference_by="on the plate", standing_source="nowhere")
+        visitor.press("step")
+        visitor.refused("no such folder")
+        first = (folder / "standing" / "000.png").read_bytes()
+        cv2.imwrite(str(folder / "standing" / "000.png"), small)
+        visitor.go("corners")
+        visitor.press("step")
+        visitor.refused("64 x 48 px; the camera's 768 x 576 px")
+        (folder / "standing" / "000.png").write_bytes(first)
+        cv2.imwrite(str(folder / "teaching" / "000.png"), small)
+        visitor.go("teach")
+        visitor.press("step")
+        visitor.refused("000.png", "64 x 48")
+        assert {name: (folder / name).read_bytes() for name in kept} == kept
+        (folder / "config.yaml").write_text("robot: [")
+        visitor.go("check")
+        visitor.press("step")
+        visitor.refused("config.yaml")
+        visitor.go("run")
+        visitor.press("step")
+        visitor.refused("config.yaml")
         visitor.click("#done")
         assert running.ended() == (0, "")

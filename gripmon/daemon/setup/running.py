@@ -17,7 +17,6 @@ import numpy as np
 
 from gripmon.client import Ambiguous, Client, NotCarriedOut
 from gripmon.daemon.config import Config, load_config
-from gripmon.daemon.config.checks import predict_view
 from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
 from gripmon.model.geometry import from_record
@@ -25,6 +24,7 @@ from gripmon.model.images import read_image
 from gripmon.model.records import FrameRecord, Image
 from gripmon.teach.drawing import Canvas, Colour
 from gripmon.teach.messages import BadRequest
+from gripmon.teach.snapping import outlines_px
 
 _LINES = 200
 _ASK_EVERY_S, _ANSWER_S, _ENDS_S = 0.2, 2.0, 20.0
@@ -174,12 +174,8 @@ def overlay(config: Config, record: FrameRecord, image: Image) -> bytes:
     gripper, camera = config.gripper, config.camera
     if record.cam_T_grip is not None:
         cam_T_grip, opening_m = from_record(record.cam_T_grip), record.jaw_opening_m if gripper.has_jaw else None
-        points_grip_m = gripper.points_grip_m(opening_m)
-        visible = predict_view(camera, gripper, cam_T_grip, opening_m).edges_visible
-        for start, end in points_grip_m[gripper.edge_points[visible]]:
-            along = start + np.linspace(0.0, 1.0, 33)[:, None] * (end - start)
-            uv_px = camera.project(along @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
-            canvas.line(uv_px[np.isfinite(uv_px).all(axis=1)], _OUTLINE.get(record.verdict.value, _LOST), 2)
+        for uv_px in outlines_px(camera, gripper, cam_T_grip, opening_m, 33).values():
+            canvas.line(uv_px, _OUTLINE.get(record.verdict.value, _LOST), 2)
     for corner in record.corners:
         if corner.uv_px is not None:
             canvas.circle(np.array(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)

@@ -170,7 +170,8 @@ class SetupSite:
 
     def _do(self, order: Do) -> None:
         """Begin a step; the state says when it has ended, and how."""
-        self._named(order.step, "form", "capture")
+        # Of the steps that take images only one has something to be said without a camera.
+        self._named(order.step, "form", *(("capture",) if order.step == "standing" else ()))
         with self._lock:
             if self._busy is not None:
                 raise BadRequest(f"the step {self._busy} is still at work")
