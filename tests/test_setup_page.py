@@ -192,7 +192,7 @@ def test_later_steps_refuse_in_one_line_and_keep_what_is_there(walked: Walked, d
         cv2.imwrite(str(folder / "teaching" / "000.png"), small)
         visitor.go("teach")
         visitor.press("step")
-        visitor.refused("000.png", "64 x 48")
+        visitor.refused("000.png", "64x48 pixels")
         assert {name: (folder / name).read_bytes() for name in kept} == kept
         (folder / "config.yaml").write_text("robot: [")
         visitor.go("check")
