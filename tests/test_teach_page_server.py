@@ -24,7 +24,7 @@ from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import BadRequest, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page_server import OutlineSession, PageServer
+from gripmon.teach.page_server import OutlineSession, PageServer, TeachSite
 from gripmon.teach.session import Evaluation, Labels, Setup, TeachSession
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
@@ -59,7 +59,7 @@ def saving() -> Told:
 def served(rig: Rig, saving: Told) -> Iterator[PageServer]:
     picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
     setup = Setup(rig.camera, rig.gripper, MonitorSettings(), None)
-    server = PageServer(TeachSession(setup, [picture], LABELS, saving))
+    server = PageServer(TeachSite(TeachSession(setup, [picture], LABELS, saving)))
     yield server
     server.close()
 
@@ -246,7 +246,7 @@ def test_saving_is_told_as_it_went(served: PageServer, saving: Told, rig: Rig):
 def test_done_is_answered_before_it_is_done(rig: Rig, saving: Told):
     picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
     setup = Setup(rig.camera, rig.gripper, MonitorSettings(), None)
-    server = PageServer(TeachSession(setup, [picture], LABELS, saving))
+    server = PageServer(TeachSite(TeachSession(setup, [picture], LABELS, saving)))
     try:
         assert ask(server, "done", "POST", b"{}")[0] == 200
         assert server.done.wait(DEADLINE_S)
@@ -315,7 +315,7 @@ def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_pat
     image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
     path = tmp_path / "rough.yaml"
     session = OutlineSession(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
-    server = PageServer(session)
+    server = PageServer(TeachSite(session))
     names = [
         f"{finger}_{point}_{side}"
         for finger in ("left", "right")

@@ -25,6 +25,7 @@ from gripmon.cli import (
     replay,
     run,
     send,
+    setup,
     simulate,
     teach,
     watch,
@@ -41,7 +42,7 @@ _METHODS = (
     calibrate_intrinsics.intrinsics, calibrate_plane.plane, calibrate_arm.laser, calibrate_arm.robot_world,
     calibrate_verify.verify, calibrate_exchange.import_, calibrate_exchange.export,
 )  # fmt: skip
-_LAST = (teach.teach, certificates.certificates)
+_LAST = (setup.setup, setup.target, teach.teach, certificates.certificates)
 
 _EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 

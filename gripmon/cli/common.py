@@ -32,6 +32,10 @@ _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
+PORT_OPTIONS = """
+--port N            port of the page (default: any free one)
+--no-browser        print the page's address, but open no browser
+"""
 
 
 class Command:
@@ -170,6 +174,7 @@ def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:
 
 
 port = whole_number(1, 65535, "isn't a TCP port; 1 to 65535")
+PAGE_PORT = {"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (any free one) to 65535"), "default": 0}
 seed = whole_number(0, _LARGEST_SEED, f"isn't a seed; a whole number, 0 to {_LARGEST_SEED}")
 
 
@@ -205,6 +210,12 @@ def network_errors(arguments: argparse.Namespace) -> Iterator[None]:
     except PublishError as error:
         option = {"connect": "--connect", "zenoh_config": "--zenoh-config"}.get(error.key, error.key)
         raise InputError(f"{arguments.command.prog}: {option}: {error.text}") from None
+
+
+def announcer(verb: str) -> Callable[[str], None]:
+    """What tells a person where the page is."""
+    key = "its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it"
+    return lambda url: print(f"{verb} on this page: {url}\n{key}", flush=True)
 
 
 def make_directory(path: Path, option: str = "--out") -> Path:

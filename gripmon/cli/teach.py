@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
-import sys
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
+    PAGE_PORT,
+    PORT_OPTIONS,
     Command,
+    announcer,
     check_outputs,
     command_line,
     make_directory,
     positive_number,
     refuse_without,
-    whole_number,
     write,
 )
 from gripmon.model.errors import InputError, NoResultError
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from gripmon.teach.measure import Taught
     from gripmon.teach.messages import Saved
     from gripmon.teach.page_server import OutlineSession
-    from gripmon.teach.session import Evaluation, TeachSession
+    from gripmon.teach.session import TeachSession
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
@@ -59,9 +58,9 @@ _OPTIONS = """
 --into-config       also write the line that names it into the configuration
 """
 
-_BY_HAND = """
+_BY_HAND = f"""
 --page              teach on a local web page
---corners FILE      without a page: rough corners, `corners: {name: [u, v], …}`
+--corners FILE      without a page: rough corners, `corners: {{name: [u, v], …}}`
 --live DEVICE       with --page: a camera instead of images, as in source.device
 --live-wait S       give up when this camera has shown nothing for so long (s); default: never, the page says what is
                     wrong
@@ -70,10 +69,11 @@ _BY_HAND = """
 --reference FILE    without --config: calibration of hand and eye, if there is
 --jaw-source        in the configuration written: where jaw openings come from; zenoh: the robot says them (default:
                     frames with a timestamps.csv that has them, else fixed)
+--source SOURCE     in the configuration written: where frames come from, a folder, a video, a device,
+                    zenoh:WIDTHxHEIGHT[:KEY] or ros2:WIDTHxHEIGHT:TOPIC (default: the images' folder)
 --robot NAME        the robot's name in the configuration written
 --camera-name NAME  the camera's name in it
---port N            port of the page (default: any free one)
---no-browser        print the page's address, but open no browser
+{PORT_OPTIONS.strip()}
 """
 
 _EXAMPLES = """\
@@ -92,10 +92,8 @@ a new robot, without any configuration: put corners on the fingertips, on a page
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
 from, and why: nothing is written then"""
 
-_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source")
+_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source")
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
-_LOOK_S = 0.2
-_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def _key(text: str) -> str:
@@ -110,7 +108,7 @@ def _key(text: str) -> str:
     {"corners by hand": (None, _BY_HAND)},
     jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
     jaw_source={"choices": ("fixed", "frames", "zenoh")},
-    port={"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (any free one) to 65535"), "default": 0},
+    port=PAGE_PORT,
 )  # fmt: skip
 def teach(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach``."""
@@ -169,7 +167,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach --page`` and ``--corners``."""
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
-    from gripmon.daemon.teaching import outline_session, page_session, read_inputs, teach_from_file
+    from gripmon.daemon.teaching import in_words, outline_session, page_session, read_inputs, teach_from_file
 
     images = arguments.image
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
@@ -187,15 +185,16 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
         return
     files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
     inputs = read_inputs(
-        images, command=command_line(arguments), **files, live=arguments.live, jaw_opening_m=arguments.jaw_opening,
-        jaw_source=arguments.jaw_source, robot=arguments.robot, camera_name=arguments.camera_name,
+        images, command=command_line(arguments), **files, live=arguments.live, source=arguments.source,
+        jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
+        robot=arguments.robot, camera_name=arguments.camera_name,
     )  # fmt: skip
     make_directory(inputs.folder)
     if arguments.page:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
-    print("\n".join(_table(found)))
+    print("\n".join(in_words(found)))
     saved = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
@@ -207,6 +206,8 @@ def _misuse(arguments: argparse.Namespace) -> str:
     images, page, config, live = arguments.image, arguments.page, arguments.config, arguments.live
     if page and arguments.corners is not None:
         return "--page and --corners are two ways of the same; one of them"
+    if arguments.source is not None and (live is not None or config is not None):
+        return "--source: --live or --config says where frames come from; leave it out"
     if live is not None and (images or not page):
         return "--live goes with --page, without images; image files otherwise"
     if arguments.live_wait is not None and live is None:
@@ -235,59 +236,15 @@ def _say(saved: Saved) -> None:
 
 def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> None:
     """Until the person is done."""
-    from gripmon.teach.page_server import PageServer
+    from gripmon.teach.page_server import TeachSite, serve
+
+    def look() -> None:
+        dark_s, why = session.dark()
+        if arguments.live_wait is not None and dark_s > arguments.live_wait:
+            raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
 
     try:
-        server = PageServer(session, arguments.port)
-    except OSError as error:
-        session.close()
-        wrong = f"can't be listened on ({error.strerror}); another one, or none"
-        raise InputError(f"--port {arguments.port}: {wrong}") from None
-    try:
-        print(f"teach on this page: {server.url}", flush=True)
-        print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
-        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
-        if not arguments.no_browser and displayed:
-            webbrowser.open(server.url)
-        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
-            dark_s, why = session.dark()
-            if arguments.live_wait is not None and dark_s > arguments.live_wait:
-                raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
+        announce, browser = announcer("teach"), not arguments.no_browser
+        serve(TeachSite(session), arguments.port, announce, open_browser=browser, look=look)
     finally:
-        server.close()
         session.close()
-
-
-def _table(found: Evaluation) -> list[str]:
-    """What was seen, for a person."""
-    snapped = found.snapped
-    width = max(len(corner.name) for corner in snapped.corners)
-    lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]
-    for corner in snapped.corners:
-        agree = "" if corner.inliers is None else f"{100.0 * corner.inliers:4.0f} %"
-        if corner.uv_px is None or corner.sigma_px is None:
-            lines.append(f"{corner.name:<{width}}  not measured: {corner.reason}")
-            continue
-        u, v = corner.uv_px.tolist()
-        lines.append(f"{corner.name:<{width}}  ({u:7.2f}, {v:7.2f})  {corner.sigma_px:7.3f}  {agree}")
-    if found.reference is not None and found.pose is not None:
-        sigmas = ", ".join(f"{1e3 * found.reference.covariance[k] ** 0.5:.3f}" for k in (0, 7, 14))
-        by = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
-        lines.append(f"reference by {by}, TCP to {sigmas} mm: less exact than with a plate (gripmon calibrate plane)")
-        if found.pose.rival:
-            rival = "another pose explains these corners as well; a corner outside of their plane would tell"
-            lines.append(f"note: {rival}")
-    expected = found.expected
-    if expected is not None:
-        lines.append(f"expected of a frame   {_axes(expected.sigma)}")
-        lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
-        lines.append(f"promise               {expected.promise}")
-    return lines
-
-
-def _axes(values: object) -> str:
-    import numpy as np
-
-    x, y, z, a, b, c = np.asarray(values, dtype=float).tolist()
-    turns = ", ".join(f"{math.degrees(v):.3f}" for v in (a, b, c))
-    return f"TCP x {1e3 * x:.3f}, y {1e3 * y:.3f}, z {1e3 * z:.3f} mm, turns {turns}°"

@@ -63,7 +63,9 @@ class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the page begins with.  ``corners_only``: there is no gripper, nothing snaps."""
+    """What the page begins with.  ``corners_only``: there is no gripper, nothing snaps; ``saves``: what can be saved;
+    ``back``: where the page goes when the person is done.
+    """
 
     version: str
     width_px: int
@@ -84,6 +86,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     folder: str
     files: dict[str, str]
     corners_only: bool = False
+    saves: tuple[str, ...] = ("config", "taught", "corners")
+    back: str | None = None
 
 
 class CornerReply(msgspec.Struct, frozen=True, kw_only=True):

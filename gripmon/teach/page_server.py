@@ -13,20 +13,24 @@ from __future__ import annotations
 import contextlib
 import importlib.resources
 import logging
+import os
 import secrets
+import sys
 import threading
+import webbrowser
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from socketserver import TCPServer
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
@@ -51,14 +55,13 @@ ADDRESS = "127.0.0.1"
 LONGEST_REQUEST = 1_000_000
 _SILENT_S = 30.0
 _TOKEN_BYTES = 24
-_FILES = {
-    "": ("index.html", "text/html; charset=utf-8"),
-    "style.css": ("style.css", "text/css; charset=utf-8"),
-    "icon.svg": ("icon.svg", "image/svg+xml"),
-    **{
-        name: (name, "text/javascript; charset=utf-8")
-        for name in ("main.js", "stage.js", "panel.js", "history.js", "server.js")
-    },
+_LOOK_S = 0.2
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
 }
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
@@ -71,13 +74,40 @@ _HEADERS = {
 }
 
 
-class PageServer:
-    """Serves one session until it is done.  OSError from the constructor if the port is taken."""
+Served = tuple[bytes, str]
+"""What is sent, and its media type."""
+Action = tuple[type[Any], Callable[[Any], object]]
+"""What a request's body has to be, and what answers it; :class:`BadRequest` from it is sent as one line."""
 
-    def __init__(self, session: TeachSession | OutlineSession, port: int = 0):
-        self._http = _Http(session, port)
+
+class Site(Protocol):
+    """What a server shows.  Paths are those below the token; both methods may be called from any thread."""
+
+    def get(self, path: str) -> Served | None:
+        """None: there is nothing at this address."""
+        ...
+
+    def post(self, path: str) -> Action | None:
+        """None: there is nothing at this address."""
+        ...
+
+
+def web_files(first: str, *names: str) -> dict[str, Served]:
+    """Files of the folder ``web`` by the path that they are served at; ``first`` at the root."""
+    folder = importlib.resources.files("gripmon.teach") / "web"
+    return {
+        "" if name == first else name: ((folder / name).read_bytes(), _KINDS[Path(name).suffix])
+        for name in (first, *names)
+    }
+
+
+class PageServer:
+    """Serves one site until it is done.  OSError from the constructor if the port is taken."""
+
+    def __init__(self, site: Site, port: int = 0):
+        self._http = _Http(site, port)
         self.done, self.port, self.url = self._http.done, self._http.server_port, self._http.url
-        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-teach-page")
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-page")
         self._thread.start()
 
     def close(self) -> None:
@@ -87,18 +117,43 @@ class PageServer:
         self._thread.join()
 
 
+def serve(
+    site: Site,
+    port: int,
+    announce: Callable[[str], object],
+    *,
+    open_browser: bool,
+    look: Callable[[], object] = lambda: None,
+) -> None:
+    """Serve it until the person is done.  ``announce`` hears its address; ``look`` is called now and then.
+
+    Raises :class:`~gripmon.model.errors.InputError` for a port that is taken.
+    """
+    try:
+        server = PageServer(site, port)
+    except OSError as error:
+        raise InputError(f"{port}: can't be listened on ({error.strerror}); another one, or none", "port") from None
+    try:
+        announce(server.url)
+        displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
+        if open_browser and displayed:
+            webbrowser.open(server.url)
+        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
+            look()
+    finally:
+        server.close()
+
+
 class _Http(ThreadingHTTPServer):
     """With what the handlers share."""
 
     daemon_threads = True
     request_queue_size = 32
 
-    def __init__(self, session: TeachSession | OutlineSession, port: int):
-        self.session, self.done = session, threading.Event()
+    def __init__(self, site: Site, port: int):
+        self.site, self.done = site, threading.Event()
         self.token = secrets.token_urlsafe(_TOKEN_BYTES)
         self.encode = msgspec.json.Encoder().encode
-        folder = importlib.resources.files("gripmon.teach") / "web"
-        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
         super().__init__((ADDRESS, port), _Handler)
         self.hosts = frozenset({f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"})
         self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
@@ -132,7 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         self._answer(self._post)
 
-    def _answer(self, act: Callable[[str], tuple[bytes, str]]) -> None:
+    def _answer(self, act: Callable[[str], Served]) -> None:
         """Every request ends with an answer in one line."""
         status, kind = HTTPStatus.OK, "application/json"
         try:
@@ -180,33 +235,21 @@ class _Handler(BaseHTTPRequestHandler):
         _, _, path = self.path.partition("/")
         token, slash, rest = path.partition("/")
         if not slash or not secrets.compare_digest(token.encode(), server.token.encode()):
-            raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon teach printed")
+            raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon printed")
         return rest
 
-    def _get(self, path: str) -> tuple[bytes, str]:
-        server, session = self.server, self.server.session
-        if path in server.files:
-            return server.files[path]
-        if path == "state":
-            return server.encode(session.state()), "application/json"
-        if path.partition("?")[0] == "live.jpg":
-            return session.live(), "image/jpeg"
-        number = path.removeprefix("image/").removesuffix(".png")
-        if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
-            return session.still(int(number)), "image/png"
-        raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
-
-    def _post(self, path: str) -> tuple[bytes, str]:
-        session = self.server.session
-        actions: dict[str, Callable[[], object]] = {
-            "look": lambda: session.look(self._body(Put)),
-            "take": lambda: self._body(Nothing) and session.take(),
-            "save": lambda: session.save(self._body(SaveOrder)),
-            "done": lambda: self._end(self._body(Nothing)),
-        }
-        if path not in actions:
+    def _get(self, path: str) -> Served:
+        found = self.server.site.get(path)
+        if found is None:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
-        return self.server.encode(actions[path]()), "application/json"
+        return found
+
+    def _post(self, path: str) -> Served:
+        action = (Nothing, self._end) if path == "done" else self.server.site.post(path)
+        if action is None:
+            raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+        kind, act = action
+        return self.server.encode(act(self._body(kind))), "application/json"
 
     def _end(self, _order: Nothing) -> None:
         """The process ends once this has been answered."""
@@ -227,6 +270,43 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """The token stands in every address: nothing of it goes to a log."""
+
+
+class TeachSite:
+    """The teaching page on one session.  ``back``: where the page goes when the person is done, None: nowhere;
+    ``saves``: which files it offers, None: all.
+    """
+
+    def __init__(
+        self, session: TeachSession | OutlineSession, back: str | None = None, saves: tuple[str, ...] | None = None
+    ):
+        self._session, self._back, self._saves = session, back, saves
+        self._files = web_files(
+            "index.html", "style.css", "icon.svg", "main.js", "stage.js", "panel.js", "history.js", "server.js"
+        )
+
+    def get(self, path: str) -> Served | None:
+        if path in self._files:
+            return self._files[path]
+        if path == "state":
+            state = self._session.state()
+            state = msgspec.structs.replace(state, back=self._back, saves=self._saves or state.saves)
+            return msgspec.json.encode(state), "application/json"
+        if path.partition("?")[0] == "live.jpg":
+            return self._session.live(), "image/jpeg"
+        number = path.removeprefix("image/").removesuffix(".png")
+        if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
+            return self._session.still(int(number)), "image/png"
+        return None
+
+    def post(self, path: str) -> Action | None:
+        session = self._session
+        actions: dict[str, Action] = {
+            "look": (Put, session.look),
+            "take": (Nothing, lambda _: session.take()),
+            "save": (SaveOrder, session.save),
+        }
+        return actions.get(path)
 
 
 _NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)

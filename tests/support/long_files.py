@@ -14,6 +14,8 @@ LONGEST = (
     "test_killed",
     "test_whole_way",
     "test_first_run",
+    "test_setup_page",
+    "test_setup",
     "test_replay_recording",
     "test_plane",
     "test_sampling",

@@ -35,10 +35,10 @@ class Page:
 
 
 @contextmanager
-def page(*arguments: object) -> Iterator[Page]:
+def page(*arguments: object, command: tuple[str, ...] = ("teach", "--page")) -> Iterator[Page]:
     """The command, until the context ends."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "gripmon", "teach", "--page", "--no-browser", *map(str, arguments)],
+        [sys.executable, "-m", "gripmon", *command, "--no-browser", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -21,11 +22,12 @@ from gripmon.daemon.config.checks import covariance_of, predict_view, reference_
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import read_settings, read_yaml
-from gripmon.io.sources import FolderSettings, LiveSettings
+from gripmon.daemon.teaching.source import named_source
+from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import ReferenceRecord, to_json
+from gripmon.model.records import ReferenceRecord, Transform, to_json
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_any, read_picture
 from gripmon.teach.corner_pose import CameraError, corners_fault
@@ -46,7 +48,7 @@ class Inputs:
     pictures: tuple[Picture, ...]
     gripper_path: Path
     folder: Path
-    source: FolderSettings | LiveSettings | None
+    source: SourceSettings | None
     config: Config | None
     robot: str
     camera_name: str
@@ -66,6 +68,7 @@ def read_inputs(
     gripper: Path | None = None,
     reference: Path | None = None,
     live: str | None = None,
+    source: str | None = None,
     jaw_opening_m: float | None = None,
     jaw_source: str | None = None,
     robot: str | None = None,
@@ -73,7 +76,7 @@ def read_inputs(
 ) -> Inputs:
     """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what
     is to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of
-    images.
+    images, ``source`` where the configuration's frames come from (None: that camera, or the images' folder).
     """
     cv2.setNumThreads(1)
     given = None
@@ -91,14 +94,23 @@ def read_inputs(
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = setup.settings.bit_depth
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
-    source = live_settings(live, setup.camera) if live is not None else FolderSettings(path=str(images[0].parent))
+    frames: SourceSettings
+    try:
+        if live is not None:
+            frames = live_settings(live, setup.camera)
+        elif source is not None:
+            frames = named_source(source, (setup.camera.width_px, setup.camera.height_px))
+        else:
+            frames = FolderSettings(path=str(images[0].parent))
+    except SourceError as error:
+        raise InputError(str(error), "source") from None
     calibrations = {"camera": camera, "reference": reference}
     return Inputs(
         setup=setup,
         pictures=pictures,
         gripper_path=gripper_path,
         folder=out or (Path() if given is None else given.directory),
-        source=source if given is None else None,
+        source=frames if given is None else None,
         config=given,
         robot=robot or ROBOT,
         camera_name=camera_name or CAMERA_NAME,
@@ -162,7 +174,11 @@ def _calibrations(
     lens, error = (None, None) if camera_path is None else _read_lens(camera_path)
     reference = None
     if reference_path is not None:
-        lens, reference = _hand_eye(reference_path, lens, gripper)
+        values = read_yaml(reference_path)
+        if lens is not None and "cam_T_grip" in values and "schema" not in values:
+            reference = _section(reference_path, values)
+        else:
+            lens, reference = _hand_eye(reference_path, lens, gripper)
     if lens is None:
         right = "a file of gripmon calibrate intrinsics, or a configuration"
         raise InputError(f"is missing; {right}", "camera")
@@ -198,6 +214,14 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
     digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
     name = f"config-{digest}"  # as the configuration that names the file will call it
     return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
+
+
+def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
+    """A reference as a configuration has it, in a file by itself: a robot's own hand/eye calibration."""
+    settings = read_settings(path, ReferenceSettings, values)
+    transform = Transform(settings.cam_T_grip.translation_m, settings.cam_T_grip.rotation_xyzw)
+    digest = hashlib.sha256(to_json(transform)).hexdigest()[:8]
+    return ReferenceRecord(f"config-{digest}", 0, 0, "configuration", transform, covariance_of(settings))
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:

@@ -187,7 +187,7 @@ async function save() {
   try {
     result = await post("save", {
       put: put(), robot: $("#robot").value, camera_name: $("#camera").value, replace: asking,
-      config: $("#save-config").checked, taught: $("#save-taught").checked, corners: $("#save-corners").checked,
+      ...Object.fromEntries(["config", "taught", "corners"].map((kind) => [kind, state.saves.includes(kind) && $(`#save-${kind}`).checked])),
     });
   } catch (error) { result = { error: error.message }; }
   busy = false;
@@ -199,7 +199,7 @@ async function save() {
 }
 
 async function done() {
-  try { await post("done", {}); ended = true; panel.over(); } catch (error) { panel.status(error.message, "bad"); }
+  try { await post("done", {}); ended = true; if (state.back) location.assign(state.back); else panel.over(); } catch (error) { panel.status(error.message, "bad"); }
 }
 
 function connect() {

@@ -23,11 +23,12 @@ export function begin(state) {
   $("#subject").title = state.reference ? `reference ${state.reference}` : "no reference yet: the corners give one";
   $("#robot").value = state.robot;
   $("#camera").value = state.camera_name;
-  $("#names").hidden = state.fixed_names;
+  $("#names").hidden = state.fixed_names || !state.saves.includes("config");
   for (const kind of ["config", "taught", "corners"]) {
     const code = $(`#save-${kind}`).parentElement.querySelector("code");
     code.textContent = basename(state.files[kind]);
     code.title = state.files[kind];
+    code.closest("label").hidden = !state.saves.includes(kind);
   }
   $("#folder").textContent = `\u200e${state.folder}`; // cut at its beginning, but read from left to right
   $("#folder").title = state.folder;

@@ -9,7 +9,7 @@ async function answer(response) {
 
 async function reach(path, options) {
   try { return await fetch(path, { ...options, cache: "no-store", credentials: "omit", redirect: "error" }); }
-  catch { throw new Error("gripmon teach doesn't answer: it has ended"); }
+  catch { throw new Error("gripmon doesn't answer: it has ended"); }
 }
 
 export const get = async (path) => (await answer(await reach(path, {}))).json();

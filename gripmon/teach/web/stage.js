@@ -157,6 +157,10 @@ export class Stage {
       [g.dataset.u, g.dataset.v] = here.map((v) => v.toFixed(4));
       const [x, y] = this.toStage(here);
       g.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
+      // Near the right border its name stands on the left.
+      const text = g.lastElementChild, before = x + 24 + 7 * name.length > this.root.clientWidth;
+      text.setAttribute("x", before ? -13 : 13);
+      text.setAttribute("text-anchor", before ? "end" : "start");
     }
   }
 

@@ -1,0 +1,346 @@
+"""A folder in which a monitor is set up: what was said so far, which steps are done, and the steps themselves.
+
+A step that computes runs the very command that it names, in this folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from gripmon.calibrate.target_print import print_target
+from gripmon.daemon.config import read_gripper
+from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.setup import steps
+from gripmon.daemon.setup.capture import Capture
+from gripmon.daemon.setup.robot_file import reference_text
+from gripmon.daemon.setup.steps import STEPS, Step, needed, target_in, written
+from gripmon.daemon.teaching.source import open_named
+from gripmon.io.sources import Source, Waiting
+from gripmon.io.wire.session import check_name
+from gripmon.model.atomic import writable_folder, write_atomically
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.images import IMAGE_SUFFIXES
+from gripmon.model.targets import name_of, parse_target
+
+SETUP = "setup.yaml"
+_FIRST_FRAME_S = 20
+"""Half-second answers of a source that a camera has to show something: network cameras take ten seconds to connect."""
+Progress = Literal["done", "stale", "ready", "waits", "skipped"]
+Level = Literal["", "OK", "WARN", "FAIL"]
+
+
+class Line(msgspec.Struct, frozen=True):
+    """What a step said."""
+
+    text: str
+    level: Level = ""
+
+
+class StepState(msgspec.Struct, frozen=True, kw_only=True):
+    """``progress`` "stale": something that it was made from is newer; ``note`` why it isn't done, in words."""
+
+    name: str
+    progress: Progress
+    note: str
+    command: str
+    files: tuple[str, ...]
+
+
+class Project:
+    """The project in a ``folder``, which is made if it is missing, and is this process's working directory.
+
+    Raises :class:`~gripmon.model.errors.InputError` where it can't be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = writable_folder(folder).resolve()
+        self.values, self._accepted = steps.defaults(), {}
+        path = self.folder / SETUP
+        if path.exists():
+            kept = read_yaml(path)
+            self.values |= _texts(path, kept, "values")
+            self._accepted = _texts(path, kept, "accepted")
+
+    def keep(self, values: Mapping[str, str]) -> None:
+        """Remember what a person has said, also where it turns out wrong.  Raises :class:`InputError`."""
+        for name in values:
+            if name not in steps.defaults():
+                raise InputError(f"there is no field {name}")
+        self.values |= {name: text.strip() for name, text in values.items()}
+        self._write()
+
+    def states(self) -> tuple[StepState, ...]:
+        """Of all steps, in their order."""
+        return tuple(self._state(step) for step in STEPS)
+
+    def capture(self, step: str) -> Capture:
+        """For one of the steps that take images.  Raises :class:`InputError`."""
+        return Capture(self.folder / step, None if step == "teaching" else target_in(self.values))
+
+    def open_camera(self, step: str) -> Source:
+        """What a step's images come from.  Raises :class:`InputError`."""
+        text = self.values.get(f"{step}_source") or self.values["source"]
+        if not text:
+            raise InputError("no camera is named; step 1, or a folder with images")
+        return open_named(text, self.values["robot"], self.values["camera_name"])
+
+    def do(self, name: str) -> list[Line]:
+        """Carry a step out; what it said.  Raises :class:`InputError` and :class:`NoResultError`, one line."""
+        step = next(each for each in STEPS if each.name == name)
+        state = self._state(step)
+        if state.progress == "waits":
+            raise InputError(state.note)
+        if name in ("camera", "target", "gripper", "standing", "reference"):
+            lines = {
+                "camera": self._camera, "target": self._target, "gripper": self._gripper,
+                "standing": self._reference_by, "reference": self._reference,
+            }[name]()  # fmt: skip
+            if lines is not None:
+                return lines
+        words = step.command(self.values)
+        if words is None:
+            return [Line("nothing to do")]
+        if name == "check":
+            return self._check(words)
+        if name == "intrinsics" and self.values["intrinsics_by"] == steps.FROM_FILE:
+            return self._camera_file(words)
+        return self._command(words)
+
+    def do_here(self, name: str, note: Callable[[str], object]) -> list[Line]:
+        """The same of a person at a terminal: images are taken by themselves, ``note`` hears what becomes of each."""
+        step = next((each for each in STEPS if each.name == name), None)
+        if step is None:
+            names = ", ".join(each.name for each in STEPS)
+            raise InputError(f"{name}: is no step; one of {names}", "step")
+        if step.kind in ("page", "run"):
+            raise InputError(f"{name}: has a command of its own; {self._state(step).command}", "step")
+        if step.kind == "form":
+            return self.do(name)
+        capture = self.capture(name)
+        capture.start(self.open_camera(name))
+        capture.by_itself(True)
+        try:
+            for text in capture.notes():
+                note(text)
+        finally:
+            capture.stop()
+        return [Line(f"{len(capture.images())} images in {name}", "OK")]
+
+    def _state(self, step: Step) -> StepState:
+        try:
+            words = step.command(self.values)
+        except InputError as error:
+            return StepState(name=step.name, progress="waits", note=str(error), command="", files=())
+        files = written(step, self.values)
+        command = shlex.join(words or [])
+        if step.name == "teach":
+            command = command.replace("'teaching/*.png'", "teaching/*.png")
+        progress, note = self._progress(step, files, needs_doing=words is not None)
+        if step.picture is not None:
+            files = (*files, step.picture)
+        present = tuple(name for name in files if (self.folder / name).exists())
+        return StepState(name=step.name, progress=progress, note=note, command=command, files=present)
+
+    def _progress(self, step: Step, files: tuple[str, ...], *, needs_doing: bool) -> tuple[Progress, str]:
+        if step.name in ("camera", "target"):
+            done = self._accepted.get(step.name) == self._said(step)
+            return ("done", "") if done else ("ready", "")
+        if not needs_doing:
+            inferred = step.name == "gripper" and self._there("gripper.yaml")
+            return "done" if inferred else "skipped", self._why_skipped(step)
+        for name in needed(step, self.values):
+            if not self._there(name):
+                return "waits", f"first: {self._maker(name)} ({name})"
+        if step.kind == "capture":
+            count = self._count(step.name)
+            return ("done" if count else "ready"), f"{count} image{'' if count == 1 else 's'}"
+        if not all(self._there(name) for name in files):
+            return "ready", ""
+        made = min(self._made_ns(name) for name in files)
+        newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
+        # What was inferred together with the hand/eye calibration is as old as that.
+        newer = [name for name in newer if name not in files]
+        if step.name == "intrinsics" and self.values["intrinsics_by"] != steps.FROM_FILE and not newer:
+            made_with, now = read_yaml(self.folder / "camera.yaml").get("target"), name_of(target_in(self.values))
+            if made_with != now:
+                return "stale", f"made with {made_with}, and the target is {now}: do this again"
+        return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
+
+    def _why_skipped(self, step: Step) -> str:
+        if step.name == "gripper":
+            return "comes with hand and eye"
+        return f"reference: {self.values['reference_by']}"
+
+    def _there(self, name: str) -> bool:
+        path = self.folder / name
+        return self._count(name) > 0 if path.is_dir() else path.exists()
+
+    def _made_ns(self, name: str) -> int:
+        """When a file was written; of a folder its newest image."""
+        path = self.folder / name
+        each = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES] if path.is_dir() else []
+        return max((p.stat().st_mtime_ns for p in each), default=path.stat().st_mtime_ns)
+
+    def _count(self, folder: str) -> int:
+        path = self.folder / folder
+        if folder == "run":
+            return int(path.is_dir())
+        return sum(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir()) if path.is_dir() else 0
+
+    def _maker(self, name: str) -> str:
+        """The step that writes a file."""
+        inferred = name == "gripper.yaml" and self.values["gripper"] == steps.INFERRED
+        makers = [step for step in STEPS if name in written(step, self.values)]
+        return makers[-1 if inferred else 0].title
+
+    def _said(self, step: Step) -> str:
+        return "|".join(self.values[field.name] for field in step.fields)
+
+    def _accept(self, name: str) -> None:
+        self._accepted[name] = self._said(next(step for step in STEPS if step.name == name))
+        self._write()
+
+    def _write(self) -> None:
+        text = "# Written by gripmon setup: what was said on its page, and what of it was tried out.\n" + as_yaml(
+            {"values": self.values, "accepted": self._accepted}
+        )
+        path = self.folder / SETUP
+        try:
+            write_atomically(path, text.encode())
+        except OSError as error:
+            raise InputError(f"{path}: can't be written ({error.strerror or error})") from None
+
+    def _camera(self) -> list[Line]:
+        for role in ("robot", "camera_name"):
+            try:
+                check_name(role.replace("_name", ""), self.values[role])
+            except ValueError as error:
+                raise InputError(str(error)) from None
+        source = self.open_camera("camera")
+        why = "no image came"
+        try:
+            for _ in range(_FIRST_FRAME_S):
+                frame = source.read()
+                if frame is None:
+                    break
+                if isinstance(frame, Waiting):
+                    why = frame.reason
+                elif frame.image is None:
+                    why = frame.fault or "not an image"
+                else:
+                    height, width = frame.image.shape[:2]
+                    self._accept("camera")
+                    return [Line(f"{width} x {height} px, {8 * frame.image.itemsize} bits", "OK")]
+        finally:
+            source.close()
+        raise NoResultError(f"{self.values['source']}: {why}; a camera that delivers, or a folder with images")
+
+    def _target(self) -> list[Line]:
+        target, lines = parse_target(self.values["target"]), []
+        if self.values["have"] == steps.PRINT_IT:
+            bar_mm = print_target(target, self.values["paper"]).bar_mm
+            self.values["bar_mm"] = f"{bar_mm:g}"
+            lines = self._command(STEPS[1].command(self.values) or [])
+        else:
+            self.values["bar_mm"] = ""
+        lines.append(Line(f"the target is {name_of(target_in(self.values))}", "OK"))
+        self._accept("target")
+        return lines
+
+    def _gripper(self) -> list[Line] | None:
+        words = STEPS[4].command(self.values)
+        if words is None:
+            return [Line("it comes out of the step Hand and eye", "OK")]
+        if words[0] != "cp":
+            return None
+        path = Path(words[1])
+        if not words[1] or not path.is_file():
+            raise InputError(f"{words[1] or 'the file'}: there is no such file; a gripper file such as the library's")
+        gripper = read_gripper(path)
+        write_atomically(self.folder / "gripper.yaml", path.read_bytes())
+        return [Line(f"{gripper.name}: {len(gripper.corner_ids)} corners, {len(gripper.edge_ids)} edges", "OK")]
+
+    def _reference_by(self) -> list[Line]:
+        by = self.values["reference_by"]
+        if by != steps.ON_PLATE and self.values["gripper"] == steps.INFERRED:
+            raise InputError("a gripper that is inferred needs its images on the target; these, or another gripper")
+        if by == steps.BY_IMAGES and self.values["gripper"] != steps.FROM_IMAGES:
+            raise InputError("no images gave this gripper; another reference")
+        return [Line(f"reference: {by}", "OK")]
+
+    def _reference(self) -> list[Line] | None:
+        if self.values["reference_by"] != steps.FROM_FILE:
+            return None
+        path = Path(self.values["reference_file"])
+        text, said = reference_text(path)
+        write_atomically(self.folder / "hand_eye.yaml", text)
+        return [Line(said, "OK")]
+
+    def _camera_file(self, words: list[str]) -> list[Line]:
+        """Of gripmon as it stands, of another program by import."""
+        path = Path(self.values["camera_file"])
+        if not self.values["camera_file"] or not path.is_file():
+            raise InputError(
+                f"{self.values['camera_file'] or 'the file'}: there is no such file; a calibrated camera's"
+            )
+        own = b"gripmon.camera_calibration/" in path.read_bytes()[:4096]
+        if not own:
+            return self._command(words)
+        camera = read_camera(path).camera
+        write_atomically(self.folder / "camera.yaml", path.read_bytes())
+        return [Line(f"{camera.width_px} x {camera.height_px} px", "OK")]
+
+    def _check(self, words: list[str]) -> list[Line]:
+        done = self._run([*words, "--json"])
+        try:
+            found = msgspec.json.decode(done.stdout)["findings"]
+        except (msgspec.DecodeError, KeyError):
+            raise NoResultError(_last(done.stderr) or "gripmon check said nothing") from None
+        write_atomically(self.folder / "check.json", done.stdout.encode())
+        return _findings(found)
+
+    def checked(self) -> list[Line]:
+        """What the last forecast said; empty if there is none."""
+        with contextlib.suppress(OSError, msgspec.DecodeError, KeyError):
+            return _findings(msgspec.json.decode((self.folder / "check.json").read_bytes())["findings"])
+        return []
+
+    def _command(self, words: list[str]) -> list[Line]:
+        done = self._run(words)
+        if done.returncode != 0:
+            raise NoResultError(_last(done.stderr) or f"{shlex.join(words)} ended with {done.returncode}")
+        lines = [Line(text) for text in done.stdout.splitlines()]
+        return [*lines, *(Line(text, "WARN") for text in done.stderr.splitlines())]
+
+    def _run(self, words: list[str]) -> subprocess.CompletedProcess[str]:
+        assert words[0] == "gripmon"
+        return subprocess.run(
+            [sys.executable, "-m", *words], cwd=self.folder, capture_output=True, text=True, check=False,
+            stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+
+
+def _findings(found: list[dict[str, str]]) -> list[Line]:
+    return [Line(f"{each['about']}: {each['text']}", each["level"]) for each in found]  # type: ignore[arg-type]
+
+
+def _last(text: str) -> str:
+    """The line that says it, in an error output."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    return lines[-1].removeprefix("gripmon: ") if lines else ""
+
+
+def _texts(path: Path, kept: Mapping[str, object], key: str) -> dict[str, str]:
+    found = kept.get(key, {})
+    if not isinstance(found, dict) or not all(isinstance(text, str) for pair in found.items() for text in pair):
+        raise InputError(f"{path}: {key}: isn't a table of texts; what gripmon setup writes, or delete the file")
+    return dict(found)

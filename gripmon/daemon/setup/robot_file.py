@@ -1,0 +1,62 @@
+"""The hand/eye calibration that a robot already has, as a file that teaching takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from gripmon import __version__
+from gripmon.daemon.config.calibrated import read_hand_eye
+from gripmon.daemon.config.checks import reference_transform
+from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
+from gripmon.daemon.config.typed import SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record, invert, to_record
+from gripmon.model.records import Array, Transform
+
+_RIGHT = (
+    "a file of gripmon calibrate plane, or cam_T_grip: {translation_m: [x, y, z], rotation_xyzw: [x, y, z, w]}, or "
+    "flange_T_cam and flange_T_tcp of that form"
+)
+_FLANGE = ("flange_T_cam", "flange_T_tcp")
+
+
+def reference_text(path: Path) -> tuple[bytes, str]:
+    """The file's content as ``gripmon teach --reference`` takes it, and what it holds, in words.
+
+    ``cam_T_grip`` is ``inverse(flange_T_cam) flange_T_tcp``; ``position_sigma_m`` and ``rotation_sigma_rad`` may stand
+    beside.  Raises :class:`~gripmon.model.errors.InputError`.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; {_RIGHT}")
+    values = read_yaml(path)
+    if "schema" in values:
+        read_hand_eye(path)
+        return path.read_bytes(), "a file of gripmon calibrate plane"
+    if all(name in values for name in _FLANGE):
+        flange_T_cam, flange_T_tcp = (_transform(path, values.pop(name), name) for name in _FLANGE)
+        made = to_record(invert(flange_T_cam) @ flange_T_tcp)
+        values["cam_T_grip"] = {"translation_m": list(made.translation_m), "rotation_xyzw": list(made.rotation_xyzw)}
+    elif "cam_T_grip" not in values:
+        raise InputError(f"{path}: holds no hand/eye calibration; {_RIGHT}")
+    try:
+        settings = to_settings(values, ReferenceSettings, "")
+        reference_transform(settings)
+    except SettingsError as error:
+        raise InputError(f"{path}: {error.fault.key}: {error.fault.wrong}; {error.fault.right}") from None
+    x, y, z = (1e3 * v for v in settings.cam_T_grip.translation_m)
+    text = f"# {path.name}, by gripmon setup (gripmon {__version__})\n{as_yaml(msgspec.to_builtins(settings))}"
+    return text.encode(), f"TCP at {x:.1f}, {y:.1f}, {z:.1f} mm before the camera"
+
+
+def _transform(path: Path, value: object, key: str) -> Array:
+    try:
+        found = to_settings(value, TransformSettings, key)
+        alone = ReferenceSettings(cam_T_grip=msgspec.structs.replace(found, translation_m=(0.0, 0.0, 0.1)))
+        reference_transform(alone)  # whether its rotation is one; where it is says nothing about the camera
+    except SettingsError as error:
+        wrong = error.fault.key.replace("reference.cam_T_grip", key)
+        raise InputError(f"{path}: {wrong}: {error.fault.wrong}; {error.fault.right}") from None
+    return from_record(Transform(found.translation_m, found.rotation_xyzw))

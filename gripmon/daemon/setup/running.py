@@ -1,0 +1,182 @@
+"""The monitor as a process of its own, and what it sees: ``gripmon run`` on the configuration that was written."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from gripmon.client import Ambiguous, Client, NotCarriedOut
+from gripmon.daemon.config import Config, load_config
+from gripmon.io.sources import FolderSettings
+from gripmon.io.wire import PublishError
+from gripmon.model.geometry import from_record
+from gripmon.model.images import read_image
+from gripmon.model.records import FrameRecord, Image
+from gripmon.teach.drawing import Canvas, Colour
+from gripmon.teach.messages import BadRequest
+from gripmon.teach.snapping import outlines_px
+
+_LINES = 200
+_ASK_EVERY_S, _ANSWER_S, _ENDS_S = 0.2, 2.0, 20.0
+_STAMP = re.compile(r"^\d{4}-\d\d-\d\d \S+ ")
+_OWN_QUESTIONS = "command snapshot: done"
+_OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
+_LOST: Colour = (80, 80, 255)
+_CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
+_ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor has this name", 130: "stopped"}
+
+
+class Seen(msgspec.Struct, frozen=True, kw_only=True):
+    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest answer; ``shown`` counts the pictures; ``lines``
+    of its log, the newest last; ``ended``: how it did, None while it runs or was never started.
+    """
+
+    running: bool
+    ended: str | None
+    verdict: str | None
+    state: str | None
+    reason: str | None
+    frame: int | None
+    bound: str | None
+    shown: int
+    lines: tuple[str, ...]
+
+
+class MonitorProcess:
+    """At most one at a time; it is asked for its newest frame as ``gripmon send snapshot`` does."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._process: subprocess.Popen[str] | None = None
+        self._threads: list[threading.Thread] = []
+        self._lines: deque[str] = deque(maxlen=_LINES)
+        self._record: FrameRecord | None = None
+        self._picture: bytes | None = None
+        self._shown = 0
+
+    def start(self) -> None:
+        """Raises :class:`BadRequest` while one runs, and :class:`~gripmon.model.errors.InputError` for a configuration
+        that can't be.
+        """
+        if self.running:
+            raise BadRequest("the monitor runs already")
+        config = load_config(self._folder / "config.yaml")
+        self._lines.clear()
+        self._record = self._picture = None
+        words = [sys.executable, "-m", "gripmon", "run", "config.yaml", "--out", "run"]
+        self._process = subprocess.Popen(
+            words, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            text=True, errors="replace",
+        )  # fmt: skip
+        each = ((self._listen, (self._process,)), (self._ask, (self._process, config)))
+        self._threads = [threading.Thread(target=run, args=arguments, daemon=True) for run, arguments in each]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    def stop(self) -> None:
+        """As Ctrl-C does; may be called twice."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(_ENDS_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        for thread in self._threads:
+            thread.join(_ANSWER_S + 1.0)
+
+    def seen(self) -> Seen:
+        """For the page."""
+        process, record = self._process, self._record
+        code = None if process is None else process.poll()
+        bound = None if record is None else record.protection
+        return Seen(
+            running=process is not None and code is None,
+            ended=None if code is None else _ENDED.get(code, f"ended with exit code {code}"),
+            verdict=None if record is None else record.verdict.value,
+            state=None if record is None else record.state.value,
+            reason=None if record is None else record.reason,
+            frame=None if record is None else record.seq,
+            bound=None if bound is None else f"{1e3 * bound.position_m:.2f} mm",
+            shown=self._shown,
+            lines=tuple(self._lines),
+        )
+
+    def picture(self) -> bytes:
+        """JPEG of the newest image with what was measured in it.  Raises :class:`BadRequest`."""
+        if self._picture is None:
+            raise BadRequest("the monitor has shown nothing yet")
+        return self._picture
+
+    def _listen(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if _OWN_QUESTIONS not in line:
+                self._lines.append(_STAMP.sub("", line.rstrip()))
+
+    def _ask(self, process: subprocess.Popen[str], config: Config) -> None:
+        settings = config.settings
+        where = settings.publish.listen or settings.publish.connect
+        try:
+            client = Client(settings.robot, settings.camera_name, connect=where)
+        except (PublishError, ValueError) as error:
+            self._lines.append(f"no picture: {error}")
+            return
+        with client:
+            while process.poll() is None:
+                try:
+                    reply, data = client.snapshot(_ANSWER_S)
+                except (NotCarriedOut, Ambiguous):
+                    reply, data = None, None  # it starts, or ends
+                if reply is not None and reply.snapshot is not None:
+                    self._record = reply.snapshot.record
+                    image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+                    if image is not None:
+                        self._picture = overlay(config, reply.snapshot.record, np.asarray(image))
+                        self._shown += 1
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_ASK_EVERY_S)
+        self._last_line(config)
+
+    def _last_line(self, config: Config) -> None:
+        """A folder may end before anybody has asked: the last frame's line, with the folder's own image."""
+        source = config.settings.source
+        with contextlib.suppress(OSError, msgspec.MsgspecError, IndexError):
+            lines = (self._folder / "run" / "estimates.jsonl").read_bytes().splitlines()
+            record = msgspec.json.decode(lines[-1], type=FrameRecord)
+            self._record = record
+            if isinstance(source, FolderSettings) and record.name is not None:
+                image, _ = read_image(config.directory / source.path / record.name)
+                if image is not None:
+                    self._picture = overlay(config, record, image)
+                    self._shown += 1
+
+
+def overlay(config: Config, record: FrameRecord, image: Image) -> bytes:
+    """JPEG: the gripper's visible edges where the transform has them, green if it is valid, orange if suspect, and the
+    corners, yellow where they were used.
+    """
+    canvas = Canvas(image, max(1, round(1000 / image.shape[1])))
+    gripper, camera = config.gripper, config.camera
+    if record.cam_T_grip is not None:
+        cam_T_grip, opening_m = from_record(record.cam_T_grip), record.jaw_opening_m if gripper.has_jaw else None
+        for uv_px in outlines_px(camera, gripper, cam_T_grip, opening_m, 33).values():
+            canvas.line(uv_px, _OUTLINE.get(record.verdict.value, _LOST), 2)
+    for corner in record.corners:
+        if corner.uv_px is not None:
+            canvas.circle(np.array(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)
+    return bytes(cv2.imencode(".jpg", canvas.picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes())

@@ -1,0 +1,311 @@
+"""The page of ``gripmon setup``: requests to steps, and what the page shows."""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gripmon import __version__
+from gripmon.daemon.setup import steps
+from gripmon.daemon.setup.capture import Capture, Captured
+from gripmon.daemon.setup.project import Line, Project, StepState
+from gripmon.daemon.setup.running import MonitorProcess, Seen
+from gripmon.daemon.setup.steps import STEPS, grippers
+from gripmon.daemon.teaching import outline_session, page_session, read_inputs
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.teach.messages import BadRequest, Nothing, Request
+from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite, web_files
+from gripmon.teach.session import TeachSession
+
+_Name = Annotated[str, Meta(max_length=40)]
+_Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
+_PICTURES = {
+    "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png", "target.pdf": "application/pdf"
+}  # fmt: skip
+
+
+class Do(Request, frozen=True):
+    """A step to be carried out with what stands in its fields."""
+
+    step: _Name
+    values: _Said = msgspec.field(default_factory=dict)
+
+
+class CaptureOrder(Request, frozen=True):
+    """``take`` what is shown, ``next`` of a folder, ``drop`` the image ``name``."""
+
+    step: _Name
+    action: Literal["start", "stop", "by_itself", "by_hand", "take", "next", "drop"]
+    values: _Said = msgspec.field(default_factory=dict)
+    name: Annotated[str, Meta(max_length=200)] = ""
+
+
+class FieldState(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    label: str
+    value: str
+    hint: str
+    choices: tuple[str, ...]
+    only: tuple[str, tuple[str, ...]] | None
+
+
+class StepCard(msgspec.Struct, frozen=True, kw_only=True):
+    """What doesn't change of a step, and what does; ``said``: lines of the last time; ``error``: why it failed."""
+
+    title: str
+    about: str
+    kind: str
+    button: str
+    picture: str | None
+    fields: tuple[FieldState, ...]
+    state: StepState
+    said: tuple[Line, ...]
+    error: str
+
+
+class SetupState(msgspec.Struct, frozen=True, kw_only=True):
+    """``busy``: the step that is being carried out; ``capture``: of the step whose camera runs, or ran last."""
+
+    version: str
+    folder: str
+    busy: str | None
+    steps: tuple[StepCard, ...]
+    capturing: str | None
+    capture: Captured | None
+    monitor: Seen
+
+
+class SetupSite:
+    """Shows one project; a teaching page is below ``page/`` while one is open."""
+
+    def __init__(self, project: Project) -> None:
+        self._project = project
+        self._files = web_files("setup.html", "style.css", "setup.css", "icon.svg", "setup.js", "server.js")
+        self._lock = threading.Lock()
+        self._busy: str | None = None
+        self._said: dict[str, tuple[Line, ...]] = {"check": tuple(project.checked())}
+        self._errors: dict[str, str] = {}
+        self._capture: tuple[str, Capture] | None = None
+        self._page: tuple[TeachSite, TeachSession | OutlineSession] | None = None
+        self._monitor = MonitorProcess(project.folder)
+        self._more = _founders()
+
+    def close(self) -> None:
+        """Let go of the camera, and stop the monitor that was started here."""
+        self._let_go()
+        self._close_page()
+        self._monitor.stop()
+
+    def get(self, path: str) -> Served | None:
+        path, _, _ = path.partition("?")
+        if path in self._files:
+            return self._files[path]
+        page = self._page
+        if path.startswith("page/") and page is not None:
+            return page[0].get(path.removeprefix("page/"))
+        if path == "state":
+            return msgspec.json.encode(self.state()), "application/json"
+        if path == "live.jpg" and self._capture is not None:
+            return self._capture[1].preview(), "image/jpeg"
+        if path == "monitor.jpg":
+            return self._monitor.picture(), "image/jpeg"
+        name = path.removeprefix("file/")
+        if path == f"file/{name}" and name in _PICTURES and (self._project.folder / name).is_file():
+            return (self._project.folder / name).read_bytes(), _PICTURES[name]
+        return None
+
+    def post(self, path: str) -> Action | None:
+        page = self._page
+        if path == "page/done":
+            return Nothing, lambda _: self._close_page()
+        if path.startswith("page/"):
+            return None if page is None else page[0].post(path.removeprefix("page/"))
+        actions: dict[str, Action] = {
+            "do": (Do, self._do),
+            "capture": (CaptureOrder, self._captured),
+            "open": (Do, self._open),
+            "start": (Nothing, lambda _: self._start()),
+            "stop": (Nothing, lambda _: self._monitor.stop()),
+        }
+        return actions.get(path)
+
+    def state(self) -> SetupState:
+        """All that the page shows."""
+        capturing = self._capture
+        states = self._project.states()
+        return SetupState(
+            version=__version__,
+            folder=str(self._project.folder),
+            busy=self._busy,
+            steps=tuple(self._card(step, state) for step, state in zip(STEPS, states, strict=True)),
+            capturing=None if capturing is None else capturing[0],
+            capture=None if capturing is None else capturing[1].state(),
+            monitor=self._monitor.seen(),
+        )
+
+    def _card(self, step: steps.Step, state: StepState) -> StepCard:
+        values = self._project.values
+        fields = tuple(
+            FieldState(
+                name=field.name, label=field.label, value=values[field.name], hint=field.hint,
+                choices=self._choices(field), only=field.only,
+            )
+            for field in step.fields
+        )  # fmt: skip
+        return StepCard(
+            title=step.title, about=step.about, kind=step.kind, button=step.button, fields=fields, state=state,
+            picture=step.picture if step.picture in state.files else None, said=self._said.get(step.name, ()),
+            error=self._errors.get(step.name, ""),
+        )  # fmt: skip
+
+    def _choices(self, field: steps.Field) -> tuple[str, ...]:
+        if field.name != "gripper":
+            return field.choices
+        return (steps.INFERRED, *grippers(), steps.FROM_FILE, *self._more)
+
+    def _do(self, order: Do) -> None:
+        """Begin a step; the state says when it has ended, and how."""
+        # Of the steps that take images only one has something to be said without a camera.
+        self._named(order.step, "form", *(("capture",) if order.step == "standing" else ()))
+        with self._lock:
+            if self._busy is not None:
+                raise BadRequest(f"the step {self._busy} is still at work")
+            self._keep(order.values)
+            self._busy = order.step
+        self._errors.pop(order.step, None)
+        self._said.pop(order.step, None)
+        self._let_go()
+        threading.Thread(target=self._work, args=(order.step,), name="gripmon-setup-step", daemon=True).start()
+
+    def _work(self, step: str) -> None:
+        try:
+            self._said[step] = tuple(self._project.do(step))
+        except (InputError, NoResultError) as error:
+            self._errors[step] = str(error)
+        except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
+            self._errors[step] = f"{type(error).__name__}: {error}"
+        finally:
+            self._busy = None
+
+    def _captured(self, order: CaptureOrder) -> None:
+        self._named(order.step, "capture")
+        self._errors.pop(order.step, None)
+        if order.values:
+            self._keep(order.values)
+        if order.action == "start":
+            self._start_camera(order.step)
+            return
+        capture = self._capture
+        if capture is None or capture[0] != order.step:
+            capture = self._capture = order.step, self._fresh(order.step)
+        match order.action:
+            case "stop":
+                capture[1].stop()
+            case "by_itself" | "by_hand":
+                capture[1].by_itself(order.action == "by_itself")
+            case "take":
+                capture[1].take()
+            case "next":
+                capture[1].go_on()
+            case _:
+                capture[1].drop(order.name)
+
+    def _fresh(self, step: str) -> Capture:
+        try:
+            return self._project.capture(step)
+        except InputError as error:
+            raise BadRequest(str(error)) from None
+
+    def _start_camera(self, step: str) -> None:
+        self._let_go()
+        if self._monitor.running:
+            raise BadRequest("the monitor has the camera; stop it first")
+        capture = self._fresh(step)
+        try:
+            capture.start(self._project.open_camera(step))
+        except InputError as error:
+            self._errors[step] = str(error)
+            raise BadRequest(str(error)) from None
+        self._capture = step, capture
+
+    def _open(self, order: Do) -> dict[str, str]:
+        """A teaching page; where it is."""
+        self._named(order.step, "page")
+        self._let_go()
+        self._close_page()
+        state = next(each for each in self._project.states() if each.name == order.step)
+        if state.progress == "waits":
+            raise BadRequest(state.note)
+        try:
+            session = self._session(order.step, state.command)
+        except InputError as error:
+            self._errors[order.step] = str(error)
+            raise BadRequest(str(error)) from None
+        self._errors.pop(order.step, None)
+        saves = ("corners",) if order.step == "corners" else ("config", "taught", "corners")
+        self._page = TeachSite(session, f"../#{order.step}", saves), session
+        return {"url": "page/"}
+
+    def _session(self, step: str, command: str) -> TeachSession | OutlineSession:
+        values, camera = self._project.values, Path("camera.yaml")
+        images = [Path("standing" if step == "corners" else "teaching") / name for name in self._images(step)]
+        if step == "corners" and values["gripper"] == steps.INFERRED:
+            return outline_session(images[0], camera, Path("standing"))
+        corners = step == "corners"
+        return page_session(
+            read_inputs(
+                images[:1] if corners else images,
+                command=command,
+                out=Path("standing" if corners else "."),
+                camera=camera,
+                gripper=Path("gripper.yaml"),
+                reference=None if corners or values["reference_by"] == steps.BY_CORNERS else Path("hand_eye.yaml"),
+                source=None if corners else values["source"],
+                robot=values["robot"],
+                camera_name=values["camera_name"],
+            )
+        )
+
+    def _images(self, step: str) -> tuple[str, ...]:
+        return Capture(self._project.folder / ("standing" if step == "corners" else "teaching"), None).images()
+
+    def _start(self) -> None:
+        self._let_go()
+        self._errors.pop("run", None)
+        try:
+            self._monitor.start()
+        except InputError as error:
+            self._errors["run"] = str(error)
+            raise BadRequest(str(error)) from None
+
+    def _keep(self, values: dict[str, str]) -> None:
+        try:
+            self._project.keep(values)
+        except InputError as error:
+            raise BadRequest(str(error)) from None
+
+    @staticmethod
+    def _named(name: str, *kinds: str) -> None:
+        if not any(step.name == name and step.kind in kinds for step in STEPS):
+            raise BadRequest(f"there is no step {name} of this kind")
+
+    def _let_go(self) -> None:
+        """A camera belongs to one at a time."""
+        if self._capture is not None:
+            self._capture[1].stop()
+
+    def _close_page(self) -> None:
+        page, self._page = self._page, None
+        if page is not None:
+            page[1].close()
+
+
+def _founders() -> tuple[str, ...]:
+    """Ways to a gripper file whose commands this installation has."""
+    ways = ((steps.FROM_CAD, "gripper_cad"), (steps.FROM_IMAGES, "gripper_images"))
+    return tuple(way for way, module in ways if importlib.util.find_spec(f"gripmon.cli.{module}") is not None)

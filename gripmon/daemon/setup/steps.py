@@ -1,0 +1,291 @@
+"""The way from a camera to a running monitor as one list: what each step asks, needs, writes, and which command does
+the same in the project's folder.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from gripmon.daemon.config import builtin_config
+from gripmon.model.errors import InputError
+from gripmon.model.targets import CircleGrid, Target, name_of, parse_target
+
+Values = Mapping[str, str]
+Kind = Literal["form", "capture", "page", "run"]
+DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
+"""Mostly light, so that dark fingers show before it, and small enough for A5."""
+INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
+ON_PLATE, BY_CORNERS, BY_IMAGES = "on the plate", "from corners alone", "with the gripper's images"
+_WITHOUT = "when teaching, less exactly"
+
+
+@dataclass(frozen=True)
+class Field:
+    """What a step asks.  ``only``: (another field, its values), where it is asked at all."""
+
+    name: str
+    label: str
+    default: str = ""
+    hint: str = ""
+    choices: tuple[str, ...] = ()
+    only: tuple[str, tuple[str, ...]] | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """``needs`` and ``writes`` are paths in the project's folder; ``command`` the words of the command that does the
+    same, None where nothing is to be done with these values.
+    """
+
+    name: str
+    title: str
+    about: str
+    kind: Kind
+    button: str
+    needs: tuple[str, ...]
+    writes: tuple[str, ...]
+    command: Callable[[Values], list[str] | None]
+    fields: tuple[Field, ...] = ()
+    picture: str | None = None
+
+
+def target_in(values: Values) -> Target:
+    """The target as it was printed: the bar on it says how large.  Raises :class:`~gripmon.model.errors.InputError`."""
+    target = parse_target(values["target"])
+    text, nominal = values["bar_measured"].strip(), values.get("bar_mm", "")
+    if values["have"] != PRINT_IT or not text:
+        return target
+    try:
+        measured = float(text)
+    except ValueError:
+        measured = 0.0
+    bar_mm = float(nominal or "0") or measured
+    if not 0.5 * bar_mm < measured < 2.0 * bar_mm:
+        raise InputError(f"the bar measures '{text}' mm; a number near the {bar_mm:g} mm that it should have")
+    lengths = {
+        name: round(value * measured / bar_mm, 9)
+        for name, value in msgspec.structs.asdict(target).items()
+        if name.endswith("_m")
+    }
+    return msgspec.structs.replace(target, **lengths)
+
+
+def grippers() -> dict[str, Path]:
+    """Gripper files that come with gripmon, by name."""
+    folder = builtin_config("demo.yaml").parent / "grippers"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+PRINT_IT, HAVE_ONE = "print it", "I have one"
+_PLATE_SOURCE = "empty: the camera of step 1; or a folder with images that were taken before"
+
+
+def _step_command(name: str) -> Callable[[Values], list[str]]:
+    return lambda _values: ["gripmon", "setup", ".", "--step", name]
+
+
+def _target(values: Values) -> list[str]:
+    if values["have"] != PRINT_IT:
+        return _step_command("target")(values)
+    return ["gripmon", "target", values["target"], "--paper", values["paper"], "--pdf", "target.pdf", "--force"]
+
+
+def _intrinsics(values: Values) -> list[str]:
+    if values["intrinsics_by"] == FROM_FILE:
+        return ["gripmon", "calibrate", "import", values["camera_file"], "--out", "camera.yaml", "--force"]
+    words = ["gripmon", "calibrate", "intrinsics", "plate", "--target", name_of(target_in(values))]
+    return [*words, "--model", values["model"], "--out", "camera.yaml", "--picture", "camera.png", "--force"]
+
+
+def _gripper(values: Values) -> list[str] | None:
+    which = values["gripper"]
+    if which == INFERRED:
+        return None
+    if which in (FROM_CAD, FROM_IMAGES):
+        return ["gripmon", "gripper", *_founded(values), "--out", "gripper.yaml", "--force"]
+    path = values["gripper_file"] if which == FROM_FILE else str(grippers().get(which, which))
+    return ["cp", path, "gripper.yaml"]
+
+
+def _founded(values: Values) -> list[str]:
+    """A model from CAD, or from images, from which a reference follows, too."""
+    try:
+        files, options = shlex.split(values["gripper_file"]), shlex.split(values["gripper_options"])
+    except ValueError as error:
+        raise InputError(f"gripper: {error}; words as on a command line") from None
+    if not files:
+        raise InputError("no file is named; a mesh, URDF or .cao for CAD, a folder for images")
+    picture, reference = ["--picture", "gripper.png"], ["--reference-out", "hand_eye.yaml"]
+    if values["gripper"] == FROM_IMAGES:
+        return ["from-images", *files, "--camera", "camera.yaml", *options, *picture, *reference]
+    jaws = ["--jaw-range", values["jaw_range"]] if values["jaw_range"] else []
+    # Only with a view there is something to draw.
+    viewed = any(word.startswith(("--view", "--reference")) for word in options)
+    return ["from-cad", *files, *jaws, *options, *(["--camera", "camera.yaml", *picture] if viewed else [])]
+
+
+def _on_plate(values: Values) -> bool:
+    return values["reference_by"] == ON_PLATE
+
+
+def _corners(values: Values) -> list[str] | None:
+    if not _on_plate(values):
+        return None
+    words = ["gripmon", "teach", "--page", "standing/000.png", "--camera", "camera.yaml", "--out", "standing"]
+    return words if values["gripper"] == INFERRED else [*words, "--gripper", "gripper.yaml"]
+
+
+def _reference(values: Values) -> list[str] | None:
+    if values["reference_by"] == FROM_FILE:
+        return ["cp", values["reference_file"], "hand_eye.yaml"]
+    if not _on_plate(values):
+        return None
+    words = ["gripmon", "calibrate", "plane", "standing", "--target", name_of(target_in(values))]
+    words += ["--camera", "camera.yaml"]
+    if values["gripper"] == INFERRED:
+        words += ["--corners", "standing/rough.yaml", "--infer", "--gripper-out", "gripper.yaml"]
+        words += ["--jaw-range", values["jaw_range"]] if values["jaw_range"] else []
+    else:
+        words += ["--corners", "standing/corners.yaml", "--gripper", "gripper.yaml"]
+        words += ["--jaw-opening", values["jaw_opening"]] if values["jaw_opening"] else []
+    return [*words, "--out", "hand_eye.yaml", "--picture", "hand_eye.png", "--force"]
+
+
+def _teach(values: Values) -> list[str]:
+    words = ["gripmon", "teach", "--page", "teaching/*.png", "--camera", "camera.yaml", "--gripper", "gripper.yaml"]
+    words += [] if values["reference_by"] == BY_CORNERS else ["--reference", "hand_eye.yaml"]
+    return [*words, "--source", values["source"]]
+
+
+STEPS = (
+    Step(
+        "camera", "Camera", "Where the monitor's frames come from.  Fix focus, zoom and exposure first.", "form",
+        "Look through it", (), ("setup.yaml",), _step_command("camera"),
+        (
+            Field("source", "camera", "", "0 or /dev/video0, a URL, a folder of images, zenoh:1280x720[:KEY], "
+                  "ros2:1280x720:/camera/image_raw"),
+            Field("robot", "robot", "robot1", "names in messages: gripmon/<robot>/<camera name>/…"),
+            Field("camera_name", "camera name", "wrist"),
+        ),
+    ),
+    Step(
+        "target", "Target", "A flat pattern of known size.  Print it at 100 %, glue it onto something flat, and hold a "
+        "ruler against the bar.", "form", "Make it", (), ("setup.yaml", "target.pdf"), _target,
+        (
+            Field("have", "target", PRINT_IT, choices=(PRINT_IT, HAVE_ONE)),
+            Field("target", "pattern", DEFAULT_TARGET, "circles:COLUMNSxROWS:SPACING:DIAMETER, "
+                  "chequerboard:COLUMNSxROWS:SQUARE (inner corners) or charuco:COLUMNSxROWS:SQUARE:MARKER; metres"),
+            Field("paper", "paper", "a4", "a5 to a0, letter, legal, tabloid, or WIDTHxHEIGHT in mm", (),
+                  ("have", (PRINT_IT,))),
+            Field("bar_measured", "the bar measures (mm)", "", "empty: exactly what stands beside it; else the "
+                  "pattern's size follows the ruler", (), ("have", (PRINT_IT,))),
+        ),
+    ),
+    Step(
+        "plate", "Images of the target", "Ten to thirty images that fill the view, the target tilted by 20 to 45° to "
+        "all sides.  Images are taken by themselves when the camera stands still and the target is sharp.", "capture",
+        "Start", ("setup.yaml",), ("plate",), _step_command("plate"),
+        (Field("plate_source", "images from", "", _PLATE_SOURCE),),
+    ),
+    Step(
+        "intrinsics", "Lens", "Focal lengths, principal point and distortion, with their uncertainties.", "form",
+        "Calibrate", ("plate",), ("camera.yaml",), _intrinsics,
+        (
+            Field("intrinsics_by", "lens", "from the images", choices=("from the images", FROM_FILE)),
+            Field("model", "model", "brown_conrady", "auto: the one that the images support best",
+                  ("auto", "brown_conrady", "brown_conrady_5", "fisheye", "paper"),
+                  ("intrinsics_by", ("from the images",))),
+            Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or mrcal", (),
+                  ("intrinsics_by", (FROM_FILE,))),
+        ), "camera.png",
+    ),
+    Step(
+        "gripper", "Gripper", "What the fingertips look like: a file of the library or your own, or inferred from "
+        "images of the gripper standing on the target.", "form", "Use it", (), ("gripper.yaml",), _gripper,
+        (
+            Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_FILE)),
+            Field("gripper_file", "file", "", "a gripper file; of CAD meshes, a URDF or .cao; of images their folder",
+                  (), ("gripper", (FROM_FILE, FROM_CAD, FROM_IMAGES))),
+            Field("gripper_options", "options", "", "of the command below, e.g. --unit mm --view 0.12:30, or "
+                  "--distance 0.12:0.003", (), ("gripper", (FROM_CAD, FROM_IMAGES))),
+            Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
+                  ("gripper", (INFERRED, FROM_CAD))),
+        ), "gripper.png",
+    ),
+    Step(
+        "standing", "Gripper on the target", "The fingertips stand on the target, as flat as they can.  Three to ten "
+        "images, put down again for each; the jaws stay as they are.", "capture", "Start", ("camera.yaml",),
+        ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
+        (
+            Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}",
+                  (ON_PLATE, FROM_FILE, BY_CORNERS, BY_IMAGES)),
+            Field("standing_source", "images from", "", _PLATE_SOURCE, (), ("reference_by", (ON_PLATE,))),
+            Field("reference_file", "file", "", "of gripmon calibrate plane, or of the robot: cam_T_grip, or "
+                  "flange_T_cam and flange_T_tcp", (), ("reference_by", (FROM_FILE,))),
+        ),
+    ),
+    Step(
+        "corners", "Corners", "Drag the corners onto the fingertips in the first of these images; some pixels off is "
+        "fine.  Save, then Done.", "page", "Drag them", ("camera.yaml", "standing"), ("standing/rough.yaml",), _corners,
+    ),
+    Step(
+        "reference", "Hand and eye", "Where the gripper is in the camera's frame, with its uncertainty.", "form",
+        "Calibrate", ("camera.yaml", "standing", "standing/rough.yaml"), ("hand_eye.yaml", "gripper.yaml"), _reference,
+        (Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the gripper's "
+               "nominal"),), "hand_eye.png",
+    ),
+    Step(
+        "teaching", "Gripper at work", "One to ten images as at work, each before another background, the fingers free "
+        "and lit as in use.", "capture", "Start", ("camera.yaml", "gripper.yaml"), ("teaching",),
+        _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
+    ),
+    Step(
+        "teach", "Teach", "Drag the corners, see the edges snap and what accuracy to expect.  Save, then Done.", "page",
+        "Teach", ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
+    ),
+    Step(
+        "check", "Forecast", "What the monitor will be able to do with this view.", "form", "Check", ("config.yaml",),
+        ("check.json",), lambda _values: ["gripmon", "check", "config.yaml"],
+    ),
+    Step(
+        "run", "Start", "The monitor itself, as it runs without this page.", "run", "Start the monitor",
+        ("config.yaml",), ("run",), lambda _values: ["gripmon", "run", "config.yaml", "--out", "run"],
+    ),
+)  # fmt: skip
+
+
+def defaults() -> dict[str, str]:
+    """Every field's value before a person has said anything."""
+    return {field.name: field.default for step in STEPS for field in step.fields}
+
+
+def needed(step: Step, values: Values) -> tuple[str, ...]:
+    """What it needs with these values: some files come only one way, or have another name."""
+    names = step.needs
+    if step.name == "intrinsics" and values["intrinsics_by"] == FROM_FILE:
+        names = ()
+    if step.name == "gripper" and values["gripper"] in (FROM_CAD, FROM_IMAGES):
+        names = ("camera.yaml",)
+    if step.name == "teach" and values["reference_by"] == BY_CORNERS:
+        names = tuple(name for name in names if name != "hand_eye.yaml")
+    if values["gripper"] != INFERRED:
+        names = tuple("standing/corners.yaml" if name == "standing/rough.yaml" else name for name in names)
+        names += ("gripper.yaml",) if step.name in ("corners", "reference") else ()
+    if step.name == "reference" and values["reference_by"] == FROM_FILE:
+        names = ("camera.yaml", "gripper.yaml")
+    return names
+
+
+def written(step: Step, values: Values) -> tuple[str, ...]:
+    """What it writes with these values."""
+    if step.name == "corners" and values["gripper"] != INFERRED:
+        return ("standing/corners.yaml",)
+    if step.name == "reference" and values["gripper"] != INFERRED:
+        return ("hand_eye.yaml",)
+    return step.writes

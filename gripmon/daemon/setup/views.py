@@ -1,0 +1,190 @@
+"""What an image is worth for a calibration: sharp, still, where on the sensor the target is and how it is tilted.
+
+The limits are those that the calibrations themselves have, or say in their warnings; nothing here decides whether a
+calibration is good.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import msgspec
+import numpy as np
+
+from gripmon.calibrate.detection import BLURRED_PX, detect
+from gripmon.calibrate.intrinsics import COVERED
+from gripmon.calibrate.lattice import sharpest_blur_px, to_bytes, to_grey
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.model.records import Array, Image
+from gripmon.model.targets import Target
+
+CELLS = 12
+"""Across the image, as in the picture of ``gripmon calibrate intrinsics``."""
+STILL_PX = 0.5
+"""From one frame to the next: an exposure that lasts the whole time between them is blurred by a standard deviation of
+0.5 / sqrt(12) = 0.14 px then, a twentieth of what is refused as blurred."""
+MOVED_PX = 5.0
+"""Since the last image that was taken: ten times what counts as still, so that it is another view."""
+FEWEST_VIEWS = 10
+"""Images of the plate (docs/howto/calibrate_camera.md)."""
+TILTED_RAD = math.radians(20.0)
+"""From where on a tilt determines the focal length well (the warning of ``gripmon calibrate intrinsics``)."""
+SIDES = ("right", "down", "left", "up")
+FEWEST_SIDES = 3
+"""Of the four: tilts about one axis alone leave the focal length across it to the other (fx against fy)."""
+_FEATURES = 150
+_QUICK = 0.9
+"""Quantile of the features' motions: what moves before a gripper that stands is a part of the image."""
+
+
+class Coverage(msgspec.Struct, frozen=True):
+    """``cells``: rows of 0 and 1, where points were seen; ``tilts``: of each view (x, y), rad, to the side that is
+    farther away; ``wants`` what more would help, in words, empty if nothing.
+    """
+
+    cells: tuple[tuple[int, ...], ...]
+    tilts: tuple[tuple[float, float], ...]
+    wants: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """One image: ``sighting`` of the target or why there is none; ``blur_px`` of its sharpest edges (standard
+    deviation); ``moved_px`` since the image before, None for the first one or where nothing can be followed.
+    """
+
+    sighting: Sighting | NotFound | None
+    blur_px: float
+    moved_px: float | None
+
+    @property
+    def fault(self) -> str:
+        """Why the image can't be taken, empty if it can; what moves is no fault of an image that is a file."""
+        if self.blur_px > BLURRED_PX:
+            return (
+                f"blurred: its sharpest edges are {self.blur_px:.1f} px wide, at most {BLURRED_PX:g} px; focus, light"
+            )
+        return self.sighting.reason if isinstance(self.sighting, NotFound) else ""
+
+    @property
+    def still(self) -> bool:
+        return self.moved_px is not None and self.moved_px <= STILL_PX
+
+
+class Viewer:
+    """Looks at one image after another."""
+
+    def __init__(self, target: Target | None) -> None:
+        """``target`` None: none is asked for."""
+        self._target = target
+        self._before: Image | None = None
+
+    def look(self, image: Image) -> View:
+        """Any image that a camera delivers."""
+        grey = to_grey(image)
+        shown = to_bytes(grey)
+        moved_px = None if self._before is None else moved(self._before, shown)
+        self._before = shown
+        blur_px = sharpest_blur_px(grey)
+        return View(None if self._target is None else detect(image, self._target), blur_px, moved_px)
+
+
+def moved(before: Image, now: Image) -> float | None:
+    """By how far (px) all but a tenth of the features of an image (h, w), 8 bits, have moved at most; None where
+    there are none to follow, or they are not found again.
+
+    Lucas and Kanade by pyramids (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000).
+    """
+    if before.shape != now.shape:
+        return None
+    start = np.asarray(cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 10.0), np.float32)
+    if start.ndim != 3:  # it found none
+        return None
+    end, status, _ = cv2.calcOpticalFlowPyrLK(before, now, start, np.zeros_like(start))
+    good = np.ravel(status) > 0
+    if 2 * np.count_nonzero(good) < len(good):
+        return None
+    steps = np.linalg.norm(np.asarray(end)[good] - start[good], axis=-1)
+    return float(np.quantile(steps, _QUICK))
+
+
+def coverage(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Coverage:
+    """What views of a plate come to; ``size_px`` (width, height) of the images."""
+    rows = max(1, round(CELLS * size_px[1] / size_px[0]))
+    seen = np.zeros((rows, CELLS), np.int64)
+    for sighting in sightings:
+        column, row = (sighting.uv_px / np.array(size_px) * [CELLS, rows]).astype(int).T
+        seen[np.clip(row, 0, rows - 1), np.clip(column, 0, CELLS - 1)] = 1
+    tilts = tilts_of(sightings, size_px)
+    return Coverage(
+        tuple(tuple(line) for line in seen.tolist()),
+        tuple((x, y) for x, y in tilts.tolist()),
+        tuple(_wants(sightings, tilts, size_px)),
+    )
+
+
+def _wants(sightings: Sequence[Sighting], tilts: Array, size_px: tuple[int, int]) -> list[str]:
+    out = []
+    if len(sightings) < FEWEST_VIEWS:
+        out.append(f"{FEWEST_VIEWS - len(sightings)} more images")
+    # Towards right, down, left, up in the image; a tilt between two sides counts for both.
+    towards = np.stack([tilts[:, 0], tilts[:, 1], -tilts[:, 0], -tilts[:, 1]]) if len(tilts) else np.zeros((4, 0))
+    tilted = np.linalg.norm(tilts, axis=1) >= TILTED_RAD
+    has = [bool(np.any(tilted & (side > 0.5 * np.linalg.norm(tilts, axis=1)))) for side in towards]
+    if sum(has) < FEWEST_SIDES:
+        missing = " or ".join(name for name, there in zip(SIDES, has, strict=True) if not there)
+        out.append(f"the plate tilted by {math.degrees(TILTED_RAD):.0f}° or more, farther away on the side {missing}")
+    half_px = 0.5 * np.array(size_px)
+    reach = max((float(np.linalg.norm(s.uv_px - half_px, axis=1).max()) for s in sightings), default=0.0)
+    if reach < COVERED * float(np.linalg.norm(half_px)):
+        out.append("the plate nearer to the image's corners")
+    return out
+
+
+def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
+    """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down).
+
+    About right, for a person: the camera isn't known yet.  One focal length for all views, from the plate's axes being
+    at right angles and equally long (Zhang, "A flexible new technique for camera calibration", 2000), principal point
+    at the centre, square pixels, no distortion; where the views don't tell it, the image's width.
+    """
+    planes = [_homography(sighting, size_px) for sighting in sightings]
+    known = [plane for plane in planes if plane is not None]
+    focal = _focal(known) or float(size_px[0])
+    out = np.zeros((len(planes), 2))
+    for k, plane in enumerate(planes):
+        if plane is None:
+            continue
+        axes = np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ plane
+        axes = axes[:, :2] / np.linalg.norm(axes[:, :2], axis=0)
+        normal = np.cross(axes[:, 0], axes[:, 1])
+        normal /= np.linalg.norm(normal) * np.sign(normal[2] or 1.0)  # away from the camera
+        across = float(np.linalg.norm(normal[:2]))
+        # Depth grows against the normal's part in the image.
+        out[k] = -normal[:2] / max(across, 1e-9) * math.atan2(across, float(normal[2]))
+    return out
+
+
+def _homography(sighting: Sighting, size_px: tuple[int, int]) -> Array | None:
+    """(3, 3) from the plate to the image, px from its centre; None where the points don't span an area."""
+    if len(sighting) < 4:
+        return None
+    plate = sighting.plate_m[:, :2] - sighting.plate_m[:, :2].mean(axis=0)
+    plane, _ = cv2.findHomography(plate, sighting.uv_px - 0.5 * (np.array(size_px) - 1.0))
+    return None if plane is None else np.asarray(plane, np.float64)
+
+
+def _focal(planes: Sequence[Array]) -> float | None:
+    """Focal length (px); None if these views don't tell."""
+    if len(planes) < 3:
+        return None
+    terms, rests = [], []
+    for plane in planes:
+        (a1, a2), (b1, b2), (c1, c2) = (plane[:, :2] / np.linalg.norm(plane[:2, :2])).tolist()
+        terms += [a1 * a2 + b1 * b2, a1**2 + b1**2 - a2**2 - b2**2]
+        rests += [c1 * c2, c1**2 - c2**2]
+    inverse_square = -float(np.dot(terms, rests)) / max(float(np.dot(terms, terms)), 1e-30)
+    return 1.0 / math.sqrt(inverse_square) if inverse_square > 0.0 else None

@@ -1,0 +1,257 @@
+// One step at a time: its form and buttons, what the camera or the monitor shows, and what came of it.
+
+import { get, post } from "./server.js";
+
+const $ = (selector) => document.querySelector(selector);
+const SVG = "http://www.w3.org/2000/svg";
+const QUIET_MS = 1000, LIVELY_MS = 250;
+const MARKS = { done: "✓", stale: "!", skipped: "–" };
+const NAMED = { ready: "", done: "", stale: "do this again", waits: "", skipped: "not needed" };
+
+let state, chosen = null, drawn = "", refused = "", typed = {}, frame = { live: 0, monitor: 0 }, ended = false, timer = null;
+
+function element(tag, text = "", attributes = {}) {
+  const node = document.createElement(tag);
+  node.textContent = text;
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  return node;
+}
+
+function shape(tag, attributes, parent) {
+  const node = document.createElementNS(SVG, tag);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  parent.append(node);
+  return node;
+}
+
+const step = () => state.steps.find((each) => each.state.name === chosen);
+const capture = () => (state.capturing === chosen ? state.capture : null);
+const said = () => Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value]));
+
+function choose(name) {
+  chosen = name;
+  refused = "";
+  history.replaceState(null, "", `#${name}`);
+  show();
+  $("main").scrollIntoView({ block: "nearest" });
+}
+
+function showSteps() {
+  const active = document.activeElement?.dataset?.step;
+  $("#steps").replaceChildren(...state.steps.map((each, number) => {
+    const { name, progress, note } = each.state;
+    const button = element("button", "", { "data-step": name, "data-progress": progress, title: each.title });
+    if (name === chosen) button.setAttribute("aria-current", "step");
+    button.append(element("span", MARKS[progress] ?? `${number + 1}`, { class: "mark" }), element("span", each.title, { class: "name" }));
+    const more = note || NAMED[progress];
+    if (more) button.append(element("small", more));
+    button.addEventListener("click", () => choose(name));
+    const item = element("li");
+    item.append(button);
+    return item;
+  }));
+  if (active) $(`[data-step=${active}]`)?.focus();
+}
+
+// What a person types must not be drawn over by what the server says meanwhile.
+function showFields() {
+  const { fields } = step(), now = said();
+  const asked = fields.filter(({ only }) => !only || only[1].includes(now[only[0]]));
+  const form = JSON.stringify([chosen, asked.map((field) => [field.name, field.choices])]);
+  if (form === drawn) return;
+  drawn = form;
+  $("#fields").replaceChildren(...asked.map((field) => {
+    const label = element("label", field.label);
+    const input = element(field.choices.length ? "select" : "input", "", { name: field.name, spellcheck: "false" });
+    for (const choice of field.choices) input.append(element("option", choice, { value: choice }));
+    input.value = now[field.name];
+    input.addEventListener("input", () => { typed[field.name] = input.value; showFields(); showButtons(); });
+    label.append(input);
+    if (field.hint) label.append(element("span", field.hint));
+    return label;
+  }));
+}
+
+function button(text, act, kind, id, can = true) {
+  const node = element("button", text, { type: "button", class: kind, id: `do-${id}` });
+  node.disabled = Boolean(state.busy) || !can;
+  node.addEventListener("click", () => order(act));
+  return node;
+}
+
+function buttonsOf({ kind, button: name, state: { progress } }) {
+  const now = capture(), order_ = (action) => () => post("capture", { step: chosen, action });
+  const skips = chosen === "standing" && said().reference_by !== "on the plate";
+  if (kind === "form" || skips) return [button(skips ? "Use it" : name, () => post("do", { step: chosen, values: said() }), "main", "step")];
+  if (kind === "page") {
+    return [button(name, async () => location.assign((await post("open", { step: chosen })).url), "main", "step")];
+  }
+  if (kind === "run") {
+    return state.monitor.running ? [button("Stop", () => post("stop", {}), "ask", "stop")] : [button(name, () => post("start", {}), progress === "waits" ? "" : "main", "step")];
+  }
+  if (!now?.running || now.ended) return [button(now?.ended ? "Start again" : name, () => post("capture", { step: chosen, action: "start", values: said() }), "main", "step")];
+  return [
+    now.itself ? button("Stop taking", order_("by_hand"), "ask", "by-hand") : button("Take by themselves", order_("by_itself"), "main", "by-itself"),
+    button("Take this one", order_("take"), "", "take", now.shown > 0),
+    ...(now.live ? [] : [button("Next image", order_("next"), "", "next")]),
+    button("Stop the camera", order_("stop"), "", "stop"),
+  ];
+}
+
+function showButtons() {
+  const next = state.steps[state.steps.findIndex((each) => each.state.name === chosen) + 1];
+  const nodes = buttonsOf(step());
+  if (next && ["done", "skipped"].includes(step().state.progress)) {
+    const on = element("button", `Next: ${next.title} →`, { type: "button", id: "do-on" });
+    on.addEventListener("click", () => choose(next.state.name));
+    nodes.push(on);
+  }
+  const same = (a, b) => a.id === b.id && a.textContent === b.textContent && a.className === b.className && a.disabled === b.disabled;
+  const old = [...$("#buttons").children];
+  if ($("#buttons").dataset.step === chosen && old.length === nodes.length && old.every((node, k) => same(node, nodes[k]))) return;
+  $("#buttons").dataset.step = chosen;
+  $("#buttons").replaceChildren(...nodes);
+}
+
+function status() {
+  const { state: now, error } = step(), taking = capture(), { monitor } = state;
+  const wrong = refused || error;
+  if (state.busy) return state.busy === chosen ? ["at work …", ""] : [`at work on another step (${state.busy}) …`, ""];
+  if (wrong) return [wrong, "bad"];
+  if (chosen === "run" && (monitor.running || monitor.ended)) {
+    const last = monitor.lines.at(-1) ?? "";
+    if (monitor.verdict === null) return monitor.running ? [last || "starting …", ""] : [last ? `${monitor.ended}: ${last}` : monitor.ended, "bad"];
+    const why = monitor.reason ? `: ${monitor.reason}` : "", bound = monitor.bound ? `, error at most ${monitor.bound}` : "";
+    const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
+    return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
+  }
+  if (taking && (taking.running || taking.ended)) return [taking.ended ? taking.note : `${taking.note}; ${taking.images.length} taken`, /^(taken|ready|no more)/.test(taking.note) ? "good" : "warn"];
+  const words = { done: "done", stale: now.note, waits: now.note, skipped: `not needed: ${now.note}`, ready: "" };
+  const text = words[now.progress] || "";
+  return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || "not done yet", { done: "good", stale: "warn" }[now.progress] ?? ""];
+}
+
+function showCapture() {
+  const isOne = step().kind === "capture", now = capture();
+  $("#capture").hidden = !isOne || !now;
+  if (!isOne || !now) return;
+  const views = now.coverage;
+  $("#coverage").hidden = !views || chosen !== "plate";
+  if (!$("#coverage").hidden) {
+    const across = views.cells[0].length, cells = $("#cells"), tilts = $("#tilts");
+    cells.setAttribute("viewBox", `0 0 ${across} ${views.cells.length}`);
+    cells.replaceChildren();
+    views.cells.forEach((row, v) => row.forEach((seen, u) => shape("rect", { x: u + 0.03, y: v + 0.03, width: 0.94, height: 0.94, class: seen ? "seen" : "" }, cells)));
+    tilts.replaceChildren();
+    for (const r of [20, 45]) shape("circle", { r, class: "ring" }, tilts);
+    shape("path", { d: "M-58 0H58M0-58V58" }, tilts);
+    const degrees = 180 / Math.PI;
+    for (const [x, y] of views.tilts) shape("circle", { cx: x * degrees, cy: y * degrees, r: 4, class: "tilt" }, tilts);
+    const wants = views.wants.map((text) => element("li", `still: ${text}`));
+    $("#wants").replaceChildren(...(wants.length ? wants : [element("li", "enough to calibrate; more do no harm", { class: "enough" })]));
+  }
+  $("#images").replaceChildren(...now.images.map((name) => {
+    const item = element("li", name), drop = element("button", "✕", { type: "button", title: `delete ${name}`, "aria-label": `delete ${name}` });
+    drop.addEventListener("click", () => order(() => post("capture", { step: chosen, action: "drop", name })));
+    item.append(drop);
+    return item;
+  }));
+}
+
+async function load(image, path, count, key) {
+  if (count === frame[key]) return;
+  frame[key] = count;
+  if (!count) { image.removeAttribute("src"); return; }
+  image.src = `${path}?${count}`;
+}
+
+function showMonitor() {
+  const now = state.monitor, isOne = step().kind === "run" && (now.running || now.ended !== null);
+  $("#monitor").hidden = !isOne;
+  if (!isOne) return;
+  const log = $("#log"), text = now.lines.join("\n");
+  if (log.textContent !== text) { log.textContent = text; log.scrollTop = log.scrollHeight; }
+}
+
+function showResult() {
+  const card = step();
+  const lines = state.busy === chosen ? [] : card.said;
+  $("#said").replaceChildren(...lines.filter(({ level }) => level).map(({ text, level }) => {
+    const item = element("li", "", { "data-level": level });
+    item.append(element("b", level), element("span", text));
+    return item;
+  }));
+  const output = lines.filter(({ level }) => !level).map(({ text }) => text).join("\n");
+  if ($("#output").textContent !== output) $("#output").textContent = output;
+  $("#file").hidden = chosen !== "target" || !card.state.files.includes("target.pdf");
+  const image = $("#result img");
+  $("#result").hidden = !card.picture || Boolean(state.busy);
+  if (card.picture && !state.busy) {
+    const source = `file/${card.picture}?${card.said.length}`;
+    if (image.getAttribute("src") !== source) image.setAttribute("src", source);
+  }
+}
+
+function show() {
+  const card = step();
+  showSteps();
+  $("#folder").textContent = state.folder;
+  $("#folder").title = state.folder;
+  $("#title").textContent = card.title;
+  $("#about").textContent = card.about;
+  $("#command code").textContent = card.state.command;
+  showFields();
+  showButtons();
+  const [text, kind] = status();
+  if ($("#status").textContent !== text) $("#status").textContent = text;
+  $("#status").dataset.kind = kind;
+  showCapture();
+  showMonitor();
+  showResult();
+  document.body.dataset.busy = Boolean(state.busy);
+  if (capture()) load($("#live"), "live.jpg", capture().shown, "live");
+  if (step().kind === "run") load($("#shown"), "monitor.jpg", state.monitor.shown, "monitor");
+}
+
+async function order(act) {
+  refused = "";
+  document.body.dataset.busy = "true";
+  try { await act(); } catch (error) { refused = error.message; }
+  await refresh();
+}
+
+async function refresh() {
+  clearTimeout(timer);
+  if (ended) return;
+  try {
+    state = await get("state");
+    show();
+  } catch (error) {
+    $("#status").textContent = error.message;
+    $("#status").dataset.kind = "bad";
+  }
+  const lively = state?.busy || state?.monitor.running || (state?.capture?.running && !state.capture.ended);
+  timer = setTimeout(refresh, lively ? LIVELY_MS : QUIET_MS);
+}
+
+async function done() {
+  try { await post("done", {}); } catch (error) { refused = error.message; show(); return; }
+  ended = true;
+  const page = element("div", "", { class: "over" });
+  page.append(element("h1", "Done."), element("p", "gripmon setup has ended; this page may be closed. gripmon setup in the same folder goes on."));
+  for (const part of document.body.children) part.hidden = true;
+  document.body.append(page);
+}
+
+async function begin() {
+  state = await get("state");
+  const wanted = location.hash.slice(1);
+  const open = state.steps.find((each) => ["ready", "stale"].includes(each.state.progress)) ?? state.steps.at(-1);
+  chosen = state.steps.some((each) => each.state.name === wanted) ? wanted : open.state.name;
+  $("#done").addEventListener("click", done);
+  $("#fields").addEventListener("submit", (event) => { event.preventDefault(); $("#do-step")?.click(); });
+  await refresh();
+  document.body.dataset.ready = "true";
+}
+
+begin().catch((error) => { $("#status").textContent = error.message; $("#status").dataset.kind = "bad"; });

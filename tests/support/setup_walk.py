@@ -1,0 +1,211 @@
+"""What a person does on the page of ``gripmon setup``, from nothing to a running monitor, on simulated images; and, run
+as a program, the pictures of docs/tutorials/setup.md: ``cd tests && python -m support.setup_walk``.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from support import new_user
+from support.teach_page_browser import ROOT, Visitor, browser, page
+
+INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
+WIDTHS = (375, 1100, 1920)
+_CONTROLS = """
+const seen = [...document.querySelectorAll("button, input, select, a, label.check")]
+  .filter((node) => node.checkVisibility({visibilityProperty: true}) && node.getBoundingClientRect().width > 0);
+const out = [], named = (node) => node.id || node.name || node.textContent, wide = document.documentElement.scrollWidth;
+for (const [k, a] of seen.entries()) {
+  const one = a.getBoundingClientRect();
+  if (one.left < -0.5 || one.right > innerWidth + 0.5) out.push(`${named(a)} beyond the border`);
+  for (const b of seen.slice(k + 1)) {
+    if (a.contains(b) || b.contains(a)) continue;
+    const other = b.getBoundingClientRect();
+    const across = Math.min(one.right, other.right) - Math.max(one.left, other.left);
+    const down = Math.min(one.bottom, other.bottom) - Math.max(one.top, other.top);
+    if (across > 1 && down > 1) out.push(`${named(a)} lies over ${named(b)}`);
+  }
+}
+if (wide > innerWidth) out.push(`wider than the window: ${wide}`);
+return out;
+"""
+
+
+class Walker(Visitor):
+    """A person before the page."""
+
+    def text(self, selector: str) -> str:
+        """Also of what is hidden, or drawn again at this moment."""
+        return str(self.script("return document.querySelector(arguments[0])?.textContent ?? ''", selector))
+
+    def press(self, name: str) -> None:
+        """A button, once it can be pressed."""
+        script = (
+            "const b = document.querySelector(arguments[0]); if (!b || b.disabled) return false; b.click(); return true"
+        )
+        self.wait(lambda: self.script(script, f"#do-{name}"), f"the button {name}")
+
+    def fill(self, **values: str) -> None:
+        """Fields of the step, as typing does."""
+        for name, value in values.items():
+            self.script(
+                "const i = document.querySelector(`[name=${arguments[0]}]`); i.value = arguments[1];"
+                "i.dispatchEvent(new Event('input', {bubbles: true}))", name, value,
+            )  # fmt: skip
+
+    def go(self, step: str) -> None:
+        """To a step of the list."""
+        self.script("document.querySelector(`[data-step=${arguments[0]}]`).click()", step)
+
+    def progress(self, step: str) -> str:
+        return str(self.script("return document.querySelector(`[data-step=${arguments[0]}]`).dataset.progress", step))
+
+    def done(self, step: str) -> None:
+        """Wait until this step is."""
+        rest = "return document.body.dataset.busy === 'false'"
+        self.wait(lambda: self.progress(step) == "done" and self.script(rest), f"{step}")
+
+    def refused(self, *words: str) -> None:
+        """Wait for one line on the page that says these."""
+        bad = "return document.querySelector('#status').dataset.kind === 'bad'"
+        self.wait(lambda: self.script(bad) and all(word in self.text("#status") for word in words), " ".join(words))
+        assert "\n" not in self.text("#status") and "Traceback" not in self.text("#status")
+
+    def on_page(self, selector: str) -> None:
+        self.wait(lambda: self.script("return Boolean(document.querySelector(arguments[0]))", selector), selector)
+
+    def sized(self, width_px: int, height_px: int = 900) -> None:
+        """The window, as a telephone or a screen has it."""
+        sizes = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", sizes)
+        self.driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+    def ugly(self) -> list[str]:
+        """What doesn't fit at some width, or lies over something else."""
+        out = []
+        for width_px in WIDTHS:
+            self.sized(width_px)
+            out += [f"{width_px} px: {fault}" for fault in self.script(_CONTROLS)]
+        self.sized(1400)
+        return out
+
+
+def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -> None:
+    """From the first step to a monitor that has seen all images; ``at`` hears the name of each step done."""
+    folder, rng = user.folder, np.random.default_rng(4)
+    clicks = user.rough_px(rng, off_px=4.0)
+    visitor.fill(source=str(folder / "work"), robot="arm1")
+    visitor.press("step")
+    visitor.done("camera")
+    at("camera")
+    visitor.press("on")
+    visitor.press("step")
+    visitor.done("target")
+    at("target")
+    visitor.press("on")
+    visitor.fill(plate_source=str(folder / "plate"))
+    _take_all(visitor, "12 taken")
+    at("plate")
+    visitor.press("on")
+    visitor.fill(model="paper")
+    visitor.press("step")
+    visitor.done("intrinsics")
+    at("intrinsics")
+    visitor.press("on")
+    visitor.fill(jaw_range="0:0.06")
+    visitor.press("step")
+    visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "what becomes of the gripper")
+    at("gripper")
+    visitor.go("standing")
+    visitor.fill(standing_source=str(folder / "standing"))
+    _take_all(visitor, "3 taken")
+    at("standing")
+    visitor.press("on")
+    _by_hand(visitor, {name: (float(u), float(v)) for name, (u, v) in clicks.items()}, at, "corners")
+    visitor.done("corners")
+    visitor.press("on")
+    visitor.press("step")
+    visitor.done("reference")
+    at("reference")
+    visitor.press("on")
+    visitor.press("step")
+    visitor.wait(lambda: "ready to be taken" in visitor.text("#status"), "the first image")
+    visitor.press("take")
+    visitor.wait(lambda: "1 taken" in visitor.text("#status"), "the image")
+    at("teaching")
+    visitor.press("stop")
+    visitor.press("on")
+    _by_hand(visitor, {}, at, "teach")
+    visitor.done("teach")
+    visitor.press("on")
+    visitor.press("step")
+    visitor.done("check")
+    at("check")
+    visitor.press("on")
+    visitor.press("step")
+    visitor.wait(lambda: visitor.script("return document.querySelector('#shown')?.naturalWidth > 0"), "the overlay")
+    at("running")
+    visitor.wait(lambda: "stopped after" in visitor.text("#log") and "ended" in visitor.text("#status"), "the end")
+    at("run")
+
+
+def _take_all(visitor: Walker, words: str) -> None:
+    visitor.press("step")
+    visitor.press("by-itself")
+    visitor.wait(lambda: "no more images" in visitor.text("#status") and words in visitor.text("#status"), words)
+
+
+def _by_hand(visitor: Walker, corners: dict[str, tuple[float, float]], at: Callable[[str], object], name: str) -> None:
+    """On the teaching page, and back."""
+    visitor.press("step")
+    visitor.on_page("#stage")
+    visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page to begin")
+    visitor.settle()
+    for corner, (u, v) in corners.items():
+        visitor.drag(corner, u, v)
+    at(name)
+    visitor.click("#save")
+    visitor.wait(lambda: "next:" in visitor.text("#saved"), "the files")
+    visitor.click("#done")
+    visitor.on_page("#steps [data-step]")
+    visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page again")
+
+
+_SHOWN = {"plate": 1150, "corners": 1150, "check": 1150, "run": 1150}
+
+
+def main() -> None:
+    """Draw the pictures."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    out, driver = ROOT / "docs" / "tutorials", browser()
+    with tempfile.TemporaryDirectory() as name:
+        user = new_user.make(Path(name))
+        with page(Path(name) / "arm1", command=("setup",)) as running:
+            visitor = Walker(driver, running.url)
+
+            def at(step: str) -> None:
+                if step not in _SHOWN:
+                    return
+                visitor.sized(_SHOWN[step], 760)
+                time.sleep(0.5)
+                height = visitor.script("return document.documentElement.scrollHeight")
+                visitor.sized(_SHOWN[step], min(int(height), 1300))
+                time.sleep(0.5)
+                visitor.script("const f = document.querySelector('#folder'); if (f) f.textContent = '/home/me/arm1'")
+                picture = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+                cv2.imwrite(str(out / f"setup_{step}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
+                visitor.sized(1400)
+
+            walk(visitor, user, at)
+    driver.quit()
+
+
+if __name__ == "__main__":
+    main()

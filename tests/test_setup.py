@@ -1,0 +1,453 @@
+"""Setting up without a browser: views of a plate held against the truth, images taken by themselves, the project folder
+and its commands.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from support import new_user
+from support.loopback import frame_record, free_endpoint, wait_until
+
+from gripmon.calibrate.sighting import Sighting
+from gripmon.cli import main
+from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.setup import STEPS, Project, SetupSite
+from gripmon.daemon.setup.capture import Capture
+from gripmon.daemon.setup.project import Line
+from gripmon.daemon.setup.robot_file import reference_text
+from gripmon.daemon.setup.running import overlay
+from gripmon.daemon.setup.site import CaptureOrder, Do
+from gripmon.daemon.setup.steps import defaults, target_in
+from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
+from gripmon.daemon.teaching.source import named_source
+from gripmon.io.sources import FolderSettings, FolderSource, LiveSettings, NetworkSettings, SourceError, Waiting
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.images import read_image
+from gripmon.model.records import Frame, Image, Transform, Verdict
+from gripmon.model.targets import parse_target
+from gripmon.teach.messages import BadRequest, Nothing, Put, SaveOrder
+
+TARGET = parse_target(new_user.TARGET)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("setup")
+    for kind in ("plate", "standing"):
+        assert main(["simulate", kind, "--out", str(folder / kind)]) == 0
+    return folder
+
+
+def pictures(folder: Path) -> list[Image]:
+    out = [read_image(path)[0] for path in sorted(folder.glob("*.png"))]
+    assert all(image is not None for image in out)
+    return [image for image in out if image is not None]
+
+
+def sightings(folder: Path) -> list[Sighting]:
+    seen = [Viewer(TARGET).look(image).sighting for image in pictures(folder)]
+    return [each for each in seen if isinstance(each, Sighting)]
+
+
+def test_tilts_are_those_of_the_simulated_plate(images: Path):
+    truth = json.loads((images / "plate" / "truth.json").read_text())
+    seen = sightings(images / "plate")
+    size_px = truth["camera"]["width_px"], truth["camera"]["height_px"]
+    found = np.array(coverage(seen, size_px).tilts)
+    assert len(found) == len(truth["images"])
+    for (x, y), image in zip(found, truth["images"], strict=True):
+        normal = np.array(image["cam_T_plate"])[:3, 2]  # into the plate, away from the camera
+        # The depth of its plane grows against what the normal has in the image.
+        tilt = math.acos(normal[2])
+        assert math.hypot(x, y) == pytest.approx(tilt, abs=math.radians(3.0))
+        across = -normal[:2] / np.linalg.norm(normal[:2])
+        assert np.array([x, y]) / math.hypot(x, y) @ across > math.cos(math.radians(6.0))
+
+
+def test_coverage_says_what_is_missing(images: Path):
+    seen = sightings(images / "plate")
+    size_px = seen[0].size_px
+    assert coverage(seen, size_px).wants == ()
+    few = coverage(seen[:1], size_px).wants
+    assert f"{FEWEST_VIEWS - 1} more images" in few and any("tilted" in want for want in few)
+    # All tilted alike: more of them don't help.
+    alike = coverage([seen[0]] * 12, size_px)
+    assert [want for want in alike.wants if "tilted" in want] and not any("more images" in w for w in alike.wants)
+    shown = np.array(alike.cells, bool)
+    columns, rows = (seen[0].uv_px / size_px * shown.shape[::-1]).astype(int).T
+    expected = np.zeros_like(shown)
+    expected[rows, columns] = True
+    assert (shown == expected).all()
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 0.3, 0.8, 3.0, 12.0])
+def test_motion_is_what_the_image_was_shifted_by(images: Path, shift_px: float):
+    image = pictures(images / "plate")[0]
+    matrix = np.array([[1.0, 0.0, shift_px], [0.0, 1.0, 0.0]])
+    after = cv2.warpAffine(image, matrix, image.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    found = moved(image, np.asarray(after))
+    assert found == pytest.approx(shift_px, abs=0.1)
+    assert (found <= STILL_PX) == (shift_px <= STILL_PX)
+
+
+class Script:
+    """A live camera that shows these images, each when it is asked for."""
+
+    live, connected, dropped = True, True, 0
+
+    def __init__(self, shown: Sequence[Image]) -> None:
+        self._shown, self._next, self._closed = list(shown), 0, threading.Event()
+
+    def read(self) -> Frame | Waiting | None:
+        if self._closed.is_set() or self._next >= len(self._shown):
+            return None
+        self._next += 1
+        return Frame(self._next, 1000 * self._next, self._shown[self._next - 1], 0.03)
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+def taken(folder: Path, shown: Sequence[Image]) -> tuple[str, ...]:
+    capture, source = Capture(folder, TARGET), Script(shown)
+    ready = threading.Event()
+    plain = source.read
+    source.read = lambda: (ready.wait(30.0), plain())[1]  # type: ignore[method-assign]
+    capture.start(source)
+    capture.by_itself(True)
+    ready.set()
+    wait_until(lambda: capture.state().ended, "the end")
+    capture.stop()
+    return capture.images()
+
+
+def test_a_live_camera_takes_what_is_still_sharp_and_new(images: Path, tmp_path: Path):
+    first, second, third = pictures(images / "plate")[:3]
+    again = np.asarray(np.minimum(first, 250) + 1, np.uint8)
+    blurred = np.asarray(cv2.GaussianBlur(third, (0, 0), 5.0))
+    nothing = np.random.default_rng(2).integers(90, 110, first.shape, np.uint8)
+    shown = [first, first, first, second, second, blurred, blurred, nothing, nothing, again, again]
+    # One for each pose that is held: neither while it moves, nor twice, nor what is blurred or shows no target.
+    names = taken(tmp_path / "plate", shown)
+    assert names == ("000.png", "001.png", "002.png")
+    kept = [read_image(tmp_path / "plate" / name)[0] for name in names]
+    assert all(np.array_equal(a, b) for a, b in zip(kept, (first, second, again), strict=True))
+    rows = list(csv.DictReader((tmp_path / "plate" / "timestamps.csv").read_text().splitlines()))
+    found = [(row["stamp_ns"], row["jaw_opening_m"]) for row in rows]
+    assert found == [("2000", "0.03"), ("5000", "0.03"), ("11000", "0.03")]
+    assert len(FolderSource(FolderSettings(path=str(tmp_path / "plate")), Path())) == 3
+
+
+def test_nothing_is_taken_of_a_camera_that_moves(images: Path, tmp_path: Path):
+    shown = pictures(images / "plate")
+    assert taken(tmp_path / "plate", shown) == ()
+
+
+def test_a_folder_is_taken_as_it_stands_and_once(images: Path, tmp_path: Path):
+    capture = Capture(tmp_path / "standing", TARGET)
+    for _ in range(2):
+        capture.start(FolderSource(FolderSettings(path=str(images / "standing")), Path()))
+        capture.by_itself(True)
+        wait_until(lambda: capture.state().ended, "the end")
+        capture.stop()
+        assert capture.images() == ("000.png", "001.png", "002.png")
+    with pytest.raises(BadRequest, match="there is no image x"):
+        capture.drop("x")
+    capture.drop("001.png")
+    assert capture.images() == ("000.png", "002.png")
+
+
+def test_sources_by_name(tmp_path: Path):
+    assert named_source(str(tmp_path)) == FolderSettings(path=str(tmp_path))
+    assert named_source("0", (640, 480)) == LiveSettings(device=0, width_px=640, height_px=480)
+    assert named_source("zenoh:640x480") == NetworkSettings()
+    assert named_source("zenoh:640x480:a/b", (640, 480)) == NetworkSettings(key="a/b")
+    topic = named_source("ros2:640x480:/camera/image_raw/compressed")
+    assert topic == NetworkSettings(topic="/camera/image_raw/compressed", format="ros2_compressed")
+    for text, words in (
+        ("", "names no camera"),
+        ("zenoh:640", "names no camera"),
+        ("zenoh:640x480:a/*", "without"),
+        ("ros2:640x480", "topic"),
+        ("cam.avi", "no such folder or file"),
+    ):
+        with pytest.raises(SourceError, match=words) as error:
+            named_source(text)
+        assert "\n" not in str(error.value)
+    with pytest.raises(SourceError, match="the camera's calibration has 800 x 600 px"):
+        named_source("zenoh:640x480", (800, 600))
+
+
+def test_a_camera_on_the_network_is_looked_through(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The driver's frames come on the monitor's own key, as when it runs."""
+    from support.loopback import plain_session
+
+    from gripmon.daemon.teaching import source as sources
+
+    endpoint = free_endpoint()
+    given = sources.PublishSettings
+    monkeypatch.setattr(sources, "PublishSettings", lambda: given(listen=(endpoint,)))
+    image = pictures(images / "plate")[0]
+    project = Project(tmp_path)
+    project.keep({"source": "zenoh:768x576", "robot": "arm7"})
+    png = cv2.imencode(".png", image)[1].tobytes()
+    stop = threading.Event()
+
+    def drive() -> None:
+        with plain_session(connect=endpoint, mode="peer") as session:
+            while not stop.wait(0.05):
+                session.put("gripmon/arm7/wrist/image", png, encoding="image/png")
+
+    def driven() -> None:
+        while not stop.is_set():
+            try:
+                drive()
+            except Exception:  # noqa: BLE001  the camera isn't there yet
+                stop.wait(0.1)
+
+    thread = threading.Thread(target=driven)
+    thread.start()
+    try:
+        assert project.do("camera") == [Line("768 x 576 px, 8 bits", "OK")]
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_a_robots_own_calibration(tmp_path: Path):
+    rng = np.random.default_rng(5)
+    flange_T_cam, cam_T_grip = np.eye(4), np.eye(4)
+    flange_T_cam[:3, :3] = Rotation.random(random_state=1).as_matrix()
+    flange_T_cam[:3, 3] = rng.uniform(-0.1, 0.1, 3)
+    cam_T_grip[:3, :3] = Rotation.from_euler("x", 30.0, degrees=True).as_matrix()
+    cam_T_grip[:3, 3] = [0.001, 0.002, 0.12]
+    written = {
+        name: {
+            "translation_m": made[:3, 3].tolist(),
+            "rotation_xyzw": Rotation.from_matrix(made[:3, :3]).as_quat().tolist(),
+        }
+        for name, made in (("flange_T_cam", flange_T_cam), ("flange_T_tcp", flange_T_cam @ cam_T_grip))
+    }
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(written))
+    text, said = reference_text(path)
+    found = yaml.safe_load(text)["cam_T_grip"]
+    np.testing.assert_allclose(found["translation_m"], cam_T_grip[:3, 3], atol=1e-12)
+    turned = Rotation.from_quat(found["rotation_xyzw"]) * Rotation.from_matrix(cam_T_grip[:3, :3]).inv()
+    assert turned.magnitude() < 1e-9 and said == "TCP at 1.0, 2.0, 120.0 mm before the camera"
+    for values, words in (
+        ({"a": 1}, "holds no hand/eye calibration"),
+        ({"cam_T_grip": {"translation_m": [0.0, 0.0, 120.0], "rotation_xyzw": [0, 0, 0, 1]}}, "120 mm were meant"),
+        (written | {"flange_T_cam": {"translation_m": [0, 0, 0], "rotation_xyzw": [1, 1, 0, 0]}}, "flange_T_cam"),
+    ):
+        path.write_text(yaml.safe_dump(values))
+        with pytest.raises(InputError, match=words) as error:
+            reference_text(path)
+        assert "\n" not in str(error.value)
+
+
+def test_steps_are_a_chain(tmp_path: Path):
+    """What a step needs is written by one before it."""
+    written: set[str] = set()
+    for step in STEPS:
+        assert set(step.needs) <= written | {"setup.yaml"}, step.name
+        written |= set(step.writes)
+    names = [field.name for step in STEPS for field in step.fields]
+    assert len(names) == len(set(names)) and set(names) == set(defaults())
+    assert [state.progress for state in Project(tmp_path).states()][:3] == ["ready", "ready", "waits"]
+
+
+def test_grippers_from_cad_and_images_are_commands(tmp_path: Path):
+    project = Project(tmp_path)
+    (tmp_path / "camera.yaml").write_text("")
+    project.keep(
+        {"gripper": "from CAD", "gripper_file": "l.stl 'my r.stl'", "gripper_options": "--unit mm --view 0.12:30"}
+    )
+    project.keep({"jaw_range": "0:0.06"})
+    words, written = (
+        "gripmon gripper from-cad l.stl 'my r.stl' --jaw-range 0:0.06 --unit mm",
+        "--out gripper.yaml --force",
+    )
+    view = "--view 0.12:30 --camera camera.yaml --picture gripper.png"
+    assert project.states()[4].command == f"{words} {view} {written}" and project.states()[4].progress == "ready"
+    project.keep({"gripper": "from images", "gripper_file": "free", "gripper_options": "--distance 0.12:0.003"})
+    words = "gripmon gripper from-images free --camera camera.yaml --distance 0.12:0.003 --picture gripper.png"
+    assert project.states()[4].command == f"{words} --reference-out hand_eye.yaml {written}"
+    project.keep({"gripper_options": "'"})
+    assert "words as on a command line" in project.states()[4].note
+    project.keep({"gripper": "two_box_fingers", "reference_by": "with the gripper's images"})
+    with pytest.raises(InputError, match="no images gave this gripper"):
+        project.do("standing")
+
+
+def test_what_the_ruler_says_scales_the_target(tmp_path: Path):
+    project = Project(tmp_path)
+    project.keep({"bar_measured": "153"})
+    lines = project.do("target")
+    assert lines[-1].text == "the target is circles:12x10:0.00816:0.00408"  # 2 % larger, as the bar of 150 mm
+    assert read_yaml(tmp_path / "setup.yaml")["values"]["bar_measured"] == "153"
+    again = Project(tmp_path)
+    assert again.states()[1].progress == "done" and target_in(again.values) == target_in(project.values)
+    again.keep({"have": "I have one"})
+    assert target_in(again.values) == TARGET
+
+
+def test_a_project_that_cant_be_read_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "setup.yaml").write_text("values: [1, 2]\n")
+    assert main(["setup", str(tmp_path), "--step", "camera"]) == 2
+    assert "values: isn't a table of texts" in capsys.readouterr().err
+    (tmp_path / "setup.yaml").unlink()
+    (tmp_path / "file").write_text("")
+    assert main(["setup", str(tmp_path / "file"), "--step", "camera"]) == 2
+    assert main(["setup", str(tmp_path), "--step", "nose"]) == 2
+    assert "is no step; one of camera, target" in capsys.readouterr().err
+    assert main(["setup", str(tmp_path), "--step", "run"]) == 2
+    assert "gripmon run config.yaml --out run" in capsys.readouterr().err
+    assert main(["setup", str(tmp_path), "--step", "intrinsics"]) == 2
+    assert "first: Images of the target (plate)" in capsys.readouterr().err
+
+
+def test_steps_as_commands(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "arm"
+    assert main(["setup", str(folder), "--source", str(images / "plate"), "--step", "camera"]) == 0
+    assert main(["setup", str(folder), "--step", "target"]) == 0
+    assert main(["setup", str(folder), "--step", "plate"]) == 0
+    assert "OK    12 images in plate" in capsys.readouterr().out
+    assert main(["setup", str(folder), "--step", "intrinsics"]) == 0
+    assert "written: camera.yaml" in capsys.readouterr().out
+    found = read_yaml(folder / "camera.yaml")
+    assert found["target"] == new_user.TARGET
+    assert found["provenance"]["command"].startswith("gripmon calibrate intrinsics plate --target circles:")
+    assert abs(found["camera"]["fx_px"] - 962.0) < 1.0
+    # A command that fails says why, and what was there stays.
+    project = Project(folder)
+    project.keep({"target": "chequerboard:9x6:0.02"})
+    before = (folder / "camera.yaml").read_bytes()
+    with pytest.raises(NoResultError, match="none of 12 images shows the target"):
+        project.do("intrinsics")
+    assert (folder / "camera.yaml").read_bytes() == before
+
+
+def test_a_gripper_of_the_library_and_every_kind_of_reference(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Corners by name on the teaching page; then a plate, the robot's own file, or these corners alone."""
+    monkeypatch.chdir(tmp_path)
+    given = f"calibrate intrinsics {images / 'plate'} --target {new_user.TARGET} --model paper --out given.yaml"
+    assert main(given.split()) == 0
+    project = Project(tmp_path)
+    project.keep({"gripper": "two_box_fingers", "source": str(images / "standing"), "have": "I have one"})
+    project.keep({"intrinsics_by": "a file", "camera_file": "given.yaml"})
+    with pytest.raises(InputError, match=r"first: Lens \(camera.yaml\)"):
+        project.do("reference")
+    for step in ("camera", "target", "intrinsics", "gripper"):
+        project.do(step)
+    for folder in ("standing", "teaching"):
+        (tmp_path / folder).mkdir()
+        shutil.copy(images / "standing" / "0.png", tmp_path / folder / "000.png")
+    site, truth = SetupSite(project), json.loads((images / "standing" / "truth.json").read_text())
+    opening_m, rng, corners = truth["jaw_opening_m"], np.random.default_rng(7), {}
+    for name in ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far"):
+        u, v = (np.array(truth["corners"][name]) + rng.uniform(-4.0, 4.0, 2)).tolist()
+        corners[f"{name[0].upper()}_in_{name.rpartition('_')[2]}"] = u, v
+    try:
+        assert _sent(site, "open", Do(step="corners")) == {"url": "page/"}
+        assert _shown(site)["saves"] == ["corners"]
+        put = Put(corners=corners, image=0, jaw_opening_m=opening_m)
+        order = SaveOrder(put=put, robot="arm1", camera_name="wrist", config=False, taught=False)
+        assert _sent(site, "page/save", order).written == {"standing/corners.yaml": "the corners"}
+        _sent(site, "page/done", Nothing())
+        assert site.get("page/state") is None
+        project.keep({"jaw_opening": str(opening_m)})
+        project.do("reference")
+        found, true = read_yaml(tmp_path / "hand_eye.yaml")["cam_T_grip"], np.array(truth["cam_T_grip"])
+        np.testing.assert_allclose(found["translation_m"], true[:3, 3], atol=5e-5)
+        (tmp_path / "robot.yaml").write_text(yaml.safe_dump({"cam_T_grip": found}))
+        project.keep({"reference_by": "a file", "reference_file": "robot.yaml"})
+        project.do("reference")
+        _sent(site, "open", Do(step="teach"))
+        assert _shown(site)["needed"] == 0  # the reference is known
+        put = Put(corners={}, image=0, jaw_opening_m=opening_m)
+        saved = _sent(site, "page/save", SaveOrder(put=put, robot="arm1", camera_name="wrist"))
+        assert "the configuration" in saved.written.values()
+        config = load_config(tmp_path / "config.yaml")
+        assert config.reference.covariance[0] == pytest.approx(1e-6)  # (1 mm)²
+        _drawn_where_it_is(config, truth, tmp_path / "teaching" / "000.png")
+        assert {line.level for line in project.do("check")} <= {"OK", "WARN"} and project.checked()
+        project.keep({"reference_by": "from corners alone"})
+        states = {state.name: state for state in project.states()}
+        assert states["reference"].progress == "skipped" and "--reference" not in states["teach"].command
+        _sent(site, "open", Do(step="teach"))
+        assert _shown(site)["needed"] == 4
+        _started_and_stopped(site, tmp_path)
+        with pytest.raises(BadRequest, match="no step nose"):
+            _sent(site, "open", Do(step="nose"))
+        project.keep({"gripper": "from the plate"})
+        with pytest.raises(InputError, match="that is inferred needs its images on the target"):
+            project.do("standing")
+    finally:
+        site.close()
+
+
+def _drawn_where_it_is(config: Config, truth: dict[str, Any], path: Path) -> None:
+    """The overlay's colour is at the simulator's corners, and nowhere without a transform."""
+    image, true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.array(truth["cam_T_grip"])
+    x, y, z, w = Rotation.from_matrix(true[:3, :3]).as_quat().tolist()
+    places = np.rint([truth["corners"][name] for name in truth["corners"] if "inner" in name]).astype(int)
+    for verdict, transform in ((Verdict.VALID, true), (Verdict.SUSPECT, true), (Verdict.UNKNOWN, None)):
+        pose = None if transform is None else Transform(tuple(transform[:3, 3].tolist()), (x, y, z, w))
+        changes = {"verdict": verdict, "cam_T_grip": pose, "corners": (), "jaw_opening_m": truth["jaw_opening_m"]}
+        jpeg = overlay(config, frame_record(**changes), np.asarray(image))
+        blue, green, red = np.moveaxis(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int), 2, 0)
+        coloured = {"valid": green - red > 60, "suspect": red - blue > 60, "unknown": abs(red - blue) > 60}[
+            verdict.value
+        ]
+        near = [coloured[v - 3 : v + 4, u - 3 : u + 4].any() for u, v in places]
+        assert all(near) if transform is not None else not coloured.any(), verdict
+
+
+def _started_and_stopped(site: SetupSite, folder: Path) -> None:
+    """The monitor waits for a camera that isn't there, until it is told to end."""
+    values = read_yaml(folder / "config.yaml")
+    values["source"], values["publish"] = {"kind": "live", "device": "/dev/video987"}, {"listen": [free_endpoint()]}
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    _sent(site, "start", Nothing())
+    wait_until(lambda: any("/dev/video987" in line for line in site.state().monitor.lines), "what the monitor says")
+    assert site.state().monitor.running and site.state().monitor.ended is None
+    with pytest.raises(BadRequest, match="runs already"):
+        _sent(site, "start", Nothing())
+    with pytest.raises(BadRequest, match="the monitor has the camera"):
+        _sent(site, "capture", CaptureOrder(step="teaching", action="start"))
+    _sent(site, "stop", Nothing())
+    assert (site.state().monitor.running, site.state().monitor.ended) == (False, "stopped")
+    (folder / "config.yaml").write_text("robot: [\n")
+    with pytest.raises(BadRequest, match=r"config\.yaml"):
+        _sent(site, "start", Nothing())
+
+
+def _shown(site: SetupSite) -> dict[str, Any]:
+    found = site.get("page/state")
+    assert found is not None
+    state: dict[str, Any] = msgspec.json.decode(found[0])
+    return state
+
+
+def _sent(site: SetupSite, path: str, order: Any) -> Any:
+    action = site.post(path)
+    assert action is not None and isinstance(order, action[0])
+    return action[1](order)

@@ -1,0 +1,205 @@
+"""``gripmon setup`` in a real browser, from nothing to a running monitor on simulated images, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from support import new_user
+from support.loopback import wait_for_default_port
+from support.setup_walk import Walker, walk
+from support.simulated import BOX_FINGERS
+from support.teach_page_browser import browser, page
+
+from gripmon.daemon.config import load_config
+from gripmon.model.geometry import perturbation_between
+
+
+@pytest.fixture(scope="module")
+def user(tmp_path_factory: pytest.TempPathFactory) -> new_user.NewUser:
+    return new_user.make(tmp_path_factory.mktemp("images"))
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[Any]:
+    opened = browser()
+    yield opened
+    opened.quit()
+
+
+Walked = tuple[Path, dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def walked(user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Walked:
+    """The project of a person who went the whole way, and what the page looked like after each step."""
+    wait_for_default_port()
+    folder, seen = tmp_path_factory.mktemp("way") / "arm1", {}
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+
+        def at(step: str) -> None:
+            seen[step] = {"ugly": visitor.ugly(), "status": visitor.text("#status"), "said": visitor.text("#said")}
+            seen[step] |= {"command": visitor.text("#command code"), "log": visitor.text("#log")}
+
+        walk(visitor, user, at)
+        assert visitor.complaints() == []
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+    return folder, seen
+
+
+def test_from_nothing_to_a_running_monitor(user: new_user.NewUser, walked: Walked):
+    folder, seen = walked
+    assert "768 x 576 px" in seen["camera"]["said"]
+    assert (folder / "target.pdf").read_bytes().startswith(b"%PDF")
+    config = load_config(folder / "config.yaml")
+    assert config.settings.robot == "arm1" and config.taught is not None
+    error = perturbation_between(config.cam_T_grip, user.cam_T_grip[0])
+    assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()  # as the commands by hand give it (test_whole_way.py)
+    assert "OKsource" in seen["check"]["said"] and "FAIL" not in seen["check"]["said"]
+    assert "transform" in seen["running"]["status"]
+    assert "a step against the reference" in seen["run"]["log"] and "stopped after 90 frames" in seen["run"]["log"]
+    lines = [json.loads(line) for line in (folder / "run" / "estimates.jsonl").read_text().splitlines()]
+    assert len(lines) == 90 and sum(line["verdict"] == "valid" for line in lines[: new_user.STEP]) > 0.9 * new_user.STEP
+    commands = {step: each["command"] for step, each in seen.items()}
+    assert commands["intrinsics"].startswith("gripmon calibrate intrinsics plate --target circles:12x10:0.008:0.004")
+    assert "--infer" in commands["reference"] and commands["run"] == "gripmon run config.yaml --out run"
+
+
+def test_nothing_overflows_or_overlaps_at_three_widths(walked: Walked):
+    assert {step: each["ugly"] for step, each in walked[1].items() if each["ugly"]} == {}
+
+
+def test_it_goes_on_where_it_stopped(walked: Walked, driver: Any, tmp_path: Path):
+    folder = tmp_path / "again"
+    shutil.copytree(walked[0], folder, copy_function=shutil.copy2)
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        steps = visitor.script("return [...document.querySelectorAll('[data-step]')].map((b) => b.dataset.step)")
+        assert {step: visitor.progress(step) for step in steps} == dict.fromkeys(steps, "done")
+        (folder / "camera.yaml").touch()
+        visitor.wait(lambda: visitor.progress("reference") == "stale", "what the lens was for is old")
+        assert visitor.progress("intrinsics") == "done" and visitor.progress("plate") == "done"
+        visitor.go("target")
+        visitor.fill(target="circles:12x10:0.009:0.004")
+        visitor.press("step")
+        visitor.wait(lambda: visitor.progress("intrinsics") == "stale", "another target")
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+    kept = yaml.safe_load((folder / "setup.yaml").read_text())["values"]
+    assert kept["target"] == "circles:12x10:0.009:0.004" and kept["robot"] == "arm1"
+
+
+def test_bad_input_is_one_line_and_nothing_is_lost(user: new_user.NewUser, driver: Any, tmp_path: Path):
+    folder = tmp_path / "bad"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        for source, words in (
+            ("", "no camera is named"),
+            ("nowhere", "there is no such folder"),
+            (str(empty), "no image in"),
+            ("zenoh:1280", "names no camera"),
+        ):
+            visitor.fill(source=source)
+            visitor.press("step")
+            visitor.refused(words)
+        visitor.fill(source=str(user.folder / "work"), robot="arm/1")
+        visitor.press("step")
+        visitor.refused("robot name", "can't be part")
+        assert visitor.script("return document.querySelector('[name=source]').value") == str(user.folder / "work")
+        visitor.fill(robot="arm1")
+        visitor.press("step")
+        visitor.done("camera")
+        visitor.go("target")
+        for values, words in (
+            ({"target": "squares:3x3:1"}, "is no target"),
+            ({"target": "chequerboard:9x6:25"}, "millimetres?"),
+            ({"target": "circles:12x10:0.008:0.004", "paper": "a9"}, "is no paper"),
+            ({"paper": "50x60"}, "too small"),
+            ({"paper": "a4", "bar_measured": "15"}, "near the 150 mm"),
+        ):
+            visitor.fill(**values)
+            visitor.press("step")
+            visitor.refused(words)
+        visitor.fill(bar_measured="148.5")
+        visitor.press("step")
+        visitor.done("target")
+        assert "circles:12x10:0.00792:0.00396" in visitor.text("#said")  # a hundredth smaller, as the ruler says
+        visitor.go("intrinsics")
+        visitor.press("step")
+        visitor.refused("first: Images of the target")
+        visitor.go("plate")
+        visitor.fill(plate_source=str(empty))
+        visitor.press("step")
+        visitor.refused("no image in")
+        visitor.fill(plate_source=str(user.folder / "work"))
+        visitor.press("step")
+        visitor.press("take")
+        visitor.refused("not taken: ")
+        visitor.go("gripper")
+        visitor.fill(gripper="a file", gripper_file=str(folder / "setup.yaml"))
+        visitor.press("step")
+        visitor.refused("setup.yaml", "name")
+        visitor.fill(gripper="two_box_fingers")
+        visitor.press("step")
+        visitor.done("gripper")
+        assert (folder / "gripper.yaml").read_bytes() == Path(BOX_FINGERS).read_bytes()
+        visitor.go("run")
+        visitor.press("step")
+        visitor.refused("config.yaml")
+        assert all("400" in line for line in visitor.complaints())  # the browser notes each refusal
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+
+
+def test_later_steps_refuse_in_one_line_and_keep_what_is_there(walked: Walked, driver: Any, tmp_path: Path):
+    folder = tmp_path / "later"
+    shutil.copytree(walked[0], folder, copy_function=shutil.copy2)
+    kept = {name: (folder / name).read_bytes() for name in ("hand_eye.yaml", "gripper.yaml", "config.yaml")}
+    small = np.zeros((48, 64), np.uint8)
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        visitor.go("gripper")
+        visitor.fill(jaw_range="wide")
+        visitor.press("step")
+        visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "the gripper")
+        visitor.go("reference")
+        visitor.press("step")
+        visitor.refused("--jaw-range", "isn't a range")
+        visitor.go("standing")
+        visitor.fill(reference_by="a file")
+        visitor.press("step")
+        visitor.refused("that is inferred needs its images")
+        visitor.fill(reference_by="on the plate", standing_source="nowhere")
+        visitor.press("step")
+        visitor.refused("no such folder")
+        first = (folder / "standing" / "000.png").read_bytes()
+        cv2.imwrite(str(folder / "standing" / "000.png"), small)
+        visitor.go("corners")
+        visitor.press("step")
+        visitor.refused("64 x 48 px; the camera's 768 x 576 px")
+        (folder / "standing" / "000.png").write_bytes(first)
+        cv2.imwrite(str(folder / "teaching" / "000.png"), small)
+        visitor.go("teach")
+        visitor.press("step")
+        visitor.refused("000.png", "64x48 pixels")
+        assert {name: (folder / name).read_bytes() for name in kept} == kept
+        (folder / "config.yaml").write_text("robot: [")
+        visitor.go("check")
+        visitor.press("step")
+        visitor.refused("config.yaml")
+        visitor.go("run")
+        visitor.press("step")
+        visitor.refused("config.yaml")
+        visitor.click("#done")
+        assert running.ended() == (0, "")
