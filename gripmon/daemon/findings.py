@@ -220,7 +220,9 @@ def _mount(reference: ReferenceValues) -> Finding:
 def _view(in_view: InView, gripper: GripperValues) -> Finding:
     if not in_view.enough:
         return Finding("FAIL", "view", f"nothing can be measured: {in_view.reason}")
-    seen = f"{in_view.corners} of {gripper.corners} corners and {in_view.edges} edges can be measured"
+    few = gripper.corners < in_view.corners_needed  # then the ends of its curves stand for them
+    corners = f"{in_view.corners} ends of curves" if few else f"{in_view.corners} of {gripper.corners} corners"
+    seen = f"{corners} and {in_view.edges} edges can be measured"
     spans = {} if in_view.camera_may_move is None else in_view.camera_may_move.shift_m
     shifts = [amount for span in spans.values() for amount in span if amount is not None]
     if not shifts:
