@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from gripmon.record.export import export
     from gripmon.teach.api import teach as teach_edges
     from gripmon.teach.cad import gripper_from_cad
+    from gripmon.teach.from_images import gripper_from_images
     from gripmon.teach.hand_eye import calibrate_plane
 
 __version__ = "0.1.0"
@@ -58,6 +59,7 @@ _WHERE = {
     "export": "record.export",
     "forecast": "daemon.forecast",
     "gripper_from_cad": "teach.cad",
+    "gripper_from_images": "teach.from_images",
     "load_config": "daemon.config",
     "open_source": "daemon.api",
     "replay": "daemon.replaying",
@@ -88,6 +90,7 @@ __all__ = [
     "export",
     "forecast",
     "gripper_from_cad",
+    "gripper_from_images",
     "load_config",
     "open_source",
     "replay",

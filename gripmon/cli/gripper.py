@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from gripmon.cli import gripper_cad
+from gripmon.cli import gripper_cad, gripper_images
 
-_WAYS = (gripper_cad.from_cad,)
+_WAYS = (gripper_cad.from_cad, gripper_images.from_images)
 
 _DESCRIPTION = """\
 Make a gripper file from what there is of a gripper.  Each way writes it whole or not at all, and

@@ -342,7 +342,8 @@ def gripper_values(model: GripperModel) -> dict[str, Any]:
     out["fingers"] = {
         name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()
     }
-    out["edges"] = {name: {"from": edge["from"], "to": edge["to"]} for name, edge in out["edges"].items()}
+    plain = {"kind": "contour", "brighter": "any", "bevel_m": 0.0}
+    out["edges"] = {name: {k: v for k, v in edge.items() if v != plain.get(k)} for name, edge in out["edges"].items()}
     return {key: value for key, value in out.items() if value not in (None, [], ())}
 
 

@@ -29,6 +29,7 @@ LONGEST = (
     "test_gripper_cad_tracked",
     "test_fleet_load",
     "test_network_camera",
+    "test_gripper_from_images",
     "test_run_on_the_network",
     "test_simulator_pictures",
     "test_smoothing",

@@ -1,0 +1,131 @@
+"""``gripmon gripper from-images``: a gripper file from images before changing backgrounds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli.common import (
+    REQUIRED,
+    Command,
+    check_outputs,
+    command_line,
+    positive_number,
+    progress_bar,
+    write_document,
+    write_picture,
+)
+from gripmon.model.errors import InputError
+
+if TYPE_CHECKING:
+    from gripmon.teach.from_images import GripperFromImages
+
+_DESCRIPTION = """\
+The outline of a gripper, its inner edges and its place, from ten to a hundred images of the wrist
+camera: the robot moves, so that the background changes, and the gripper stays.  No dimensions, no
+straight edges, no plate are needed; one length is: the distance of the fingertips from the camera, or
+the width of a finger.  Images at several jaw openings, in metres in a timestamps.csv beside them as
+gripmon replay takes it, tell how the fingers move, and the length, too.
+
+Ten images at least of each opening, in focus, each before another background, lit as in use.  Where
+the fingers' long edges meet in one point (their vanishing point) they are placed in space; else the
+outline is taken as flat, facing the camera.  What isn't known is said and in the reference's covariance.
+
+Written are the gripper file and, with --reference-out, the reference that belongs to it."""
+
+_OPTIONS = """
+IMAGE...                image file, or folder with images
+--camera FILE.yaml      file of gripmon calibrate intrinsics
+--distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m)
+| --finger-width M:SIGMA
+                        width of a fingertip across the jaws, with its standard deviation (m)
+| --reference FILE.yaml
+                        calibration of hand and eye, of gripmon calibrate plane or another one: its frame is kept
+--name NAME             the gripper's name (default: gripper)
+--out FILE.yaml         gripper file to write
+--reference-out FILE.yaml
+                        reference to write, for a configuration's `reference:`
+--picture FILE.png      also draw outline, scatter and fingers over the first image
+--force                 replace files that are there
+--json                  one JSON object instead of text; m, rad, px
+"""
+
+_EXAMPLES = """\
+  gripmon gripper from-images free/ --camera camera.yaml --distance 0.12:0.003 \\
+      --out gripper.yaml --reference-out reference.yaml --picture gripper.png
+  gripmon gripper from-images openings/ --camera camera.yaml --out gripper.yaml \\
+      --reference-out reference.yaml
+
+exit codes: 0 written; 2 wrong usage or files; 3 the images show no gripper, and why: nothing is
+written then"""
+
+
+def _length(text: str) -> tuple[float, float]:
+    value, colon, sigma = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' doesn't say how exact it is; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
+        )
+    found = positive_number(value), positive_number(sigma)
+    if found[0] > 2.0:
+        raise argparse.ArgumentTypeError(f"{value} m is no distance at a wrist (millimetres?); metres")
+    if found[1] > 0.5 * found[0]:
+        raise argparse.ArgumentTypeError(
+            f"'{text}': a standard deviation of more than half of it says nothing; smaller"
+        )
+    return found
+
+
+@Command(
+    "from-images", "from images before changing backgrounds", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    camera=REQUIRED, distance=_length, finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
+)  # fmt: skip
+def from_images(arguments: argparse.Namespace) -> None:
+    """Handle ``gripmon gripper from-images``."""
+    import cv2
+
+    from gripmon.daemon.gripper_images import images_inputs
+    from gripmon.model.images import image_paths
+    from gripmon.model.provenance import provenance_of
+    from gripmon.teach.from_images import gripper_from_images
+    from gripmon.teach.hand_eye import gripper_values
+
+    outputs = [arguments.out, arguments.reference_out, arguments.picture]
+    paths = [path.resolve() for path in outputs if path is not None]
+    if len(set(paths)) < len(paths):
+        raise InputError("gripper from-images: --out, --reference-out, --picture name the same file; different files")
+    check_outputs(arguments, "out", "reference_out", "picture")
+    cv2.setNumThreads(1)
+    images = image_paths(arguments.image)
+    given = images_inputs(images, arguments.camera, arguments.reference)
+    provenance = provenance_of(command_line(arguments), list(dict.fromkeys([*images, *given.files])))
+    found = gripper_from_images(
+        images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
+        finger_width_m=arguments.finger_width, reference=given.reference, name=arguments.name, provenance=provenance,
+        progress=progress_bar,
+    )  # fmt: skip
+    write_document(gripper_values(found.gripper.model), arguments.out)
+    written = [arguments.out]
+    if arguments.reference_out is not None:
+        write_document(found.document(provenance), arguments.reference_out, "--reference-out")
+        written.append(arguments.reference_out)
+    if arguments.picture is not None:
+        write_picture(found.picture(), arguments.picture)
+        written.append(arguments.picture)
+    values = {**found.values(), "written": [str(path) for path in written]}
+    print(json.dumps(values, indent=2) if arguments.json else "\n".join(_lines(found, values)))
+
+
+def _lines(found: GripperFromImages, values: dict[str, Any]) -> list[str]:
+    """What a person should know."""
+    lines = [f"left out: {file}: {why}" for file, why in found.left_out.items()]
+    for name, finger in values["fingers"].items():
+        corners, edges, inner = finger["corners"], finger["edges"], finger["inner_edges"]
+        lines.append(f"{name}: {edges} edges of its outline, {inner} inner ones, {corners} corners")
+    lines.append(f"outline known to {found.outline_sigma_px:.3f} px (median), by {found.images} images")
+    x, y, z = (1e3 * value for value in values["cam_T_grip"]["translation_m"])
+    sx, sy, sz = (1e3 * found.covariance[k, k] ** 0.5 for k in range(3))
+    lines.append(f"TCP in the camera frame  {x:.2f} {y:.2f} {z:.2f} mm  +- {sx:.2f} {sy:.2f} {sz:.2f} mm")
+    lines += [f"note: {note}" for note in found.notes]
+    return [*lines, *(f"written: {path}" for path in values["written"])]

@@ -1,0 +1,63 @@
+"""What ``gripmon gripper from-images`` is given, read from files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gripmon.daemon.calibrations import read_calibrated, read_given_camera
+from gripmon.io.sources import SourceError
+from gripmon.io.sources.files import TIMESTAMPS_NAME, read_table
+from gripmon.model.camera import LensSettings
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record
+from gripmon.model.records import Array
+
+
+@dataclass(frozen=True)
+class ImagesInputs:
+    """The ``camera``; the jaw's opening in each image (m), None without tables; the reference ``cam_T_grip`` (4, 4)
+    with its covariance (6, 6), if one is named; the ``files`` read.
+    """
+
+    camera: LensSettings
+    openings_m: list[float | None] | None
+    reference: tuple[Array, Array] | None
+    files: tuple[Path, ...]
+
+
+def images_inputs(images: list[Path], camera: Path, reference: Path | None) -> ImagesInputs:
+    """Read the files; openings from a ``timestamps.csv`` beside each image, where there is one.
+    :class:`~gripmon.model.errors.InputError`.
+    """
+    files = [camera, *([] if reference is None else [reference])]
+    pose = None
+    if reference is not None:
+        found = read_calibrated(reference)
+        if found.cam_T_grip is None or found.covariance is None:
+            raise InputError(f"{reference}: holds no pose of a gripper; a file of gripmon calibrate plane", "reference")
+        pose = from_record(found.cam_T_grip), np.reshape(found.covariance, (6, 6))
+    return ImagesInputs(read_given_camera(camera).lens, _openings(images), pose, tuple(files))
+
+
+def _openings(images: list[Path]) -> list[float | None] | None:
+    tables = {}
+    for folder in dict.fromkeys(path.parent for path in images):
+        if (folder / TIMESTAMPS_NAME).exists():
+            try:
+                tables[folder] = read_table(folder / TIMESTAMPS_NAME)
+            except SourceError as error:
+                raise InputError(str(error)) from None
+    rows = [tables.get(path.parent, {}).get(path.name) for path in images]
+    openings = [None if row is None else row.jaw_opening_m for row in rows]
+    if all(opening is None for opening in openings):
+        return None
+    for path, opening in zip(images, openings, strict=True):
+        if opening is None:
+            raise InputError(
+                f"{path}: its jaw opening isn't known and that of others is; jaw_opening_m in "
+                f"{path.parent / TIMESTAMPS_NAME} for all of them, or for none"
+            )
+    return openings

@@ -1,0 +1,303 @@
+"""Where in space the outlines of fingers lie that one camera sees from one side: up to one length, perspective tells.
+
+Long edges of a finger that run along it are parallel in space, so their images meet in one point, which is the fingers'
+direction (the vanishing point; Caprile and Torre 1990).  Fingertips end square to that: their outline lies in the
+contact
+plane, and the long edges run back from it.  Where edges don't meet so, the outline is taken as flat, facing the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.records import Array
+
+LONG_PX = 30.0
+"""Edges that tell a direction: 0.1 px at each end is 0.3 degrees."""
+PARALLEL_RAD = math.radians(0.6)
+"""By which a long edge may miss the vanishing point: twice what 30 px tell."""
+FEWEST_PARALLEL = 3
+MAJORITY = 0.5
+"""Part of the length of the edges that may run along the fingers that has to, as where the monitor looks for their
+ends."""
+ALONG_RAD = math.radians(50.0)
+"""Between an edge's image and the way to the tip: perspective turns edges along a finger by up to so much."""
+STEEPEST = 0.25
+"""Cosine between line of sight and fingers below which a contact plane is seen too obliquely to place corners on it."""
+_ROUNDS = 4
+FLAT_SIGMA_RAD = math.radians(26.0)
+"""Of a plane whose tilt isn't known: anything up to 45 degrees (45 / sqrt(3))."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A finger's outline: ``xy`` (v, 2) of its vertices in ideal coordinates, ``corner`` (v,), ``pieces`` as pairs of
+    vertices, ``outwards`` (2,): the way to its tip in the image, ``length_px`` (p,) of the pieces; ends ``inner_xy``
+    (i, 2, 2) and
+    lengths ``inner_px`` (i,) of its inner edges.
+    """
+
+    name: str
+    xy: Array
+    corner: NDArray[np.bool_]
+    pieces: tuple[tuple[int, int], ...]
+    outwards: Array
+    length_px: Array
+    inner_xy: Array
+    inner_px: Array
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Outlines in space at unit depth of the TCP.  ``points`` for each finger (v, 3) in the camera frame, NaN where
+    not known; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
+    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.
+    """
+
+    points: tuple[Array, ...]
+    kept: tuple[tuple[tuple[int, int], ...], ...]
+    rotation: Array
+    tcp: Array
+    flat: bool
+    sigma_rad: Array
+
+
+def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
+    """The fingers in space, from their perspective, or with ``rotation`` (3, 3) and ``tcp`` (3,) at unit depth, where a
+    calibration has them.
+    """
+    given = None if rotation is None else rotation[:, 2]
+    direction, sigma = (given, 0.0) if given is not None else finger_direction(fingers)
+    centre = tip_centre(fingers)
+    if direction is not None and abs(float(direction @ _ray(centre)) / float(np.linalg.norm(_ray(centre)))) < STEEPEST:
+        direction = None
+    if direction is None or sigma > FLAT_SIGMA_RAD:
+        return _flat(fingers, centre, rotation, tcp)
+    runs = [_tip_and_sides(finger, direction) for finger in fingers]
+    if any(not tip for tip, _ in runs):
+        return _flat(fingers, centre, rotation, tcp)
+    plane_at = _ray(centre) if tcp is None else tcp
+    points = [
+        _on_contact_plane(f, tip, sides, direction, plane_at) for f, (tip, sides) in zip(fingers, runs, strict=True)
+    ]
+    tips = [sorted(tip) for tip, _ in runs]
+    if rotation is None or tcp is None:
+        inner = _innermost([p[t] for p, t in zip(points, tips, strict=True)])
+        tcp = np.mean(inner, axis=0)
+        points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
+        rotation = _axes(inner, direction, across=_across_inner_edges(fingers, points, tips, direction))
+    kept = tuple(
+        tuple(piece for piece in finger.pieces if np.isfinite(p[list(piece)]).all())
+        for finger, p in zip(fingers, points, strict=True)
+    )
+    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma))
+
+
+def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
+    """Unit vector (3,) out of the gripper and its standard deviation (rad); None where no three long edges agree."""
+    lines, middles, ways, lengths = [], [], [], []
+    for finger in fingers:
+        ends = np.concatenate([finger.xy[np.reshape(finger.pieces, (-1, 2))], finger.inner_xy])
+        for (a, b), length in zip(ends, np.append(finger.length_px, finger.inner_px), strict=True):
+            way = (b - a) / np.linalg.norm(b - a)
+            if length >= LONG_PX and abs(float(way @ finger.outwards)) > math.cos(ALONG_RAD):
+                middles.append(0.5 * (a + b))
+                ways.append(way)
+                lengths.append(length)
+                lines.append(np.cross(_ray(a), _ray(b)))
+    if len(lines) < FEWEST_PARALLEL:
+        return None, 0.0
+    line = np.array([n / np.linalg.norm(n[:2]) for n in lines])
+    middle, way, worth = np.array(middles), np.array(ways), np.array(lengths)
+    best: tuple[float, NDArray[np.bool_]] | None = None
+    for i in range(len(line)):
+        for j in range(i):
+            meet = np.cross(line[i], line[j])
+            if not np.linalg.norm(meet) > 1e-6:
+                continue
+            on = _missed(meet, middle, way) < PARALLEL_RAD
+            score = float(worth[on].sum())
+            enough = np.count_nonzero(on) >= FEWEST_PARALLEL and score > MAJORITY * float(worth.sum())
+            if enough and (best is None or score > best[0]):
+                best = score, on
+    if best is None:
+        return None, 0.0
+    on = best[1]
+    weighted = line[on] * worth[on, None]
+    meet = np.linalg.svd(weighted)[2][2]
+    sigma = _direction_sigma(meet, middle[on], line[on])
+    outwards = np.sum([finger.outwards for finger in fingers], axis=0)
+    centre = tip_centre(fingers)
+    moved = _image_way(meet, centre)
+    sign = 1.0 if float(moved @ outwards) > 0.0 else -1.0
+    return sign * meet / np.linalg.norm(meet), sigma
+
+
+def _direction_sigma(meet: Array, middle: Array, line: Array) -> float:
+    """Standard deviation (rad) of a direction whose image n lines (n, 3) through ``middle`` (n, 2) meet in, each known
+    to half of :data:`PARALLEL_RAD`; large where they are nearly one line.
+    """
+    at = meet[:2] / (meet[2] if abs(meet[2]) > 1e-9 else 1e-9)
+    off = 0.5 * PARALLEL_RAD * np.linalg.norm(at - middle, axis=1)
+    information = (line[:, :2] / off[:, None]).T @ (line[:, :2] / off[:, None])
+    return float(np.sqrt(1.0 / max(float(np.linalg.eigvalsh(information)[0]), 1e-12)) / math.hypot(1.0, *at))
+
+
+def _image_way(direction: Array, xy: Array) -> Array:
+    """Way (2,) in the image of a point that goes along a direction in space."""
+    return np.asarray(direction[:2] - direction[2] * xy)
+
+
+def _missed(meet: Array, middle: Array, way: Array) -> Array:
+    """Angles (n,) by which lines miss a point of the image plane."""
+    to = meet[:2] - meet[2] * middle
+    to = to / np.maximum(np.linalg.norm(to, axis=1), 1e-12)[:, None]
+    return np.asarray(np.arcsin(np.minimum(np.abs(to[:, 0] * way[:, 1] - to[:, 1] * way[:, 0]), 1.0)))
+
+
+def _ray(xy: Array) -> Array:
+    return np.array([xy[0], xy[1], 1.0])
+
+
+def tip_centre(fingers: Sequence[Outline]) -> Array:
+    """Middle (2,) between the foremost vertices of all fingers, ideal coordinates."""
+    return np.asarray(np.mean([f.xy[int((f.xy @ f.outwards).argmax())] for f in fingers], axis=0))
+
+
+def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tuple[int, int]]]:
+    """Vertices of the tip's outline, and the pieces along the finger that follow it on both sides, outwards first; the
+    rest, as a body that carries the finger, has another depth.
+    """
+    along = {
+        piece
+        for piece in finger.pieces
+        if _missed(direction, 0.5 * finger.xy[list(piece)].sum(axis=0)[None], _unit(finger.xy, piece)[None])[0]
+        < 2.0 * PARALLEL_RAD
+    }
+    links: dict[int, list[tuple[int, tuple[int, int]]]] = {}
+    for a, b in finger.pieces:
+        links.setdefault(a, []).append((b, (a, b)))
+        links.setdefault(b, []).append((a, (a, b)))
+    first = int((finger.xy @ finger.outwards).argmax())
+    tip, sides, work = {first}, [], [(first, False)]
+    seen: set[tuple[int, int]] = set()
+    while work:
+        at, behind = work.pop()
+        for other, piece in links.get(at, ()):
+            if piece in seen:
+                continue
+            if piece in along:
+                seen.add(piece)
+                sides.append((at, other))
+                work.append((other, True))
+            elif not behind:
+                seen.add(piece)
+                tip.add(other)
+                work.append((other, False))
+    return (tip, sides) if sides else (set(), [])
+
+
+def _unit(xy: Array, piece: tuple[int, int]) -> Array:
+    way = xy[piece[1]] - xy[piece[0]]
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _on_contact_plane(
+    finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array
+) -> Array:
+    out = np.full((len(finger.xy), 3), np.nan)
+    height = float(direction @ plane_at)
+    for k in tip:
+        ray = _ray(finger.xy[k])
+        out[k] = ray * (height / float(direction @ ray))
+    for start, end in sides:
+        if np.isfinite(out[end]).all() or not np.isfinite(out[start]).all():
+            continue
+        out[end] = nearest_on_ray(_ray(finger.xy[end]), out[start], direction)
+    out[out[:, 2] <= 0.0] = np.nan
+    return out
+
+
+def nearest_on_ray(ray: Array, start: Array, direction: Array) -> Array:
+    """The point (3,) of a line of sight that is nearest to the parallel of the fingers through ``start``."""
+    normal = np.cross(direction, np.cross(ray, direction))
+    return np.asarray(ray * (float(normal @ start) / float(normal @ ray)))
+
+
+def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp: Array | None) -> Placed:
+    """All in one plane through the TCP that faces the camera."""
+    facing = _ray(centre if tcp is None else tcp[:2] / tcp[2])
+    facing = facing / np.linalg.norm(facing)
+    at = _ray(centre) if tcp is None else tcp
+    points = [np.array([_ray(xy) * float(facing @ at) / float(facing @ _ray(xy)) for xy in f.xy]) for f in fingers]
+    tips = [int((f.xy @ f.outwards).argmax()) for f in fingers]
+    sigma = np.zeros(3)
+    if rotation is None or tcp is None:
+        outwards = np.sum([f.outwards for f in fingers], axis=0)
+        direction = np.array([*outwards, 0.0]) - facing * float(facing[:2] @ outwards)
+        direction /= np.linalg.norm(direction)
+        inner = _innermost(points) if len(points) > 1 else [points[0][tips[0]]]
+        tcp = np.mean(inner, axis=0)
+        points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
+        rotation = _axes(inner, direction, facing)
+        sigma = np.array([FLAT_SIGMA_RAD, FLAT_SIGMA_RAD, 0.0])
+    return Placed(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, True, sigma)
+
+
+def _innermost(tips: Sequence[Array]) -> list[Array]:
+    """Middle (3,) of what each finger's tip (v, 3) shows nearest to the others, first and last; of one its own."""
+    points = [tip[np.isfinite(tip).all(axis=1)] for tip in (tips[0], tips[-1])]
+    if len(tips) == 1:
+        return [points[0].mean(axis=0)]
+    inner = [p.mean(axis=0) for p in points]
+    for _ in range(_ROUNDS):
+        across = inner[1] - inner[0]
+        far = [p @ across / float(np.linalg.norm(across)) for p in points]
+        # Vertices as far in as the innermost one, to a tenth of the gap: the paper's rectangle has two on each finger.
+        gap = abs(float(far[1].min() - far[0].max()))
+        near = far[0] > far[0].max() - 0.1 * gap, far[1] < far[1].min() + 0.1 * gap
+        inner = [p[chosen].mean(axis=0) for p, chosen in zip(points, near, strict=True)]
+    return inner
+
+
+def _across_inner_edges(
+    fingers: Sequence[Outline], points: Sequence[Array], tips: Sequence[Sequence[int]], direction: Array
+) -> Array | None:
+    """Direction (3,) square to the edges of two fingertips that face each other: jaws close square to those."""
+    if len(fingers) != 2:
+        return None
+    middles = [np.nanmean(p[list(t)], axis=0) for p, t in zip(points, tips, strict=True)]
+    across = middles[1] - middles[0]
+    across = across / np.linalg.norm(across)
+    total = np.zeros(3)
+    for finger, p, tip, middle, side in zip(fingers, points, tips, middles, (1.0, -1.0), strict=True):
+        ways = [
+            p[b] - p[a]
+            for a, b in finger.pieces
+            if a in tip and b in tip and side * float((0.5 * (p[a] + p[b]) - middle) @ across) > 0.0
+        ]
+        steep = [way for way in ways if abs(float(way @ across)) < math.sin(math.radians(30.0)) * np.linalg.norm(way)]
+        if not steep:
+            return None
+        longest = max(steep, key=lambda way: float(np.linalg.norm(way)))
+        total = total + longest * (1.0 if float(longest @ total) >= 0.0 else -1.0)
+    square = np.cross(total, direction)
+    return np.asarray(square * np.sign(float(square @ across)))
+
+
+def _axes(tips: Sequence[Array], direction: Array, facing: Array | None = None, across: Array | None = None) -> Array:
+    """Rotation (3, 3) of ``cam_T_grip``: x from the first finger to the last, or ``across``, z out of the gripper."""
+    if across is not None:
+        x = across / np.linalg.norm(across)
+        return np.column_stack([x, np.cross(direction, x), direction])
+    x = tips[-1] - tips[0] if len(tips) > 1 else np.cross(direction, facing if facing is not None else [0.0, 0.0, 1.0])
+    x = x - direction * float(direction @ x)
+    if len(tips) == 1 and x[0] < 0.0:
+        x = -x
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, np.cross(direction, x), direction])

@@ -1,0 +1,326 @@
+"""A gripper file from images before changing backgrounds: ``gripmon gripper from-images`` is this.
+
+The images show outlines and inner edges in pixels (:mod:`~gripmon.teach.image_outline`), perspective and the jaws'
+motion their places in space up to one length (:mod:`~gripmon.teach.finger_depth`, :mod:`~gripmon.teach.image_motion`),
+which somebody gives, a calibration knows, or the openings in metres tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.geometry import make_transform, to_record
+from gripmon.model.gripper import Gripper, GripperError
+from gripmon.model.images import check_size, images_of_one_camera
+from gripmon.model.progress import Progress, quiet
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Image
+from gripmon.teach.finger_depth import Placed, place
+from gripmon.teach.image_drawing import draw_outlines
+from gripmon.teach.image_model import Seen, build_model, finger_outlines, tip_width
+from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, motion_of
+from gripmon.teach.image_outline import OpeningSeen, see_opening
+from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, smallest_noise
+from gripmon.track.edges.taught import gripper_digest
+
+MOST_IMAGES = 200
+Length = tuple[float, float]
+"""A length and its standard deviation, m."""
+Pose = tuple[Array, Array]
+"""``cam_T_grip`` (4, 4) and the covariance (6, 6) of its error."""
+
+
+@dataclass(frozen=True)
+class GripperFromImages:
+    """``gripper`` and where it is: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the
+    TCP then rotation, camera axes.  ``opening_m`` that the coordinates hold at; ``outline_sigma_px`` median standard
+    deviation of the outline's vertices by their scatter over the images; ``left_out``: images that weren't used, and
+    why; ``notes``: what isn't known, or was taken for granted.
+    """
+
+    gripper: Gripper
+    cam_T_grip: Array
+    covariance: Array
+    opening_m: float | None
+    outline_sigma_px: float
+    images: int
+    left_out: dict[str, str]
+    notes: tuple[str, ...]
+    lens: LensSettings
+    seen: OpeningSeen
+    shown: Image
+    names: tuple[str, ...]
+    rms_px: float
+
+    def picture(self) -> Image:
+        """The first image that was used, with outline, scatter and fingers; BGR."""
+        return draw_outlines(self.shown, self.seen, self.names)
+
+    def values(self) -> dict[str, Any]:
+        """The result as plain values: m, rad, px."""
+        model, transform = self.gripper.model, to_record(self.cam_T_grip)
+        fingers = {}
+        for name in self.gripper.finger_ids:
+            own = [e for e in model.edges.values() if model.points[e.start].finger == name]
+            fingers[name] = {
+                "edges": sum(edge.kind == "contour" for edge in own),
+                "inner_edges": sum(edge.kind == "crease" for edge in own),
+                "corners": sum(point.corner for point in model.points.values() if point.finger == name),
+            }
+        return {
+            "fingers": fingers,
+            "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
+            "covariance": self.covariance.ravel().tolist(),
+            "jaw_opening_m": self.opening_m,
+            "outline_sigma_px": self.outline_sigma_px,
+            "images": self.images,
+            "left_out": self.left_out,
+            "notes": self.notes,
+        }
+
+    def document(self, provenance: Provenance) -> HandEyeCalibration:
+        """The reference, as a file has it."""
+        pixel_m = float(self.cam_T_grip[2, 3]) / self.lens.fx_px
+        return HandEyeCalibration(
+            camera=self.lens,
+            gripper=CalibratedGripper(name=self.gripper.name, sha256=gripper_digest(self.gripper)),
+            jaw_opening_m=self.opening_m,
+            cam_T_grip=to_record(self.cam_T_grip),
+            covariance=tuple(self.covariance.ravel().tolist()),
+            residuals=HandEyeResiduals(
+                rms_m=self.rms_px * pixel_m,
+                rms_px=self.rms_px,
+                corners=len(self.gripper.corner_ids),
+                images=self.images,
+            ),
+            warnings=self.notes,
+            provenance=provenance,
+        )
+
+
+def gripper_from_images(
+    images: Sequence[str | Path | Image],
+    camera: LensSettings,
+    *,
+    openings_m: Sequence[float | None] | None = None,
+    distance_m: Length | None = None,
+    finger_width_m: Length | None = None,
+    reference: Pose | None = None,
+    name: str = "gripper",
+    provenance: Provenance | None = None,
+    progress: Progress = quiet,
+) -> GripperFromImages:
+    """A gripper and its reference from ten to some hundred ``images`` before changing backgrounds.
+
+    ``openings_m``: the jaw's opening in each image (None: the jaws stand); ten images at least of each opening that is
+    to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the optical axis),
+    ``finger_width_m`` (of a fingertip, across the jaws), a ``reference`` calibration, or from several openings.
+
+    Raises :class:`~gripmon.model.errors.InputError` for what was given wrong,
+    :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
+    """
+    _check(distance_m, finger_width_m, reference, openings_m, len(images))
+    made = make_camera(camera)
+    taken = list(images_of_one_camera(images))
+    for file, image in taken:
+        check_size(file, image, camera.width_px, camera.height_px)
+    groups = _groups(openings_m, len(taken))
+    first, *others = groups
+    least = smallest_noise(taken[0][1])
+    notes: list[str] = []
+    left_out: dict[str, str] = {}
+
+    def see(indices: Sequence[int]) -> OpeningSeen:
+        found = see_opening(made, [grey_levels(taken[k][1]) for k in indices], least, step)
+        left_out.update({taken[indices[k]][0]: why for k, why in found.left_out.items()})
+        return found
+
+    with progress(None, "step") as step:
+        seen = see(groups[first])
+        around = {}
+        for opening in others:
+            if len(groups[opening]) < FEWEST_IMAGES:
+                notes.append(
+                    f"opening {opening:g} m: {len(groups[opening])} images aren't used; {FEWEST_IMAGES} or more"
+                )
+                continue
+            around[opening] = see(groups[opening])
+        outlines = finger_outlines(made, seen)
+        pose = None if reference is None else reference[0]
+        placed = place(
+            outlines,
+            None if pose is None else pose[:3, :3],
+            None if pose is None else pose[:3, 3] / pose[2, 3],
+        )
+        moved = _motions(made, seen, placed, around, notes)
+        step()
+    opening_m = first if openings_m is not None else None
+    scale = _scale(placed, distance_m, finger_width_m, reference, moved, opening_m)
+    described = Seen(made, seen, outlines, placed, moved, scale[0], opening_m)
+    try:
+        gripper = Gripper(build_model(described, name, provenance, notes))
+    except GripperError as error:
+        raise NoResultError(f"what the images show is no gripper that can be tracked: {error}") from None
+    if pose is None:
+        cam_T_grip = make_transform(placed.rotation, placed.tcp * scale[0])
+        covariance = _covariance(made.fx_px, placed, scale, seen)
+    else:
+        assert reference is not None
+        cam_T_grip, covariance = reference
+    notes += _said(placed, scale, reference, left_out, len(taken))
+    sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
+    rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
+    used = len(seen.matte.kept)
+    shown = taken[groups[first][seen.matte.kept[0]]][1]
+    names = tuple(outline.name for outline in outlines)
+    return GripperFromImages(
+        gripper, cam_T_grip, covariance, opening_m, float(np.median(sigmas)), used, left_out, tuple(notes), camera,
+        seen,
+        shown, names, float(np.sqrt(np.square(rms).mean())),
+    )  # fmt: skip
+
+
+def _check(
+    distance_m: Length | None,
+    finger_width_m: Length | None,
+    reference: Pose | None,
+    openings_m: Sequence[float | None] | None,
+    count: int,
+) -> None:
+    if count < FEWEST_IMAGES:
+        raise InputError(f"{count} images; at least {FEWEST_IMAGES}, each before another background", "images")
+    if count > MOST_IMAGES:
+        raise InputError(f"{count} images; at most {MOST_IMAGES}, each before another background", "images")
+    lengths = {"distance_m": distance_m, "finger_width_m": finger_width_m, "reference": reference}
+    given = [key for key, value in lengths.items() if value is not None]
+    if len(given) > 1:
+        raise InputError("two lengths for one scale; one of distance, finger width and reference", given[1])
+    if openings_m is not None:
+        if len(openings_m) != count:
+            raise InputError(f"{len(openings_m)} for {count} images; one for each", "openings_m")
+        if any(opening is None for opening in openings_m):
+            raise InputError("some images have one and others don't; of all images or of none", "openings_m")
+    if not given and (openings_m is None or _spread(openings_m) <= SAME_OPENING_M):
+        raise InputError(
+            "nothing tells the size: --distance M (fingertips from the camera), --finger-width M, --reference FILE, or "
+            "images at several jaw openings, in metres in their timestamps.csv"
+        )
+
+
+def _spread(openings_m: Sequence[float | None]) -> float:
+    values = [opening for opening in openings_m if opening is not None]
+    return max(values) - min(values) if values else 0.0
+
+
+def _groups(openings_m: Sequence[float | None] | None, count: int) -> dict[float, list[int]]:
+    """Indices of the images of each opening; the one with most images first."""
+    if openings_m is None:
+        return {0.0: list(range(count))}
+    order = sorted(range(count), key=lambda k: openings_m[k] or 0.0)
+    runs: list[list[int]] = [[order[0]]]
+    for k in order[1:]:
+        apart = (openings_m[k] or 0.0) - (openings_m[runs[-1][0]] or 0.0)
+        if apart <= SAME_OPENING_M:
+            runs[-1].append(k)
+        else:
+            runs.append([k])
+    runs.sort(key=lambda run: -len(run))
+    if len(runs[0]) < FEWEST_IMAGES:
+        raise InputError(
+            f"at most {len(runs[0])} images are of one opening; {FEWEST_IMAGES} or more before changing backgrounds, "
+            "the jaws standing",
+            "openings_m",
+        )
+    return {round(float(np.mean([openings_m[k] or 0.0 for k in run])), 6): sorted(run) for run in runs}
+
+
+def _motions(
+    camera: Camera, seen: OpeningSeen, placed: Placed, around: Mapping[float, OpeningSeen], notes: list[str]
+) -> dict[float, list[FingerMoved]]:
+    """How each finger moved to each other opening; openings at which one isn't found are left out, and noted."""
+    out = {}
+    for opening, other in around.items():
+        moved = [
+            motion_of(camera, finger.mask, finger.outwards, points, kept, seen, other)
+            for finger, points, kept in zip(seen.fingers, placed.points, placed.kept, strict=True)
+        ]
+        found = [m for m in moved if m is not None]
+        if len(found) < len(moved):
+            notes.append(f"opening {opening:g} m isn't used: a finger of the first opening isn't found there")
+        else:
+            out[opening] = found
+    return out
+
+
+def _scale(
+    placed: Placed,
+    distance_m: Length | None,
+    finger_width_m: Length | None,
+    reference: Pose | None,
+    moved: Mapping[float, Sequence[FingerMoved]],
+    opening_m: float | None,
+) -> Length:
+    """Depth of the TCP and its standard deviation, m."""
+    if distance_m is not None:
+        return distance_m
+    if finger_width_m is not None:
+        width = tip_width(placed)
+        return finger_width_m[0] / width, finger_width_m[1] / width
+    if reference is not None:
+        return float(reference[0][2, 3]), float(np.sqrt(reference[1][2, 2]))
+    if opening_m is None or not moved or len(placed.points) < 2:
+        raise NoResultError(
+            "the openings don't tell the size: two fingers that move with the jaws, at two openings at least; or "
+            "--distance M, --finger-width M"
+        )
+    values, weights = [], []
+    for opening, fingers in moved.items():
+        apart = fingers[-1].shift - fingers[0].shift
+        folds = np.linalg.norm(fingers[-1].folds - fingers[0].folds, axis=1)
+        length = float(np.linalg.norm(apart))
+        sigma = float(np.sqrt((len(folds) - 1) / len(folds) * np.square(folds - folds.mean()).sum())) / length
+        values.append(abs(opening - opening_m) / length)
+        weights.append(1.0 / max(sigma, 1e-4) ** 2)
+    depth = float(np.average(values, weights=weights))
+    scatter = float(np.ptp(values)) / depth if len(values) > 1 else 0.0
+    return depth, depth * max(float(np.sum(weights)) ** -0.5, 0.5 * scatter)
+
+
+def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) -> Array:
+    """(6, 6): the distance along the line of sight, the outline's scatter across it, and the axes' directions."""
+    depth, sigma = scale
+    sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
+    across = float(np.median(sigmas)) / fx_px * depth
+    ray = placed.tcp / placed.tcp[2]
+    out = np.zeros((6, 6))
+    out[:3, :3] = sigma**2 * np.outer(ray, ray) + across**2 * np.eye(3)
+    out[3:, 3:] = np.diag(placed.sigma_rad**2) + (across / depth) ** 2 * np.eye(3)
+    return out
+
+
+def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int) -> list[str]:
+    """What isn't known, in words."""
+    notes = []
+    if reference is None:
+        depth, sigma = scale
+        notes.append(
+            f"lengths are known to {100.0 * sigma / depth:.1f} %: the fingertips are {1e3 * depth:.1f} +- "
+            f"{1e3 * sigma:.1f} mm from the camera, which is in the reference's covariance"
+        )
+    if placed.flat:
+        notes.append(
+            "the outline is taken as flat, facing the camera: no three long edges of the fingers meet in one point. "
+            "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
+            "large by what the fingers stand out of that plane"
+        )
+    if left_out:
+        notes.append(f"{len(left_out)} of {count} images left out")
+    return notes

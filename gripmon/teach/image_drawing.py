@@ -1,0 +1,54 @@
+"""The picture of a gripper made from images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gripmon.model.records import Array, Image
+from gripmon.teach.drawing import Canvas, Colour, write
+from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.straight_pieces import Chain
+
+_FINGERS: tuple[Colour, ...] = ((96, 224, 96), (255, 176, 64), (224, 96, 224), (64, 208, 255))
+_CORNER: Colour = (0, 255, 255)
+_INNER: Colour = (0, 144, 255)
+_TEXT: Colour = (255, 255, 255)
+_SCATTER: Colour = (64, 64, 255)
+_ENLARGED = 50.0
+
+
+def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Image:
+    """Outlines by finger, corners as circles, inner edges; across each vertex its scatter, three standard deviations,
+    enlarged.
+    """
+    canvas = Canvas(image, 2 if image.shape[1] < 1000 else 1)
+    for number, (finger, name) in enumerate(zip(seen.fingers, names, strict=True)):
+        colour = _FINGERS[number % len(_FINGERS)]
+        for edge in finger.inner:
+            canvas.line(edge.uv_px, _INNER)
+        for chain in finger.chains:
+            for a, b in chain.pieces:
+                canvas.line(chain.uv_px[[a, b]], colour)
+            _draw_vertices(canvas, chain, colour)
+        centre = np.argwhere(finger.mask)[:, ::-1].mean(axis=0)
+        write(canvas.picture, name, canvas.pixel(centre), colour, 0.6)
+    sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
+    text = (
+        f"{len(seen.matte.kept)} images, outline to {np.median(sigmas):.3f} px (median), blur {seen.blur_px:.1f} px; "
+        f"red: 3 sigma, x {_ENLARGED:g}"
+    )
+    write(canvas.picture, text, (12, canvas.picture.shape[0] - 14), _TEXT, 0.5)
+    return canvas.picture
+
+
+def _draw_vertices(canvas: Canvas, chain: Chain, colour: Colour) -> None:
+    covariance = np.einsum("fvi,fvj->vij", *[chain.folds_px - chain.folds_px.mean(axis=0)] * 2)
+    covariance *= (len(chain.folds_px) - 1) / len(chain.folds_px)
+    for at, corner, matrix in zip(chain.uv_px, chain.corner.tolist(), covariance, strict=True):
+        values, axes = np.linalg.eigh(matrix)
+        reach: Array = 3.0 * _ENLARGED * np.sqrt(max(float(values[1]), 0.0)) * axes[:, 1]
+        reach = reach * min(1.0, 40.0 / max(float(np.linalg.norm(reach)), 1e-9))
+        canvas.line(np.array([at - reach, at + reach]), _SCATTER)
+        canvas.circle(at, 6.0 if corner else 2.5, _CORNER if corner else colour)

@@ -1,0 +1,266 @@
+"""What stays the same in images before changing backgrounds: the gripper, and how sure that is.
+
+Light and exposure change between images, so each is first brought to the others' grey levels by a gain and an offset,
+which the pixels that change least tell.  A pixel of the gripper then shows the same grey level but for noise; one of
+the background doesn't.  Robust statistics over images throughout: a shadow or a hand in a few of them does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Array, Image
+from gripmon.track.edges.profiles import GREY_BGR, full_scale, quantum
+
+FEWEST_IMAGES = 10
+"""Images of one opening: the scatter of ten is known to 24 % (1 / sqrt(2 (n - 1)))."""
+NOISE_FACTOR = 4.0
+"""Scatter over that of the gripper from which a pixel is background (no unit): with ten images noise alone exceeds it
+in none of a million pixels (chi-squared)."""
+MOST_STILL_SHARE = 0.9
+"""Of the image: a gripper that hides more than this of a wrist camera's view leaves no background to be told from."""
+FEWEST_STILL_SHARE = 0.005
+"""Of the image: less is no fingertip that could be tracked (0.5 % of 640 x 480 px is 40 x 38 px)."""
+ALIKE_SHARE = 0.8
+"""Part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
+_STEP = 3
+_ROUNDS = 3
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class Matte:
+    """``mean`` (h, w) grey levels of what stays, ``scatter`` (h, w) its standard deviation over the images, robustly;
+    ``still`` (h, w): part of the gripper; ``noise``: usual scatter there, in grey levels of 0 to 255.
+
+    ``images`` (n, h, w) float32 at common grey levels, ``kept`` (n,) indices of those that were given, ``left_out``
+    why others weren't.
+    """
+
+    mean: NDArray[np.float32]
+    scatter: NDArray[np.float32]
+    still: NDArray[np.bool_]
+    noise: float
+    images: NDArray[np.float32]
+    kept: tuple[int, ...]
+    left_out: dict[int, str]
+
+
+def grey_levels(image: Image) -> NDArray[np.float32]:
+    """An image as (h, w) float32 from 0 to 255, colour (blue first) as the measurement sees it."""
+    pixels = image.astype(np.float32) * np.float32(255.0 / full_scale(image))
+    if pixels.ndim == 3:
+        pixels = pixels @ GREY_BGR
+    return np.ascontiguousarray(pixels)
+
+
+def smallest_noise(image: Image) -> float:
+    """What rounding alone makes of a pixel, in grey levels of 0 to 255."""
+    return 255.0 * quantum(image) / full_scale(image) / 12.0**0.5
+
+
+def find_matte(
+    images: Sequence[NDArray[np.float32]], least_noise: float, step: Callable[[], None] = lambda: None
+) -> Matte:
+    """The matte of ``images`` (h, w) at one jaw opening.  Raises :class:`NoResultError`: too few alike, nothing changes
+    behind the gripper, or nothing stays.
+    """
+    stack = np.stack(images)
+    kept = np.arange(len(stack))
+    left_out: dict[int, str] = {}
+    while True:
+        mean, scatter, still, noise = _statistics(stack, least_noise)
+        step()
+        alike = _alike(stack, mean, scatter, still, noise)
+        bad = alike < ALIKE_SHARE
+        if not bad.any():
+            break
+        for k in np.flatnonzero(bad).tolist():
+            left_out[int(kept[k])] = (
+                f"shows {100.0 * alike[k]:.0f} % of the gripper where the others do, at least "
+                f"{100.0 * ALIKE_SHARE:.0f} %: the camera or the jaws moved, something hides it, or another gripper"
+            )
+        if np.count_nonzero(~bad) < max(FEWEST_IMAGES, (len(images) + 2) // 2):
+            raise NoResultError(
+                f"{len(left_out)} of {len(images)} images contradict the others (each shows less than "
+                f"{100.0 * ALIKE_SHARE:.0f} % of the gripper where the others do); one camera, one gripper, jaws that "
+                "stand, sharp images"
+            )
+        stack, kept = stack[~bad], kept[~bad]
+    _check_one_set(stack, noise)
+    return Matte(mean, scatter, still, noise, stack, tuple(kept.tolist()), left_out)
+
+
+def _check_one_set(stack: NDArray[np.float32], noise: float) -> None:
+    """Raise :class:`NoResultError` where the images fall into two sets, each of which stays the same in places where
+    the other one doesn't: what both share is then no gripper.
+    """
+    small = stack[:, :: _STEP + 1, :: _STEP + 1].reshape(len(stack), -1)
+    limit = NOISE_FACTOR * noise
+    alike = np.array([(np.abs(small - image) < 2.0**0.5 * limit).mean(axis=1) for image in small])
+    np.fill_diagonal(alike, 0.0)
+    centred = alike - alike.mean(axis=0)
+    side = np.linalg.eigh(centred @ centred.T)[1][:, -1]
+    for chosen in (side > 0.0, _nearer(alike)):
+        sets = [small[chosen], small[~chosen]]
+        if min(len(part) for part in sets) < 3:
+            continue
+        each = [_still_share(part, limit) for part in (*sets, small)]
+        if min(each[:2]) > each[2] + 4.0 * FEWEST_STILL_SHARE and min(each[:2]) > 1.1 * each[2]:
+            raise NoResultError(
+                f"the images fall into two sets, of {len(sets[0])} and {len(sets[1])}, in which different parts "
+                "stay the same; images of one gripper at one opening, a camera fixed to it, each before another "
+                "background"
+            )
+
+
+def _nearer(alike: Array) -> NDArray[np.bool_]:
+    """(n,) which images are more like the one that is least like the first."""
+    first = int(alike.sum(axis=1).argmax())
+    other = int(np.where(np.arange(len(alike)) == first, np.inf, alike[first]).argmin())
+    chosen = alike[other] > alike[first]
+    chosen[[first, other]] = False, True
+    return np.asarray(chosen)
+
+
+def _still_share(part: NDArray[np.float32], limit: float) -> float:
+    """Of the pixels (n, p) those that stay the same in all but a tenth of the images."""
+    last = max(int(0.9 * len(part)), 2)
+    off = _partitioned(np.abs(part - _median(part)), last - 1)[..., last - 1]
+    return float((off < limit).mean())
+
+
+def _statistics(
+    stack: NDArray[np.float32], least_noise: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
+    """Mean, scatter, what is still, and noise; ``stack`` is brought to common grey levels, in place."""
+    quiet = None
+    for _ in range(_ROUNDS):
+        _level(stack, quiet)
+        mean, scatter = _robust(stack)
+        clipped = (mean <= 1.0) | (mean >= 254.0)
+        noise = _noise(scatter, mean, clipped, least_noise)
+        still = scatter < NOISE_FACTOR * noise
+        quiet = still & ~clipped
+    share = float(still.mean())
+    if share > MOST_STILL_SHARE:
+        raise NoResultError(
+            f"{100.0 * share:.0f} % of the image stays the same; images before changing backgrounds: move the robot "
+            "between them"
+        )
+    still = _cleaned(still)
+    if still.mean() < FEWEST_STILL_SHARE:
+        raise NoResultError(
+            f"only {100.0 * float(still.mean()):.1f} % of the image stays the same; a camera that is fixed to the "
+            "gripper, one gripper, jaws that stand, light that stays"
+        )
+    return mean, scatter, still, noise
+
+
+def _level(stack: NDArray[np.float32], quiet: NDArray[np.bool_] | None) -> None:
+    """Gain and offset of each image so that the quiet pixels agree with their median, in place."""
+    small = stack[:, ::_STEP, ::_STEP].reshape(len(stack), -1)
+    middle = _median(small)
+    if quiet is None:
+        scatter = _median(np.abs(small - middle)) / np.maximum(middle, 8.0)
+        usable = (middle > 4.0) & (middle < 250.0)
+        chosen = usable & (scatter <= np.quantile(scatter[usable], 0.05)) if usable.any() else usable
+    else:
+        chosen = quiet[::_STEP, ::_STEP].ravel()
+    if np.count_nonzero(chosen) < 50:
+        return
+    wanted = middle[chosen].astype(float)
+    for k in range(len(stack)):
+        seen = small[k, chosen].astype(float)
+        weight = np.ones(len(seen))
+        gain, offset = 1.0, 0.0
+        for _ in range(6):
+            centre = np.average(seen, weights=weight), np.average(wanted, weights=weight)
+            spread = float(weight @ np.square(seen - centre[0]))
+            slope = float(weight @ ((seen - centre[0]) * (wanted - centre[1]))) / max(spread, 1e-9)
+            # Without a spread of grey levels only the product of the two is known: a gain it is.
+            known = spread > 4.0 * weight.sum()
+            gain = slope if known else centre[1] / max(centre[0], 1.0)
+            offset = centre[1] - gain * centre[0] if known else 0.0
+            off = np.abs(gain * seen + offset - wanted)
+            weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
+        if 0.2 < gain < 5.0:
+            stack[k] = gain * stack[k] + offset
+
+
+def _partitioned(values: NDArray[np.float32], kth: int) -> NDArray[np.float32]:
+    """Partitioned along the first axis, which becomes the last one: contiguous it takes a fraction of the time."""
+    turned = np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    turned.partition(kth, axis=-1)
+    return turned
+
+
+def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Along the first axis; the upper one of two middle values."""
+    middle = len(values) // 2
+    return np.asarray(_partitioned(values, middle)[..., middle])
+
+
+def _robust(stack: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Median and scatter (h, w) over images, by rows to save memory: the root mean square of the middle nine tenths of
+    the deviations tells background that seldom differs better than their median does.
+    """
+    mean, scatter = np.empty_like(stack[0]), np.empty_like(stack[0])
+    rows = max(1, int(4e6 / (stack.shape[0] * stack.shape[2])))
+    last = max(int(0.9 * len(stack)), 2)
+    for top in range(0, stack.shape[1], rows):
+        part = stack[:, top : top + rows]
+        mean[top : top + rows] = middle = _median(part)
+        off = _partitioned(np.abs(part - middle), last - 1)[..., :last]
+        scatter[top : top + rows] = np.sqrt(np.square(off).mean(axis=-1)) / 0.79
+    return mean, scatter
+
+
+def _noise(
+    scatter: NDArray[np.float32], mean: NDArray[np.float32], clipped: NDArray[np.bool_], least_noise: float
+) -> float:
+    """Scatter of the gripper's pixels: the mode of the small ones."""
+    usable = np.log(np.maximum(scatter[~clipped], 0.5 * least_noise))
+    if not usable.size:
+        return least_noise
+    counts, ends = np.histogram(usable, bins=np.arange(np.log(0.4 * least_noise), np.log(128.0), 0.08))
+    smooth = np.convolve(counts, np.ones(3), mode="same")
+    # The first mode that holds what the smallest fingertip would.
+    enough = smooth >= 0.25 * FEWEST_STILL_SHARE * scatter.size
+    peaks = enough & (smooth >= np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1))
+    first = int(np.flatnonzero(peaks)[0]) if peaks.any() else int(smooth.argmax())
+    return max(float(np.exp(0.5 * (ends[first] + ends[first + 1]))), least_noise)
+
+
+def _cleaned(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Without specks and holes: a background pixel may stay the same by chance, its neighbourhood doesn't."""
+    mask = cv2.medianBlur(still.astype(np.uint8) * 255, 7)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel)
+    smallest = FEWEST_STILL_SHARE * mask.size
+    for value in (255, 0):
+        count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == value).astype(np.uint8), connectivity=4)
+        for k in range(1, count):
+            if stats[k, cv2.CC_STAT_AREA] < smallest:
+                mask[labels == k] = 255 - value
+    return np.asarray(mask > 0)
+
+
+def _alike(
+    stack: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    scatter: NDArray[np.float32],
+    still: NDArray[np.bool_],
+    noise: float,
+) -> Array:
+    """(n,) part of the gripper's pixels that each image shows as the others do."""
+    inside = cv2.erode(still.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    inside = inside if inside.sum() > 100 else still
+    limit = NOISE_FACTOR * np.maximum(scatter[inside], noise)
+    return np.array([float((np.abs(image[inside] - mean[inside]) < limit).mean()) for image in stack])

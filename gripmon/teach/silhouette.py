@@ -1,0 +1,248 @@
+"""The outline of what stays in images before changing backgrounds, to a fraction of a pixel.
+
+Across the outline an image k shows ``D = (1 - alpha(s)) (B_k(s) - F)``: how much of the background B_k, against the
+finger's grey level F, still comes through at a distance s.  One image can't tell the matte ``alpha`` from the
+background's own texture.  Many can: weighted by each image's contrast ``c_k`` a few pixels outside, the textures, which
+differ, average out, and the transition, which doesn't, remains::
+
+    T(s) = sum_k c_k D_k(s) / sum_k c_k²  =  Phi((s - e) / blur) (a + b s) + Phi((e - s) / blur) (c + d s)
+
+a and b hold how fast the background forgets its own grey level, c and d the finger's shading, e is the edge's place.
+ The scatter of e over the images
+is found by leaving out a tenth of them at a time (the delete-a-group jackknife), which also holds what neighbouring
+points err together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import ndtr
+
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
+
+FOLDS = 10
+BLURS_PX = tuple(np.arange(0.5, 4.01, 0.1).tolist())
+FEWEST_CONTRASTS = 6.0
+"""Over the noise, root of the sum of squares over images: less locates no edge to a sixth of its blur."""
+_STEP_PX = 0.5
+_WIDE_PX, _NARROW_PX = 8.0, 5.0
+_GRID_PX = 0.125
+_SMOOTH_PX = 3.0
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Places along an outline: ``uv_px`` (s, 2) and ``normal`` (s, 2) away from the gripper; ``inside`` (s,): the
+    search line lies in the image.
+    """
+
+    uv_px: Array
+    normal: Array
+    inside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """What the images show across an outline.
+
+    ``offset_px`` (s,) of the edge along the normals, ``folds_px`` (f, s) the same without one f-th of the images each,
+    ``usable`` (s,), ``blur_px`` of the transition; ``shift_px`` (n, s): how far an image shows the edge farther out
+    than all do, with the ``worth`` (n, s) of that, 1/px²; ``sharpness`` (n,): of each image's transitions over all's.
+    """
+
+    offset_px: Array
+    folds_px: Array
+    usable: NDArray[np.bool_]
+    blur_px: float
+    shift_px: Array
+    worth: Array
+    sharpness: Array
+
+
+def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
+    """Closed contours (k, 2) of a mask's regions and holes, a point a pixel, smoothed; px."""
+    found, _ = cv2.findContours(still.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    out = []
+    for contour in found:
+        points = contour[:, 0].astype(float)
+        if len(points) < smallest_px:
+            continue
+        smooth = gaussian_filter1d(points, _SMOOTH_PX, axis=0, mode="wrap")
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0, append=smooth[:1]), axis=1))])
+        count = int(way[-1])
+        around = np.vstack([smooth, smooth[:1]])
+        at = np.arange(count) * way[-1] / count
+        out.append(np.column_stack([np.interp(at, way, around[:, k]) for k in (0, 1)]))
+    return out
+
+
+def stations_along(contour: Array, still: NDArray[np.bool_], margin_px: float) -> Stations:
+    """A station at each point (s, 2) of a closed contour."""
+    tangent = np.roll(contour, -2, axis=0) - np.roll(contour, 2, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-9)[:, None]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    side = inner_side(contour, normal, still)
+    normal = normal if float(side.sum()) < 0.0 else -normal
+    return Stations(contour, normal, in_image(contour, still.shape, margin_px))
+
+
+def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
+    """(n,) above zero where the normals (n, 2) point into a mask."""
+    soft = cv2.GaussianBlur(still.astype(np.float32), (0, 0), 2.0)
+    at = [(uv_px + s * normal).astype(np.float32) for s in (-3.0, 3.0)]
+    behind, ahead = (cv2.remap(soft, p[:, :1], p[:, 1:], cv2.INTER_LINEAR)[:, 0] for p in at)
+    return np.asarray(ahead - behind, dtype=float)
+
+
+def in_image(uv_px: Array, shape: tuple[int, ...], margin_px: float) -> NDArray[np.bool_]:
+    """(n,) which points lie at least a margin inside an image of a shape."""
+    limit = np.array([shape[1] - 1.0, shape[0] - 1.0]) - margin_px
+    return np.asarray(((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1))
+
+
+def measure_transitions(
+    images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float | None = None
+) -> Transitions:
+    """The edge's place at each station in ``images`` (n, h, w): ``wide`` within 4 px, else within 2 px and more
+    exactly.  ``blur_px`` None: found here.
+    """
+    reach = _WIDE_PX if wide else _NARROW_PX
+    search = 4.0 if wide else 2.0
+    s = np.arange(-reach, reach + 0.25, _STEP_PX)
+    profiles = _read(images, stations, s)
+    within, beyond = s <= -search - 0.5, s >= search + 0.5
+    if not wide:
+        within, beyond = (s <= -2.0) & (s >= -4.0), (s >= 2.0) & (s <= 4.0)
+    finger = _finger_levels(profiles, s, wide=wide)
+    d = profiles - finger[None]
+    # An image that shows another grey level on the finger (a shadow, a hand) says nothing of this station.
+    sound = np.abs(d[:, :, within].mean(axis=2)) < 4.0 * max(noise, 1.0)
+    contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
+    # Beyond a few times the usual one a contrast tells no more: what is wrong then is wrong by a share of it.
+    weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
+    shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
+    weight = weight - shading * weight.mean(axis=0)
+    upper, lower = weight[:, :, None] * d, weight * contrast
+    total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
+    usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
+    transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
+    near = (s >= -search - 2.0) & (s <= search + 2.5)
+    if blur_px is None:
+        blur_px = _usual_blur(transition[usable][:, near], s[near], search)
+    offset, fits = _edge(transition[:, near], s[near], blur_px, search)
+    usable &= fits
+    fold = np.arange(len(images)) % FOLDS
+    folds = np.empty((FOLDS, len(offset)))
+    for f in range(FOLDS):
+        part = fold == f
+        without = (total_upper - upper[part].sum(axis=0)) / np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)[
+            :, None
+        ]
+        folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
+    shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness)
+
+
+def _finger_levels(profiles: NDArray[np.float32], s: Array, *, wide: bool) -> Array:
+    """Grey levels (stations, samples) of the finger, to be taken off: where it surely is what it shows in most images,
+    and the last of these across the edge and beyond.
+    """
+    usual = np.median(profiles, axis=0)
+    last = int(np.flatnonzero(s <= (-4.5 if wide else -1.5))[-1])
+    usual[:, last:] = usual[:, max(last - 1, 0) : last + 1].mean(axis=1, keepdims=True)
+    return np.asarray(usual)
+
+
+def _shading(profiles: NDArray[np.float32], d: Array, contrast: Array, s: Array, search_px: float) -> float:
+    """How much of the contrasts' mean is left out, 0 to 1: it also sees the finger's own shading, which is the same in
+    all images, where their differences see the background alone.  The shading's variance t² against that of the
+    backgrounds' texture v, known from n images: ``n t² / (n t² + v)`` (the shrinkage of a random intercept).
+    """
+    own = np.median(profiles[:, :, s <= -search_px], axis=0)
+    design = np.vander(s[s <= -search_px], 2)
+    trend = own @ np.linalg.pinv(design).T @ design.T
+    shading = float(np.median(np.square(own - trend).sum(axis=1) / max(own.shape[1] - 2, 1)))
+    texture = d[:, :, s >= 1.5][:, :, 0] - contrast
+    rest = float(np.median(np.square(texture).mean(axis=0)))
+    return len(d) * shading / max(len(d) * shading + rest, 1e-6)
+
+
+def _read(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[np.float32]:
+    """Grey levels (n, stations, samples)."""
+    maps = [(stations.uv_px[:, k, None] + stations.normal[:, k, None] * s).astype(np.float32) for k in (0, 1)]
+    return np.stack([
+        cv2.remap(image, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE) for image in images
+    ])  # fmt: skip
+
+
+@lru_cache(maxsize=128)
+def _bases(samples: tuple[float, ...], blur_px: float, search_px: float) -> tuple[Array, list[Array]]:
+    """Places that are tried (g,), and an orthonormal basis (samples, 4) of the transitions there."""
+    s = np.array(samples)
+    grid = np.arange(-search_px, search_px + 0.5 * _GRID_PX, _GRID_PX)
+    bases = []
+    for e in grid:
+        rise = ndtr((s - e) / blur_px)
+        bases.append(np.linalg.qr(np.column_stack([rise, rise * (s - e), 1.0 - rise, (1.0 - rise) * (s - e)]))[0])
+    return grid, bases
+
+
+def _misfit(transition: Array, s: Array, blur_px: float, search_px: float) -> tuple[Array, Array]:
+    grid, bases = _bases(tuple(s.tolist()), blur_px, search_px)
+    total = np.square(transition).sum(axis=1)
+    return grid, np.stack([total - np.square(transition @ basis).sum(axis=1) for basis in bases])
+
+
+def _usual_blur(transition: Array, s: Array, search_px: float) -> float:
+    if not len(transition):
+        return BLURS_PX[0]
+    sample = transition[:: max(1, len(transition) // 400)]
+    costs = [float(np.median(_misfit(sample, s, b, search_px)[1].min(axis=0))) for b in BLURS_PX]
+    return float(BLURS_PX[int(np.argmin(costs))])
+
+
+def _edge(transition: Array, s: Array, blur_px: float, search_px: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Place (stations,) by least squares, and whether it lies inside of what was searched."""
+    grid, cost = _misfit(transition, s, blur_px, search_px)
+    best = cost.argmin(axis=0)
+    inner = (best > 0) & (best < len(grid) - 1)
+    at = np.clip(best, 1, len(grid) - 2)
+    column = np.arange(cost.shape[1])
+    low, mid, high = cost[at - 1, column], cost[at, column], cost[at + 1, column]
+    bend = np.maximum(low - 2.0 * mid + high, 1e-12)
+    return grid[at] + 0.5 * _GRID_PX * np.clip((low - high) / bend, -1.0, 1.0), inner
+
+
+def _of_each(
+    d: Array, contrast: Array, s: Array, offset: Array, blur_px: float, usable: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """To first order, how far each image shows the edge from where all do, what that is worth, and how sharp it is."""
+    away = (s[None] - offset[:, None]) / blur_px
+    near = np.abs(away) < 2.5
+    rise, slope = ndtr(away), np.where(near, np.exp(-0.5 * away**2) / (blur_px * (2.0 * np.pi) ** 0.5), 0.0)
+    strength = np.square(slope).sum(axis=1)
+    rest = d - contrast[:, :, None] * rise[None]
+    shift = -np.einsum("nij,ij->ni", rest, slope) / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3) / strength
+    worth = np.where(usable[None], np.square(contrast), 0.0)
+    # The transition's slope in each image, over the one expected.
+    steep = np.gradient(d, s, axis=2)
+    own = np.einsum("nij,ij,ni->n", steep, slope, np.where(usable, contrast, 0.0))
+    expected = np.einsum("ij,ni->n", np.square(slope), worth)
+    return shift, worth, own / np.maximum(expected, 1e-9)
+
+
+def to_ideal_px(camera: Camera, uv_px: Array) -> Array:
+    """Image coordinates (n, 2) without the lens's distortion, in its pixels: straight edges are straight there."""
+    return np.asarray(camera.undistort(uv_px) * camera.fx_px)
+
+
+def from_ideal_px(camera: Camera, ideal_px: Array) -> Array:
+    """Back to the image."""
+    return np.asarray(camera.distort(ideal_px / camera.fx_px))
