@@ -118,6 +118,26 @@ def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> No
     assert np.quantile(np.abs(made[2][:, 2]), 0.95) <= max(2.0 * np.quantile(np.abs(exact[2][:, 2]), 0.95), 1e-4)
 
 
+@pytest.mark.usefixtures("tools_importable")
+@pytest.mark.parametrize("radius_m", [0.002, 0.004])
+def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(radius_m: float) -> None:
+    """Also after the camera has moved, before backgrounds that the file wasn't made from."""
+    from benchmarks.rounded import rounded_solids
+
+    solids = rounded_solids(0.012, radius_m)
+    found = gripper_from_images(images_of(moving_robot(311, gripper=solids)), PAPER_LENS, distance_m=DISTANCE)
+    gripper = found.gripper
+    assert len(gripper.edge_ids) == 6 and np.count_nonzero(gripper.edge_curved) == 2 and not len(gripper.corner_ids)
+    creep = Creep(start_s=0.5, time_s=0.8, tcp_shift_m=(0.0012, 0.0005))
+    scenario = Scenario(name="x", duration_s=4.0, fps=15.0, mount=(creep,), background=Background(kind="printed"))
+    simulator = Simulator(CAMERA, solids, nominal_cam_T_grip(), scenario, 77)
+    shown, truths = [simulator.frame(k) for k in range(60)], [simulator.truth(k) for k in range(60)]
+    standing = [Frame(f.seq, f.stamp_ns, f.image, None, f.name) for f in shown]
+    share, misleading, errors = errors_of(gripper, found.cam_T_grip, found.covariance, standing, truths)
+    assert misleading == 0 and share > 0.5
+    assert np.quantile(np.abs(errors[:, :2]), 0.95) < 5e-5 and np.quantile(np.abs(errors[:, 2]), 0.95) < 1e-4
+
+
 def test_openings_in_metres_tell_distance_and_motion() -> None:
     images, openings = [], []
     for seed, opening_m, count in ((401, 0.034, 24), (402, 0.024, 12)):

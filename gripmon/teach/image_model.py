@@ -11,13 +11,13 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.gripper import EdgeModel, FingerModel, GripperModel, JawModel, PointModel
-from gripmon.model.gripper.core import on_a_line
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, nearest_on_ray
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
+from gripmon.track.edges.ends import ALONG_COSINE
 
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0
@@ -25,7 +25,10 @@ MEETS_PX = 2.0
 bevel of 0.25 mm, 100 mm away, it lies so far beside it."""
 LARGEST_GAP = 0.5
 """Between such an edge and its corner, over its length: its line is then known there as well as along itself."""
-_FEWEST_CORNERS = 3
+LONG_SIDE = 0.5
+"""Length of a finger's side over that of its longest, from which it is one, and no piece of the curve at its end."""
+ON_THE_CURVE = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
+"""Where on its length the best line through a stretch of a curve crosses it: the parabola's mean square is least so."""
 
 
 @dataclass(frozen=True)
@@ -87,16 +90,23 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
     for outline, places, placed, finger in parts:
         dropped += len(outline.pieces) - len(placed)
         long = dict(zip(outline.pieces, (outline.length_px >= SHORTEST_EDGE_PX).tolist(), strict=True))
-        kept = [piece for piece in placed if long[piece]]
         local = ((places - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
+        curves = _curves(outline, placed, local)
+        of_curves = {piece for curve in curves for piece in curve}
+        kept = [piece for piece in placed if long[piece] and piece not in of_curves]
         met = np.bincount(np.ravel(kept).astype(int), minlength=len(local)) if kept else np.zeros(len(local), int)
-        known = sorted({k for piece in kept for k in piece})
+        known = sorted({k for piece in kept for k in piece} | {k for c in curves for k in (c[0][0], c[-1][1])})
         for k in known:
             x, y, z = (round(float(v), 7) for v in local[k])
             corner = bool(outline.corner[k] and met[k] >= 2)
             points[f"{outline.name}_{k}"] = PointModel(finger=outline.name, xyz_m=(x, y, z), corner=corner)
         for a, b in kept:
             edges[f"{outline.name}_{a}_{b}"] = EdgeModel(start=f"{outline.name}_{a}", end=f"{outline.name}_{b}")
+        for curve in curves:
+            first, last = (f"{outline.name}_{k}" for k in (curve[0][0], curve[-1][1]))
+            via = [local[a] + share * (local[b] - local[a]) for a, b in curve for share in ON_THE_CURVE]
+            places_m = tuple((round(float(x), 7), round(float(y), 7), round(float(z), 7)) for x, y, z in via)
+            edges[f"{first}_{curve[-1][1]}"] = EdgeModel(start=first, end=last, via=places_m)
         for number, edge in enumerate(finger.inner):
             start = _starts_at(seen, outline, known, edge)
             ends = _inner_in_space(seen, outline, places, start, edge)
@@ -110,9 +120,33 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
         notes.append(
             f"{inner_dropped} inner edges aren't used: they don't start from a corner, so their depth isn't known"
         )
-    points = _with_corners(points, edges, notes)
     fingers, jaw = _jaw(seen)
     return GripperModel(name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, provenance=provenance)
+
+
+def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:
+    """Pieces in turn between which no corner is, as a round fingertip has them, without the fingers' long sides: those
+    are straight, and an edge of their own, so that it is seen where the finger ends.
+    """
+    way = np.array([local[b] - local[a] for a, b in placed]).reshape(-1, 3)
+    length = np.linalg.norm(way, axis=1)
+    along = np.abs(way[:, 2]) > ALONG_COSINE * length
+    side = along & (length >= LONG_SIDE * length[along].max(initial=0.0))
+    runs: list[list[tuple[int, int]]] = [[]]
+    for piece, straight in zip(placed, side.tolist(), strict=True):
+        if runs[-1] and (straight or runs[-1][-1][1] != piece[0] or outline.corner[piece[0]]):
+            runs.append([])
+        if not straight:
+            runs[-1].append(piece)
+    if (
+        len(runs) > 1
+        and runs[-1]
+        and runs[0]
+        and runs[-1][-1][1] == runs[0][0][0]
+        and not outline.corner[runs[0][0][0]]
+    ):
+        runs[0] = runs.pop() + runs[0]  # a closed outline begins anywhere
+    return [run for run in runs if len(run) > 1]
 
 
 def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEdge) -> tuple[int, int] | None:
@@ -171,38 +205,6 @@ def _add_inner(
     edges[f"{finger}_inner_{number}"] = EdgeModel(
         start=names[0], end=names[1], kind="crease", brighter="right" if edge.step > 0.0 else "left"
     )
-
-
-def _with_corners(
-    points: dict[str, PointModel], edges: Mapping[str, EdgeModel], notes: list[str]
-) -> dict[str, PointModel]:
-    """At least three corners that aren't on a line: where there are fewer, the vertices in which the outline turns
-    most count as such.
-    """
-
-    def enough(table: Mapping[str, PointModel]) -> bool:
-        corners = np.array([p.xyz_m for p in table.values() if p.corner])
-        return len(corners) >= _FEWEST_CORNERS and not on_a_line(corners)
-
-    turns: dict[str, list[Array]] = {}
-    for edge in edges.values():
-        way = np.subtract(points[edge.end].xyz_m, points[edge.start].xyz_m)
-        turns.setdefault(edge.start, []).append(way / np.linalg.norm(way))
-        turns.setdefault(edge.end, []).append(-way / np.linalg.norm(way))
-    by_turn = sorted((float(w[0] @ w[1]), k) for k, w in turns.items() if len(w) == 2 and not points[k].corner)
-    table, more = dict(points), 0
-    while not enough(table) and by_turn:
-        _, key = by_turn.pop()
-        old = table[key]
-        table[key] = PointModel(finger=old.finger, xyz_m=old.xyz_m, corner=True)
-        more += 1
-    if not enough(table):
-        raise NoResultError(
-            "the outline has fewer than three corners that aren't on a line; more of the fingertips in view"
-        )
-    if more:
-        notes.append(f"{more} of the corners are places where a curve turns most: less exact along it than across")
-    return table
 
 
 def _jaw(seen: Seen) -> tuple[dict[str, FingerModel], JawModel | None]:
