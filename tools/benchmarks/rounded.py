@@ -29,6 +29,7 @@ def outline_m(width_m: float, radius_m: float, step_m: float) -> Array:
     half = 0.5 * width_m
     if radius_m == 0.0:
         return np.array([[-half, 0.0], [half, 0.0]])
+    radius_m = half if half - radius_m < step_m else radius_m  # a flat part shorter than a facet is none
     angle = np.linspace(0.0, 0.5 * np.pi, max(round(0.5 * np.pi * radius_m / step_m), 2) + 1)
     left = np.column_stack([radius_m - half - radius_m * np.cos(angle), radius_m * np.sin(angle) - radius_m])
     right = left[::-1] * (-1.0, 1.0)
