@@ -13,7 +13,8 @@ from gripmon.cli.common import (
     Command,
     check_outputs,
     command_line,
-    positive_number,
+    jaw_opening,
+    jaw_range,
     progress_bar,
     write_document,
     write_picture,
@@ -77,28 +78,9 @@ exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated 
 nothing is written then"""
 
 
-def opening(text: str) -> float:
-    """An argument that is a jaw opening, m."""
-    value = 0.0 if text.strip() in ("0", "0.0") else positive_number(text)
-    if value > 0.5:
-        raise argparse.ArgumentTypeError(f"{text} m isn't a jaw opening (millimetres?); metres, 0 to 0.5")
-    return value
-
-
-def range_of(text: str) -> tuple[float, float]:
-    """An argument MIN:MAX of jaw openings, m."""
-    low, colon, high = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
-    ends = opening(low), opening(high)
-    if not ends[0] < ends[1]:
-        raise argparse.ArgumentTypeError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
-    return ends
-
-
 @Command(
     "plane", "camera to gripper, from images of it on a plate", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    target=REQUIRED, jaw_opening=opening, jaw_range=range_of, name={"default": "gripper"}, out=REQUIRED,
+    target=REQUIRED, jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
 def plane(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate plane``."""

@@ -162,6 +162,25 @@ def positive_number(text: str) -> float:
     return value
 
 
+def jaw_opening(text: str) -> float:
+    """An argument that is a jaw opening, m."""
+    value = 0.0 if text.strip() in ("0", "0.0") else positive_number(text)
+    if value > 0.5:
+        raise argparse.ArgumentTypeError(f"{text} m isn't a jaw opening (millimetres?); metres, 0 to 0.5")
+    return value
+
+
+def jaw_range(text: str) -> tuple[float, float]:
+    """An argument MIN:MAX of jaw openings, m."""
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
+    ends = jaw_opening(low), jaw_opening(high)
+    if not ends[0] < ends[1]:
+        raise argparse.ArgumentTypeError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
+    return ends
+
+
 def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:
     """The type of an argument within these bounds; ``wrong``: what another text is not, and what would be right."""
 

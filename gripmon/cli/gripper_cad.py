@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from gripmon.cli.calibrate_plane import opening, range_of
 from gripmon.cli.common import (
     REQUIRED,
     Command,
     check_outputs,
     command_line,
+    jaw_opening,
+    jaw_range,
     positive_number,
     progress_bar,
     write,
@@ -74,7 +75,8 @@ def _view(text: str) -> tuple[float, float]:
 
 @Command(
     "from-cad", "from STL, OBJ, PLY, URDF or .cao", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    out=REQUIRED, length=positive_number, jaw_range=range_of, jaw_opening=opening, view=_view, frame={"default": "tcp"},
+    out=REQUIRED, length=positive_number, jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view,
+    frame={"default": "tcp"},
 )  # fmt: skip
 def from_cad(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon gripper from-cad``."""

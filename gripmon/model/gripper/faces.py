@@ -46,11 +46,14 @@ def inwards(fingers: Sequence[str], loops: Sequence[tuple[int, ...]], points_m: 
     positive volume (what is open is closed towards the finger's middle).  So fingers need not be convex, nor closed; a
     face without neighbours looks away from the middle.
     """
+    of_finger: dict[str, set[int]] = {}
+    for finger, loop in zip(fingers, loops, strict=True):
+        of_finger.setdefault(finger, set()).update(loop)
+    middle_m = {finger: points_m[sorted(own)].mean(axis=0) for finger, own in of_finger.items()}
     looks_out = []
     for finger, loop in zip(fingers, loops, strict=True):
-        own = sorted({p for name, other in zip(fingers, loops, strict=True) if name == finger for p in other})
         corners = points_m[list(loop)]
-        looks_out.append(float(normal_of(corners) @ (corners.mean(axis=0) - points_m[own].mean(axis=0))))
+        looks_out.append(float(normal_of(corners) @ (corners.mean(axis=0) - middle_m[finger])))
     sides = [{(a, b) for a, b in zip(loop, (*loop[1:], loop[0]), strict=True)} for loop in loops]
     for k, finger in enumerate(fingers):
         if looks_out[k] >= 0.0:
