@@ -220,8 +220,8 @@ def _mount(reference: ReferenceValues) -> Finding:
 def _view(in_view: InView, gripper: GripperValues) -> Finding:
     if not in_view.enough:
         return Finding("FAIL", "view", f"nothing can be measured: {in_view.reason}")
-    few = gripper.corners < in_view.corners_needed  # then the ends of its curves stand for them
-    corners = f"{in_view.corners} ends of curves" if few else f"{in_view.corners} of {gripper.corners} corners"
+    few = gripper.corners < in_view.corners_needed  # then ends of curves or edges stand for them
+    corners = f"{in_view.corners} points" if few else f"{in_view.corners} of {gripper.corners} corners"
     seen = f"{corners} and {in_view.edges} edges can be measured"
     spans = {} if in_view.camera_may_move is None else in_view.camera_may_move.shift_m
     shifts = [amount for span in spans.values() for amount in span if amount is not None]
