@@ -20,7 +20,7 @@ from support.stand_ins import REFUSED, ScriptedMonitor
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.neighbours import Reports
-from gripmon.daemon.running import log_to_stderr
+from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     Alert,

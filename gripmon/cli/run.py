@@ -36,6 +36,7 @@ CONFIG         configuration file (YAML)
                one of the two is stopped
 {VIEW_OPTION.strip()}
 --verbose      say more on stderr
+--log-json     one JSON object a line on stderr: time, level, logger, text (for log collectors)
 """
 
 _EXAMPLES = """\
@@ -69,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             duration_s=arguments.duration,
             verbose=arguments.verbose,
+            log_json=arguments.log_json,
             fresh_state=arguments.fresh_state,
             view=arguments.view,
             take_over=arguments.take_over,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import logging
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -60,7 +59,7 @@ def run(
     frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
     the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
     from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`).  The logger
-    ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
+    ``gripmon`` is left as the caller set it up (see :func:`gripmon.daemon.service.log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
@@ -152,16 +151,6 @@ def _faults(
     faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
     faults += [lambda: recorder.failure, lambda: lines.failure]
     return faults if keeper is None else [*faults, lambda: keeper.failure]
-
-
-def log_to_stderr(*, verbose: bool = False) -> None:
-    """Let the ``gripmon`` loggers write lines for people on stderr; ``verbose`` adds tracebacks of survived errors."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    logger = logging.getLogger("gripmon")
-    logger.handlers = [handler]
-    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
-    logger.propagate = False
 
 
 def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:

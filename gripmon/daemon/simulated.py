@@ -248,6 +248,7 @@ class Demo:
         ``step`` is called for each transform that arrives, ``on_network`` when the client has joined; ``stop``: see
         :func:`gripmon.daemon.starting.run_monitor`.
         """
+        from gripmon.daemon.service import log_to_stderr
         from gripmon.daemon.starting import run_monitor
 
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:
@@ -260,6 +261,7 @@ class Demo:
                 receiver.connect()
                 on_network()
 
+            log_to_stderr()
             code = run_monitor(
                 self._config, out=out, stop=stop, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=joined,
                 view=view,

@@ -19,7 +19,8 @@ from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.network import open_network, open_second_network, with_source
 from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
-from gripmon.daemon.running import log_to_stderr, run, run_second
+from gripmon.daemon.running import run, run_second
+from gripmon.daemon.service import log_to_stderr
 from gripmon.judge.statefile import StateFile, StateFileError
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
@@ -42,6 +43,7 @@ def run_file(
     stop: StopRequest,
     duration_s: float | None = None,
     verbose: bool = False,
+    log_json: bool = False,
     fresh_state: bool = False,
     view: str | None = None,
     take_over: bool = False,
@@ -49,7 +51,8 @@ def run_file(
     """Run the daemon on a configuration file, a wrist camera's or a second camera's; returns the exit code.
 
     ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``:
-    "auto", "web", "native" or "server"; the rest as in :func:`run_monitor`.
+    "auto", "web", "native" or "server"; ``verbose`` and ``log_json``: see
+    :func:`gripmon.daemon.service.log_to_stderr`; the rest as in :func:`run_monitor`.
     """
     config = load_second(path) if is_second(path) else load_config(path)
     second = isinstance(config, SecondConfig)
@@ -62,10 +65,11 @@ def run_file(
             lines.open("ab").close()
         except OSError as error:
             raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
+    log_to_stderr(verbose=verbose, as_json=log_json)
     if isinstance(config, SecondConfig):
-        return _run_second(config, out, stop, duration_s, view, verbose=verbose, take_over=take_over)
+        return _run_second(config, out, stop, duration_s, view, take_over=take_over)
     return run_monitor(
-        config, out=out, stop=stop, duration_s=duration_s, verbose=verbose, keep_state=True, fresh_state=fresh_state,
+        config, out=out, stop=stop, duration_s=duration_s, keep_state=True, fresh_state=fresh_state,
         view=view, take_over=take_over,
     )  # fmt: skip
 
@@ -76,7 +80,6 @@ def run_monitor(
     out: Path | None,
     stop: StopRequest | None = None,
     duration_s: float | None = None,
-    verbose: bool = False,
     recording_name: str | None = None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
     on_network: Callable[[], None] = lambda: None,
@@ -99,7 +102,6 @@ def run_monitor(
     """
     settings = config.settings
     cv2.setNumThreads(1)
-    log_to_stderr(verbose=verbose)
     if keep_state and (text := limits_warning(config)) is not None:
         _log.warning("%s", text)
     live = None if view is None else LiveView(settings.view, view, config.path)
@@ -167,13 +169,11 @@ def _run_second(
     duration_s: float | None,
     view: str | None,
     *,
-    verbose: bool,
     take_over: bool,
 ) -> int:
     """The same for a second camera, which keeps no state."""
     settings = config.settings
     cv2.setNumThreads(1)
-    log_to_stderr(verbose=verbose)
     live = None if view is None else LiveView(settings.view, view, config.path)
     with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()

@@ -14,6 +14,7 @@ import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
+from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.io.publish import StatePublisher
@@ -94,6 +95,7 @@ class Loop(ABC):
         self._said: StateRecord | None = None
         self._next_state_s = self._next_command_s = self._start_s
         self._stop = stop
+        self._service = ServiceManager()
         self._source_broke = False
         self._faults: dict[str, str] = {}  # since the frame before: what could not be delivered, and why
         self._said_faults: dict[str, str] = {}  # in the log
@@ -138,11 +140,13 @@ class Loop(ABC):
             self._alert(notice, self._watch.state)
         end_s = self._start_s + duration_s if duration_s is not None else math.inf
         self._say_state(time.monotonic())
+        self._service.ready()
         while self._stop.exit_code is None and time.monotonic() < end_s and self._next_item():
             pass
         watch = self._watch
         exit_code = self._stop.exit_code if self._stop.exit_code is not None else self._code_at_the_end()
         watch.stopped()
+        self._service.stopping()
         self._finish()
         self._say_state(time.monotonic())
         _log.info(
@@ -279,6 +283,7 @@ class Loop(ABC):
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
         watch, said = self._watch, self._said
+        self._service.alive(now_s)
         several, waits = self._not_alone(), self._what_waits()
         verdict = Verdict.UNKNOWN if several else watch.verdict
         reported = (self._ask(fault, None) for fault in self._reports.faults)
@@ -291,7 +296,9 @@ class Loop(ABC):
             _log.warning("%s (or reject)", waits)
         if said is None or (watch.state, verdict) != (said.state, said.verdict):
             said_more = f" ({message})" if message else ""
-            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, verdict, said_more)
+            line = f"state {watch.state}, {self.verdict_of} {verdict}{said_more}"
+            _log.info("%s", line)
+            self._service.status(line)
         self._said = self._state_record(verdict, message, now_s, alone=not several)
         self._deliver("state", self._told.state, self._said)
         self._deliver("state's recording", self._kept.state, self._said)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.daemon.running import log_to_stderr, run
+from gripmon.daemon.running import run
+from gripmon.daemon.service import log_to_stderr
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.model.geometry import make_transform, to_record

@@ -1,0 +1,84 @@
+"""What a service manager reads of a daemon: its log, and whether it is ready, alive, or about to stop."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import socket
+import sys
+
+import msgspec
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: ``time`` (Unix time, s), ``level``, ``logger``, ``text``; of errors also ``trace``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as one line."""
+        line: dict[str, object] = {
+            "time": round(record.created, 3),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "text": record.getMessage(),
+        }
+        if record.exc_info:
+            line["trace"] = self.formatException(record.exc_info)
+        return msgspec.json.encode(line).decode()
+
+
+def log_to_stderr(*, verbose: bool = False, as_json: bool = False) -> None:
+    """Let the ``gripmon`` loggers write lines on stderr, for people or ``as_json``; ``verbose`` adds tracebacks of
+    survived errors.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger = logging.getLogger("gripmon")
+    logger.handlers = [handler]
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+    logger.propagate = False
+
+
+class ServiceManager:
+    """systemd, or whoever else set ``NOTIFY_SOCKET``, by the datagrams of sd_notify(3); without one nothing happens.
+
+    Who asks for a sign of life (``WATCHDOG_USEC``) gets four in the time that he waits, of the thread that calls
+    :meth:`alive`: if that hangs, the service is started again.
+    """
+
+    def __init__(self) -> None:
+        """Raises nothing: a manager that can't be reached is none."""
+        address = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        waits_us = os.environ.get("WATCHDOG_USEC", "")
+        asked = waits_us.isdecimal() and os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self._period_s = int(waits_us) * 1e-6 / 4.0 if self._address and asked else math.inf
+        self._due_s = -math.inf if math.isfinite(self._period_s) else math.inf
+
+    def ready(self) -> None:
+        """The start is over: frames are waited for."""
+        self._send("READY=1")
+
+    def alive(self, now_s: float) -> None:
+        """The loop goes on; ``now_s`` is monotonic time."""
+        if now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._send("WATCHDOG=1")
+
+    def status(self, text: str) -> None:
+        """One line for ``systemctl status``."""
+        self._send(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The end has begun."""
+        self._send("STOPPING=1")
+
+    def _send(self, text: str) -> None:
+        if not self._address:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as notify:
+                notify.sendto(text.encode(), self._address)
+        except OSError as error:
+            logging.getLogger(__name__).warning("NOTIFY_SOCKET %s: %s", self._address, error.strerror)
+            self._address, self._due_s = "", math.inf
