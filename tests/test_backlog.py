@@ -111,7 +111,7 @@ def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monke
         ran_in.append(threading.current_thread().name)
         return search_poses(*args)
 
-    monkeypatch.setattr("gripmon.monitor.searching.search_poses", watched)
+    monkeypatch.setattr("gripmon.track.edges.measure.search_poses", watched)
     for number, frame in enumerate(frames[:40]):
         record = monitor.process(frame if number < 5 else replaced(frame, image=noise))
         assert (record.source is Origin.HELD) == (number >= 5)
@@ -149,3 +149,31 @@ def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, mon
     other = rendered(Scenario(name="other", duration_s=0.1, fps=30.0, jaw=JawScript(knots=((0.0, 0.034),))))[0][0]
     found = tracker.measure(replaced(other, jaw_opening_m=None), pose, 1.0)
     assert found.trusted and abs(found.jaw_opening_m - 0.034) < 2e-4
+
+
+LOOKS, MOST_LOOKS = 6, 12
+"""At an image while nothing is seen of the gripper: usually, and where places that a search has found are followed."""
+
+
+def test_frames_without_the_gripper_are_answered_after_few_looks(monkeypatch: pytest.MonkeyPatch):
+    """At the expected place, where it proved to be, at the reference and with other zooms, once each."""
+    frames, _ = frames_of("static")
+    random = np.random.default_rng(1)
+    monitor, looks = new_monitor(), []
+    look = FingertipMeter._look
+
+    def counted(self: FingertipMeter, *args: object) -> object:
+        looks.append(self)
+        return look(self, *args)
+
+    monkeypatch.setattr(FingertipMeter, "_look", counted)
+    needed = []
+    for number, frame in enumerate(frames[:60]):
+        if number >= 5:
+            frame = replaced(frame, image=random.integers(0, 256, frame.image.shape, dtype=np.uint8))
+        looks.clear()
+        monitor.process(frame)
+        if number > 5:  # past the one search that is done in its frame
+            needed.append(len(looks))
+        monitor.run_pending()
+    assert max(needed) <= MOST_LOOKS and sorted(needed)[len(needed) // 2] <= LOOKS, needed
