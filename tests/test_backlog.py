@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.watched import frames_of, new_monitor, rendered, replaced
+from support.watched import FPS, frames_of, new_monitor, rendered, replaced
 
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Origin, to_json
@@ -122,6 +122,22 @@ def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monke
     assert ran_in[0] == "MainThread" and len(ran_in) >= 3 and set(ran_in[1:]) == {"worker"}
 
 
+def test_what_comes_back_elsewhere_while_its_transform_is_held_is_found_soon():
+    """Covered for 0.8 s of the second that a transform is held, and knocked meanwhile: no search has to wait for its
+    turn.
+    """
+    frames, _ = frames_of("bump")
+    monitor, random, back = new_monitor(), np.random.default_rng(1), 60
+    found = []
+    for number, frame in enumerate(frames[: back + 12]):
+        if back - 24 <= number < back:
+            frame = replaced(frame, image=random.integers(0, 256, frame.image.shape, dtype=np.uint8))
+        if monitor.process(frame).source is Origin.UPDATE and number >= back - 24:
+            found.append(number)
+    soon = round(2.0 * RESULT_AFTER_S * FPS) + 2  # the search that saw the noise, and the one after it
+    assert found and back <= found[0] <= back + soon
+
+
 @pytest.mark.parametrize("opening_m", [0.022, 0.045])
 def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, monkeypatch: pytest.MonkeyPatch):
     """The jaw stands where neither the gripper file nor anybody says: found at first, expected there then."""
@@ -151,12 +167,12 @@ def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, mon
     assert found.trusted and abs(found.jaw_opening_m - 0.034) < 2e-4
 
 
-LOOKS, MOST_LOOKS = 6, 12
+LOOKS, MOST_LOOKS = 4, 6
 """At an image while nothing is seen of the gripper: usually, and where places that a search has found are followed."""
 
 
 def test_frames_without_the_gripper_are_answered_after_few_looks(monkeypatch: pytest.MonkeyPatch):
-    """At the expected place, where it proved to be, at the reference and with other zooms, once each."""
+    """At the expected place, where it proved to be, at the reference and with another zoom, once each."""
     frames, _ = frames_of("static")
     random = np.random.default_rng(1)
     monitor, looks = new_monitor(), []

@@ -44,13 +44,12 @@ class GripperSearch:
             if isinstance(found, Exception):
                 raise found
             self._found = found
+        at_once = not self._searched
         if self._found is not None or len(self._backlog):
-            return Patience(self._found is not None, self._found is not None)
+            return Patience(self._found is not None, self._found is not None, at_once)
         held = now_s - self._seen_s <= self._hold_s
-        return Patience(
-            when_doubtful=self._credit >= 1.0,
-            when_lost=held or self._untrusted % self._settings.patient_every == 0,
-        )
+        when_lost = held or self._untrusted % self._settings.patient_every == 0
+        return Patience(self._credit >= 1.0, when_lost, at_once)
 
     def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
         """Places to follow in this frame: what was found in an earlier one, or here if the gripper is just lost; else

@@ -57,19 +57,22 @@ CLEARLY_BETTER = 1.3
 @dataclass(frozen=True, slots=True)
 class Patience:
     """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where
-    there is none.
+    there is none.  ``at_once``: near by in this frame, else that is left to the search, too.
     """
 
     when_doubtful: bool
     when_lost: bool
+    at_once: bool = True
 
 
 class Sought(NamedTuple):
-    """How a gripper is searched for: whether it is ``lost`` where it is expected, or only poor, the image's ``zoom``,
-    whether the jaw's opening is reported, the share that is usual, and the one that a rough fit must show.
+    """How a gripper is searched for: whether it is ``lost`` where it is expected, or only poor, and whether ``near``
+    by, too; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, and the one that a
+    rough fit must show.
     """
 
     lost: bool
+    near: bool
     zoom: int
     jaw_reported: bool
     usual_share: float
@@ -90,6 +93,8 @@ class _Place:
 
 class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
+
+    _lost = 0  # frames in a row in which it wasn't seen there
 
     @property
     def finger_axis(self) -> Array:
@@ -135,11 +140,13 @@ class FingertipMeter(FingerMeter):
             self._zoom_to(self._fitting_zoom(best))
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
+            self._lost = 0
             return best
         best.trusted = self._trusted(image, best, usual_share)
+        self._lost = 0 if best.trusted else self._lost + 1
         if not (patience.when_doubtful if best.trusted else patience.when_lost):
             return best
-        best = self._from_elsewhere(image, expected, best, usual_share, search or self.searched)
+        best = self._from_elsewhere(image, expected, best, usual_share, search or self.searched, patience.at_once)
         best.looked_far = True
         return best
 
@@ -159,20 +166,21 @@ class FingertipMeter(FingerMeter):
         return best
 
     def _from_elsewhere(
-        self, image: Image, expected: Expected, best: Measurement, usual_share: float, search: Search
+        self, image: Image, expected: Expected, best: Measurement, usual_share: float, search: Search, at_once: bool
     ) -> Measurement:
         """The best of the places farther away, if one is better than the expected one."""
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true, and such a place is not given up for one that isn't believed.
         beat = (CLEARLY_BETTER if best.trusted else 1.0) * best.consensus.share
         least = max(self._settings.consensus.found_share, TRUSTED * usual_share)
-        for effort in (Effort.GRID, Effort.SEARCH):
+        for effort in (Effort.GRID, Effort.SEARCH) if at_once else (Effort.SEARCH,):
             enough = PROMISING * max(beat, least)
             if effort is Effort.GRID:
-                places = self._near_places(image, expected, enough)
+                places = self._fitted_again(image, self._near_places(image, expected), enough)
             else:
-                reported = self._prior is self._prior_reported
-                places = search(image, expected, Sought(not best.trusted, self._zoom, reported, usual_share, enough))
+                lost, reported = not best.trusted, self._prior is self._prior_reported
+                sought = Sought(lost, not at_once, self._zoom, reported, usual_share, enough)
+                places = search(image, expected, sought)
             for place in places:
                 other = replace(self._settle(image, place), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
@@ -203,11 +211,12 @@ class FingertipMeter(FingerMeter):
         return self._ends.seen(image, measurement, strict)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
-        """The best of the zooms: the image may have lost, or found, its focus."""
+        """The best of the zooms: the image may have lost, or found, its focus.  Once the gripper is lost one of the
+        others is tried a frame, in turn.
+        """
         chosen = self._zoom
-        for zoom in ZOOMS:
-            if zoom == chosen:
-                continue
+        others = [zoom for zoom in ZOOMS if zoom != chosen]
+        for zoom in others[self._lost % len(others) :][:1] if self._lost else others:
             self._zoom_to(zoom)
             beat = CLEARLY_BETTER * best.consensus.share
             least = PROMISING * max(beat, self._settings.consensus.trusted_share)
@@ -277,11 +286,11 @@ class FingertipMeter(FingerMeter):
         self._take(sought.jaw_reported)
         search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
         poses = search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search)
-        return self._fitted_again(
-            image, self._far_places(image, expected, poses, sought.usual_share), sought.least_share
-        )
+        places = self._near_places(image, expected) if sought.near else []
+        places += self._far_places(image, expected, poses, sought.usual_share)
+        return self._fitted_again(image, places, sought.least_share)
 
-    def _near_places(self, image: Image, expected: Expected, least_share: float) -> Sequence[Expected]:
+    def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
         """The best of starts all over the reach of the profiles."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
@@ -290,9 +299,7 @@ class FingertipMeter(FingerMeter):
         starts = grid_of_starts(prediction, self._reach_px, settings.start_width_px)
         prior = self._prior_about(prediction, expected)
         fit = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
-        return self._fitted_again(
-            image, [_Place(fit.share, self._moved(prediction, fit.xi, expected))], least_share
-        )  # fmt: skip
+        return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
 
     def _fitted_again(self, image: Image, places: list[_Place], least_share: float) -> Sequence[Expected]:
         """The best of some places, where rough fits from there lead: those with so large a share."""
