@@ -33,6 +33,16 @@ def test_results_come_in_order_when_they_are_due_and_not_before():
     assert list(backlog.results(2.0)) == ["second"] and done == ["first", "second"], "nothing is done twice"
 
 
+def test_what_is_not_urgent_holds_up_nothing_that_is():
+    backlog: Backlog[str] = Backlog()
+    backlog.add(lambda: "confirmed", 1.0, 1.0)
+    assert list(backlog.results(1.9)) == []
+    backlog.add(lambda: "without a time")
+    assert list(backlog.results(1.9)) == [], "in order"
+    backlog.add(lambda: "urgent", 1.5)
+    assert list(backlog.results(1.5 + RESULT_AFTER_S)) == ["confirmed", "without a time", "urgent"]
+
+
 def test_what_fails_is_a_result_and_what_follows_is_done():
     backlog: Backlog[int] = Backlog()
     backlog.add(lambda: 1 // 0, 0.0)
