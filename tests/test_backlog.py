@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.watched import frames_of, new_monitor, rendered, replaced
+from support.watched import FPS, frames_of, new_monitor, rendered, replaced
 
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Origin, to_json
@@ -31,6 +31,16 @@ def test_results_come_in_order_when_they_are_due_and_not_before():
     backlog.run()
     assert done == ["first", "second"] and len(backlog) == 1, "done, and not yet due"
     assert list(backlog.results(2.0)) == ["second"] and done == ["first", "second"], "nothing is done twice"
+
+
+def test_what_is_not_urgent_holds_up_nothing_that_is():
+    backlog: Backlog[str] = Backlog()
+    backlog.add(lambda: "confirmed", 1.0, 1.0)
+    assert list(backlog.results(1.9)) == []
+    backlog.add(lambda: "without a time")
+    assert list(backlog.results(1.9)) == [], "in order"
+    backlog.add(lambda: "urgent", 1.5)
+    assert list(backlog.results(1.5 + RESULT_AFTER_S)) == ["confirmed", "without a time", "urgent"]
 
 
 def test_what_fails_is_a_result_and_what_follows_is_done():
@@ -111,7 +121,7 @@ def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monke
         ran_in.append(threading.current_thread().name)
         return search_poses(*args)
 
-    monkeypatch.setattr("gripmon.monitor.searching.search_poses", watched)
+    monkeypatch.setattr("gripmon.track.edges.measure.search_poses", watched)
     for number, frame in enumerate(frames[:40]):
         record = monitor.process(frame if number < 5 else replaced(frame, image=noise))
         assert (record.source is Origin.HELD) == (number >= 5)
@@ -120,6 +130,22 @@ def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monke
             worker.start()
             worker.join()
     assert ran_in[0] == "MainThread" and len(ran_in) >= 3 and set(ran_in[1:]) == {"worker"}
+
+
+def test_what_comes_back_elsewhere_while_its_transform_is_held_is_found_soon():
+    """Covered for 0.8 s of the second that a transform is held, and knocked meanwhile: no search has to wait for its
+    turn.
+    """
+    frames, _ = frames_of("bump")
+    monitor, random, back = new_monitor(), np.random.default_rng(1), 60
+    found = []
+    for number, frame in enumerate(frames[: back + 12]):
+        if back - 24 <= number < back:
+            frame = replaced(frame, image=random.integers(0, 256, frame.image.shape, dtype=np.uint8))
+        if monitor.process(frame).source is Origin.UPDATE and number >= back - 24:
+            found.append(number)
+    soon = round(2.0 * RESULT_AFTER_S * FPS) + 2  # the search that saw the noise, and the one after it
+    assert found and back <= found[0] <= back + soon
 
 
 @pytest.mark.parametrize("opening_m", [0.022, 0.045])
@@ -149,3 +175,31 @@ def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, mon
     other = rendered(Scenario(name="other", duration_s=0.1, fps=30.0, jaw=JawScript(knots=((0.0, 0.034),))))[0][0]
     found = tracker.measure(replaced(other, jaw_opening_m=None), pose, 1.0)
     assert found.trusted and abs(found.jaw_opening_m - 0.034) < 2e-4
+
+
+LOOKS, MOST_LOOKS = 4, 6
+"""At an image while nothing is seen of the gripper: usually, and where places that a search has found are followed."""
+
+
+def test_frames_without_the_gripper_are_answered_after_few_looks(monkeypatch: pytest.MonkeyPatch):
+    """At the expected place, where it proved to be, at the reference and with another zoom, once each."""
+    frames, _ = frames_of("static")
+    random = np.random.default_rng(1)
+    monitor, looks = new_monitor(), []
+    look = FingertipMeter._look
+
+    def counted(self: FingertipMeter, *args: object) -> object:
+        looks.append(self)
+        return look(self, *args)
+
+    monkeypatch.setattr(FingertipMeter, "_look", counted)
+    needed = []
+    for number, frame in enumerate(frames[:60]):
+        if number >= 5:
+            frame = replaced(frame, image=random.integers(0, 256, frame.image.shape, dtype=np.uint8))
+        looks.clear()
+        monitor.process(frame)
+        if number > 5:  # past the one search that is done in its frame
+            needed.append(len(looks))
+        monitor.run_pending()
+    assert max(needed) <= MOST_LOOKS and sorted(needed)[len(needed) // 2] <= LOOKS, needed

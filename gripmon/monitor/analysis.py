@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gripmon.judge.causes import CauseJudge
 from gripmon.model.errors import in_short
 from gripmon.model.records import Array, EdgeEvidence, Explanation, Frame
-from gripmon.monitor.backlog import Backlog
+from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 
 CALM_FRAMES, LULL_FRAMES = 30, 3
 """Frames in a row in which nothing looks wrong after which the evidence is forgotten, and up to which an explanation
@@ -22,6 +22,11 @@ FEWEST_FRAMES = 5
 GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
 """Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn,
 and after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
+"""
+
+CONFIRMED_AFTER_S = 1.0
+"""From a further conclusion's frame to the one that it counts in.  One is known, so that it isn't urgent; and where
+frames come one right after the other, as in a replay, a second of them takes longer than the 20 to 40 ms of this.
 """
 
 
@@ -87,11 +92,12 @@ class CauseAnalysis:
         if not wrong:
             self._calm += 1
         known = self.known
+        confirms = False
         if wrong:
             self._calm = 0
             self._asked += 1
-            gathers = self._asked % EVERY == 0 or self._asked in GATHERED_AT
-            concludes = self._asked % EVERY == 0 or self._asked in CONCLUDED_AT
+            confirms = self._asked % EVERY == 0
+            gathers, concludes = (confirms or self._asked in at for at in (GATHERED_AT, CONCLUDED_AT))
         else:
             if self._calm == CALM_FRAMES:
                 self._forget()
@@ -105,7 +111,7 @@ class CauseAnalysis:
             (judge.add if wrong else judge.well)(gather(kept))
             return judge.explanation(ref_cam_T_grip) if concludes else None
 
-        self._do(work, now_s)
+        self._do(work, now_s, CONFIRMED_AFTER_S if confirms else RESULT_AFTER_S)
         return known
 
     @property
@@ -128,10 +134,10 @@ class CauseAnalysis:
         self._asked, self._calm, self._explanation = 0, CALM_FRAMES, Explanation()
         self._do(work)
 
-    def _do(self, work: Callable[[CauseJudge], Explanation | None], *now_s: float) -> None:
+    def _do(self, work: Callable[[CauseJudge], Explanation | None], *when_s: float) -> None:
         judge, episode = self._judge, self._episode
 
         def task() -> _Finding:
             return _Finding(episode, work(judge), judge.wants_baseline)
 
-        self._backlog.add(task, *now_s)
+        self._backlog.add(task, *when_s)

@@ -46,9 +46,13 @@ class Backlog(Generic[_T]):
         """Whether there is something to :meth:`run`."""
         return len(self._undone) > 0
 
-    def add(self, work: Callable[[], _T], now_s: float = -math.inf) -> None:
-        """Begin something in the frame of ``now_s``; without a time its result counts as soon as those before do."""
-        task = _Task(work, now_s + RESULT_AFTER_S)
+    def add(self, work: Callable[[], _T], now_s: float = -math.inf, after_s: float = RESULT_AFTER_S) -> None:
+        """Begin something in the frame of ``now_s``, to count ``after_s`` later; without a time its result counts as
+        soon as those before do.  What came before counts no later than it.
+        """
+        task = _Task(work, now_s + after_s)
+        for earlier in self._tasks if task.due_s > -math.inf else ():
+            earlier.due_s = min(earlier.due_s, task.due_s)
         self._tasks.append(task)
         self._undone.append(task)
 

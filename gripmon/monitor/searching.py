@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from gripmon.model.camera import Camera
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image
+from gripmon.model.records import Image
 from gripmon.monitor.backlog import Backlog
-from gripmon.track.edges import Measurement, Patience
-from gripmon.track.edges.search import SearchSettings, search_poses
-
-NOWHERE = np.zeros((0, 4, 4))
+from gripmon.track.edges import Expected, FingertipMeter, Measurement, Patience, SearchSettings, Sought
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper
+    """One search at a time: begun with one frame's image, followed in a later frame.  Only the first one for a gripper
     that was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
 
-    A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for
-    some times one after the other, then in one of several frames.
+    A doubtful fit pays for looking further from a credit that good frames refill slowly.  A lost gripper is searched
+    for all the time as long as the last transform is held: it may come back at any moment, and goes on moving; then in
+    one of several frames.
     """
 
-    def __init__(self, camera: Camera, gripper: Gripper, settings: SearchSettings):
-        self._camera, self._gripper, self._settings = camera, gripper, settings
-        self._backlog: Backlog[Array] = Backlog()
-        self._found: Array | None = None  # for the newest frame
-        self._now_s = 0.0
+    def __init__(self, meter: FingertipMeter, settings: SearchSettings, hold_s: float):
+        """``meter``: the search's own, for it runs beside the frames."""
+        self._meter, self._settings, self._hold_s = meter, settings, hold_s
+        self._backlog: Backlog[Sequence[Expected]] = Backlog()
+        self._found: Sequence[Expected] | None = None  # for the newest frame
+        self._now_s = self._seen_s = 0.0
         self._credit = float(settings.eager_frames)
-        self._untrusted = self._searches = 0  # frames and searches since the gripper was seen
+        self._untrusted = 0  # frames since the gripper was seen
+        self._searched = False  # since then
 
     @property
     def pending(self) -> bool:
@@ -46,27 +44,25 @@ class GripperSearch:
             if isinstance(found, Exception):
                 raise found
             self._found = found
+        at_once = not self._searched
         if self._found is not None or len(self._backlog):
-            return Patience(self._found is not None, self._found is not None)
-        eager = self._searches < self._settings.eager_frames
-        return Patience(
-            when_doubtful=self._credit >= 1.0,
-            when_lost=eager or self._untrusted % self._settings.patient_every == 0,
-        )
+            return Patience(self._found is not None, self._found is not None, at_once)
+        held = now_s - self._seen_s <= self._hold_s
+        when_lost = held or self._untrusted % self._settings.patient_every == 0
+        return Patience(self._credit >= 1.0, when_lost, at_once)
 
-    def poses(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, lost: bool) -> Array:
-        """Poses (s, 4, 4) to try in this frame about ``cam_T_grip`` (4, 4): what was found in an earlier one, or here
-        if the gripper is just ``lost``; else none, and a search begins with a copy of the image.
+    def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
+        """Places to follow in this frame: what was found in an earlier one, or here if the gripper is just lost; else
+        none, and a search begins with a copy of the image.
         """
         if self._found is not None:
             return self._found
-        camera, gripper, settings = self._camera, self._gripper, self._settings
-        self._searches += 1
-        if lost and self._searches == 1:
-            return search_poses(image, camera, gripper, cam_T_grip, jaw_opening_m, settings)
+        first, self._searched = not self._searched, True
+        if sought.lost and first:
+            return self._meter.searched(image, expected, sought)
         kept = image.copy()
-        self._backlog.add(lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s)
-        return NOWHERE
+        self._backlog.add(lambda: self._meter.searched(kept, expected, sought), self._now_s)
+        return ()
 
     def end_frame(self, measurement: Measurement) -> None:
         """What came of this frame."""
@@ -75,4 +71,4 @@ class GripperSearch:
         self._credit = min(max(self._credit + earned, 0.0), float(self._settings.eager_frames))
         self._untrusted += 1
         if measurement.trusted:
-            self._untrusted = self._searches = 0
+            self._untrusted, self._searched, self._seen_s = 0, False, self._now_s

@@ -39,8 +39,9 @@ class Tracker:
         """By how much the model may have each finger out of its place; teaching measures that."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # where it was seen last
         self._usual_share = USUAL_SHARE
-        self.searching = GripperSearch(camera, gripper, settings.corners.search)
-        # Its own, since it may run beside a measurement.
+        # Of their own, since they may run beside a measurement.
+        searcher = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
+        self.searching = GripperSearch(searcher, settings.corners.search, settings.policy.hold_s)
         self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
 
     @property
@@ -63,7 +64,7 @@ class Tracker:
             patience,
             jaw_reported=frame.jaw_opening_m is not None,
             rivals=rivals,
-            search=self.searching.poses,
+            search=self.searching.places,
         )
         self.searching.end_frame(measurement)
         if measurement.trusted:

@@ -3,8 +3,9 @@
 from gripmon.track.edges.consensus import prior_information
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, finger_of_ends
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
-from gripmon.track.edges.measure import FingertipMeter, Patience
-from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
+from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
+from gripmon.track.edges.search import SearchSettings
+from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement, MeasurementSettings
 from gripmon.track.edges.sums import edge_sums
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 from gripmon.track.edges.uncertainty import NormalEquations
@@ -14,6 +15,7 @@ from gripmon.track.edges.warming import warm_up
 __all__ = [
     "JAW_UNREPORTED_SIGMA_M",
     "Effort",
+    "Expected",
     "FingerEnds",
     "FingerEndsSeen",
     "FingerMeter",
@@ -22,6 +24,8 @@ __all__ = [
     "MeasurementSettings",
     "NormalEquations",
     "Patience",
+    "SearchSettings",
+    "Sought",
     "TaughtEdges",
     "TaughtModel",
     "agreeing_fingers",

@@ -7,8 +7,9 @@ are other starts tried, and only when those fail, too, is the gripper searched f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,17 +57,30 @@ CLEARLY_BETTER = 1.3
 @dataclass(frozen=True, slots=True)
 class Patience:
     """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where
-    there is none.
+    there is none.  ``at_once``: near by in this frame, else that is left to the search, too.
     """
 
     when_doubtful: bool
     when_lost: bool
+    at_once: bool = True
 
 
-Search = Callable[[Image, Array, float, bool], Array]
-"""From an image, an expected pose (4, 4) and opening, and whether the gripper is lost there, to poses (s, 4, 4) at
-which it may be, best first.
-"""
+class Sought(NamedTuple):
+    """How a gripper is searched for: whether it is ``lost`` where it is expected, or only poor, and whether ``near``
+    by, too; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, and the one that a
+    rough fit must show.
+    """
+
+    lost: bool
+    near: bool
+    zoom: int
+    jaw_reported: bool
+    usual_share: float
+    least_share: float
+
+
+Search = Callable[[Image, Expected, Sought], Sequence[Expected]]
+"""From an image and an expected place to those at which the gripper may be, best first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +93,8 @@ class _Place:
 
 class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
+
+    _lost = 0  # frames in a row in which it wasn't seen there
 
     @property
     def finger_axis(self) -> Array:
@@ -109,7 +125,7 @@ class FingertipMeter(FingerMeter):
         elsewhere, last of all where ``search`` proposes (if None, a search in this image): another place than one that
         may be true must show the fingers' ends.
         """
-        self._prior = self._prior_reported if jaw_reported else self._prior_unreported
+        self._take(jaw_reported)
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         expected = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
@@ -124,39 +140,49 @@ class FingertipMeter(FingerMeter):
             self._zoom_to(self._fitting_zoom(best))
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
+            self._lost = 0
             return best
         best.trusted = self._trusted(image, best, usual_share)
+        self._lost = 0 if best.trusted else self._lost + 1
         if not (patience.when_doubtful if best.trusted else patience.when_lost):
             return best
-        best = self._from_elsewhere(image, expected, best, usual_share, search or self._search)
+        best = self._from_elsewhere(image, expected, best, usual_share, search or self.searched, patience.at_once)
         best.looked_far = True
         return best
 
+    def _take(self, jaw_reported: bool) -> None:
+        self._prior = self._prior_reported if jaw_reported else self._prior_unreported
+
     def _at_rivals(self, image: Image, expected: Expected, rivals: tuple[Array, ...], best: Measurement) -> Measurement:
-        """The best of the expected place and of others at which the gripper was."""
+        """The best of the expected place and of others at which the gripper was; what has been fitted from there once
+        isn't fitted again.
+        """
         for rival in rivals:
-            if best.prediction.moved_px(perturbation_between(best.cam_T_grip, rival)) > self._settings.relinearise_px:
+            moved_px = best.prediction.moved_px
+            away = perturbation_between(expected.cam_T_grip, rival), perturbation_between(best.cam_T_grip, rival)
+            if min(moved_px(away[0]), moved_px(away[1])) > self._settings.relinearise_px:
                 other = self._settle(image, replace(expected, cam_T_grip=rival))
                 best = max(best, other, key=lambda m: m.consensus.share)
         return best
 
     def _from_elsewhere(
-        self, image: Image, expected: Expected, best: Measurement, usual_share: float, search: Search
+        self, image: Image, expected: Expected, best: Measurement, usual_share: float, search: Search, at_once: bool
     ) -> Measurement:
         """The best of the places farther away, if one is better than the expected one."""
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true, and such a place is not given up for one that isn't believed.
         beat = (CLEARLY_BETTER if best.trusted else 1.0) * best.consensus.share
         least = max(self._settings.consensus.found_share, TRUSTED * usual_share)
-        for effort in (Effort.GRID, Effort.SEARCH):
+        for effort in (Effort.GRID, Effort.SEARCH) if at_once else (Effort.SEARCH,):
+            enough = PROMISING * max(beat, least)
             if effort is Effort.GRID:
-                places = self._near_places(image, expected)
+                places = self._fitted_again(image, self._near_places(image, expected), enough)
             else:
-                poses = search(image, expected.cam_T_grip, expected.jaw_opening_m, not best.trusted)
-                places = self._far_places(image, expected, poses, usual_share)
-            again = [self._tried(image, place.expected) for place in _best(places)]
-            for place in _promising(again, PROMISING * max(beat, least)):
-                other = replace(self._settle(image, place.expected), effort=effort)
+                lost, reported = not best.trusted, self._prior is self._prior_reported
+                sought = Sought(lost, not at_once, self._zoom, reported, usual_share, enough)
+                places = search(image, expected, sought)
+            for place in places:
+                other = replace(self._settle(image, place), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
                 if best.trusted and not self.ends(image, other, strict=True).sure:
                     continue
@@ -185,21 +211,26 @@ class FingertipMeter(FingerMeter):
         return self._ends.seen(image, measurement, strict)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
-        """The best of the zooms: the image may have lost, or found, its focus."""
+        """The best of the zooms: the image may have lost, or found, its focus.  Once the gripper is lost one of the
+        others is tried a frame, in turn.
+        """
         chosen = self._zoom
-        for zoom in ZOOMS:
-            if zoom == chosen:
-                continue
+        others = [zoom for zoom in ZOOMS if zoom != chosen]
+        for zoom in others[self._lost % len(others) :][:1] if self._lost else others:
             self._zoom_to(zoom)
             beat = CLEARLY_BETTER * best.consensus.share
             least = PROMISING * max(beat, self._settings.consensus.trusted_share)
-            if self._tried(image, expected).share < least:
+            if self._rough_share(image, expected) < least:
                 continue
             other = self._settle(image, expected)
             # A coarse zoom reaches far and sees little: only where the edges are as blurred as it expects.
             if other.consensus.share > beat and self._fitting_zoom(other) == zoom:
                 best, chosen = other, zoom
         self._zoom_to(chosen)
+        if best.consensus.share > 0.0:
+            # What is sampled there is chosen anew: it was for a place that may be poor.
+            self._prediction.pop(chosen, None)
+            self._laid_out.pop(chosen, None)
         return best
 
     def _trusted(self, image: Image, measurement: Measurement, usual_share: float) -> bool:
@@ -247,8 +278,17 @@ class FingertipMeter(FingerMeter):
                 best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
         return best
 
-    def _search(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, _lost: bool) -> Array:
-        return search_poses(image, self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.search)
+    def searched(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
+        """Where the gripper may be, best first, by a search in the whole neighbourhood; takes the time of many
+        frames.
+        """
+        self._zoom_to(sought.zoom)
+        self._take(sought.jaw_reported)
+        search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
+        poses = search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search)
+        places = self._near_places(image, expected) if sought.near else []
+        places += self._far_places(image, expected, poses, sought.usual_share)
+        return self._fitted_again(image, places, sought.least_share)
 
     def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
         """The best of starts all over the reach of the profiles."""
@@ -260,6 +300,11 @@ class FingertipMeter(FingerMeter):
         prior = self._prior_about(prediction, expected)
         fit = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
         return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
+
+    def _fitted_again(self, image: Image, places: list[_Place], least_share: float) -> Sequence[Expected]:
+        """The best of some places, where rough fits from there lead: those with so large a share."""
+        again = [self._tried(image, place.expected) for place in _best(places)]
+        return [place.expected for place in _promising(again, least_share)]
 
     def _far_places(self, image: Image, expected: Expected, poses: Array, usual_share: float) -> list[_Place]:
         """Proposed ``poses`` (s, 4, 4) up to the first that shows as well as usual."""
@@ -282,6 +327,14 @@ class FingertipMeter(FingerMeter):
         start = np.zeros(len(self._prior))
         fit = agree(self._look(image, prediction), prior, start, self._settings.consensus)
         return _Place(fit.share, self._moved(prediction, fit.xi, expected))
+
+    def _rough_share(self, image: Image, expected: Expected) -> float:
+        """What one rough fit shows from where the gripper is expected."""
+        prediction, start = self._predicted(expected)
+        if not prediction.ok.any():
+            return 0.0
+        prior = self._prior_about(prediction, expected)
+        return agree(self._look(image, prediction), prior, start, self._settings.consensus).share
 
 
 def _best(places: list[_Place], count: int = FITTED_AGAIN) -> list[_Place]:

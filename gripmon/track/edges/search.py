@@ -78,13 +78,18 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 160
     starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
     eager_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="so many frames may look further one after the other")
+        int, Meta(ge=1, le=1000, description="so many doubtful frames may look further one after the other")
     ] = 4
     refill_frames: Annotated[
         int, Meta(ge=1, le=100000, description="good frames after which one more frame may look further")
     ] = 60
     patient_every: Annotated[
-        int, Meta(ge=1, le=1000, description="a lost gripper is then searched for in one of so many frames")
+        int,
+        Meta(
+            ge=1,
+            le=1000,
+            description="a gripper lost for longer than its transform is held is searched for in one of so many frames",
+        ),
     ] = 15
 
 

@@ -194,13 +194,13 @@ class Settler:
         self._prior_reported = prior_information(jaw_sigma_m if gripper.has_jaw else None)
         self._prior_unreported = prior_information(JAW_UNREPORTED_SIGMA_M if gripper.has_jaw else None)
         self._prior = self._prior_reported
-        self._laid_out: tuple[EdgeLayout, Array] | None = None
-        self._prediction: Prediction | None = None
+        self._laid_out: dict[int, tuple[EdgeLayout, Array]] = {}  # by zoom
+        self._prediction: dict[int, Prediction] = {}
         self._geometry: tuple[Prediction, CornerGeometry] | None = None
 
     def _settle(self, image: Image, expected: Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
-        most.
+        most.  Where nothing agrees no fit leads to anything: it isn't followed.
         """
         settings, moved = self._settings, None
         for _ in range(3):
@@ -215,6 +215,7 @@ class Settler:
             if moved_px > 2.0 * self._reach_px:
                 # Nothing was seen out there: the few points that agree don't determine the motion.
                 consensus = replace(consensus, share=0.0)
+            if consensus.share == 0.0:
                 break
             expected, moved = self._moved(prediction, consensus.xi, expected), consensus
             if moved_px <= settings.relinearise_px:
@@ -223,7 +224,7 @@ class Settler:
             prior = self._prior_about(prediction, replace(expected, held_T=None))
         votes, consensus = agree_on_seen(votes, prior, consensus, settings.consensus)
         uncertainty = self._assess(votes, consensus)
-        if uncertainty.contradiction > CONTRADICTION:
+        if uncertainty.contradiction > CONTRADICTION and consensus.share > 0.0:
             found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
             if found is not None:
                 votes, consensus, uncertainty = found
@@ -266,8 +267,7 @@ class Settler:
         return math.sqrt(max(width_px**2 - kernel_px**2, 0.0))
 
     def _zoom_to(self, zoom: int) -> None:
-        if zoom != self._zoom:
-            self._zoom, self._laid_out, self._prediction = zoom, None, None
+        self._zoom = zoom
 
     @property
     def _reach_px(self) -> float:
@@ -277,15 +277,15 @@ class Settler:
         """The kept prediction while it holds, else a new one at the expected pose; and the unknowns (m,) from it to
         there.
         """
-        kept = self._prediction
+        kept, laid_out = self._prediction.get(self._zoom), self._laid_out.get(self._zoom)
         if kept is not None and len(kept.uv_px):
             start = self._from_prediction(kept, expected)
             if kept.moved_px(start) <= self._settings.relinearise_px:
                 return kept, start
-        if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
-            self._laid_out = self._lay_out(expected), self._corner_pixels(expected)
-        self._prediction = self._predict(self._laid_out[0], expected)
-        return self._prediction, np.zeros(len(self._prior))
+        if laid_out is None or self._layout_moved_px(laid_out[1], expected) > RELAYOUT_PX:
+            laid_out = self._laid_out[self._zoom] = self._lay_out(expected), self._corner_pixels(expected)
+        prediction = self._prediction[self._zoom] = self._predict(laid_out[0], expected)
+        return prediction, np.zeros(len(self._prior))
 
     def _geometry_of(self, prediction: Prediction) -> CornerGeometry:
         if self._geometry is None or self._geometry[0] is not prediction:
@@ -312,9 +312,9 @@ class Settler:
             self._taught,
         )
 
-    def _layout_moved_px(self, expected: Expected) -> float:
-        assert self._laid_out is not None
-        moved = np.abs(self._corner_pixels(expected) - self._laid_out[1])
+    def _layout_moved_px(self, corners_px: Array, expected: Expected) -> float:
+        """How far the corners are from where they were laid out, px."""
+        moved = np.abs(self._corner_pixels(expected) - corners_px)
         return float(np.nanmax(moved)) if np.isfinite(moved).any() else np.inf
 
     def _corner_pixels(self, expected: Expected) -> Array:
