@@ -203,10 +203,14 @@ class FingerEnds:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
         measured = places.at_end & _of_corners(measurement.corners.usable, places)
-        supported, share = measurement.consensus.supported, measurement.consensus.edge_share
-        for number, (beside, *turning) in probes.turns.items():
-            side_shows = supported[beside].mean() >= SHOWN * share[prediction.layout.edge[beside[0]]]
-            measured[number] = side_shows and all(supported[stretch].mean() >= SHOWN for stretch in turning)
+        consensus, edge = measurement.consensus, prediction.layout.edge
+        for number, stretches in probes.turns.items():
+            shown = [consensus.supported[stretch].mean() for stretch in stretches]
+            usual = np.ones(len(shown))
+            if places.rounding[number] < 0:
+                usual[0] = consensus.edge_share[places.side[number]]
+            seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
+            measured[number] = seen and (shown >= SHOWN * usual).all()
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
