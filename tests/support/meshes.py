@@ -98,11 +98,21 @@ class MeshCamera:
         )
         self._table = 70.0 + table
 
-    def picture(self, cam_T_grip: np.ndarray, offsets_m: Sequence[np.ndarray] | None = None) -> np.ndarray:
-        """(h, w) 8 bits: fingers moved by ``offsets_m`` each."""
+    def picture(
+        self,
+        cam_T_grip: np.ndarray,
+        offsets_m: Sequence[np.ndarray] | None = None,
+        *,
+        before: Sequence[tuple[np.ndarray, float]] = (),
+        behind: Sequence[tuple[np.ndarray, float]] = (),
+    ) -> np.ndarray:
+        """(h, w) 8 bits: fingers moved by ``offsets_m`` each; flat things (n, 3), camera frame, with their grey level
+        ``before`` and ``behind`` them.
+        """
         height, width = self._camera.height_px, self._camera.width_px
         v, u = (int(self._rng.integers(0, n - m)) for n, m in zip(self._table.shape, (height, width), strict=True))
         table = self._table[v : v + height, u : u + width]
+        table = self._covered(table, behind)
         passes, light = np.ones((height, width)), np.zeros((height, width))
         for k, (vertices, faces, normals) in enumerate(self._meshes):
             shift = np.zeros(3) if offsets_m is None else offsets_m[k]
@@ -120,8 +130,17 @@ class MeshCamera:
                     light[part] += level[t] * mask.mask
         # Masks of a hundred slivers are off by a per cent where they meet.
         assert passes.min() > -0.05, "faces of a finger cover each other in this view: the picture would be wrong"
-        image = table * passes + light + self._rng.normal(0.0, 1.5, passes.shape)
+        image = self._covered(table * passes + light, before) + self._rng.normal(0.0, 1.5, passes.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+    def _covered(self, image: np.ndarray, things: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+        image = image.copy()
+        for (_, level), mask in zip(things, self._raster.masks([thing for thing, _ in things]), strict=True):
+            if mask is not None:
+                rows = slice(mask.top, mask.top + mask.mask.shape[0])
+                part = rows, slice(mask.left, mask.left + mask.mask.shape[1])
+                image[part] += (level - image[part]) * mask.mask
+        return image
 
 
 def wandering(cam_T_grip: np.ndarray, share: float, most_m: float = 0.001, most_rad: float = 0.005) -> np.ndarray:

@@ -78,7 +78,7 @@ class Gripper:
         self._edges_at_corner = [np.flatnonzero(at_it & ~self.edge_curved) for at_it in at_corner]
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
-        self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
+        self.edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
         self.notes: list[str] = []
         self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
         self._check_outwards()
@@ -150,7 +150,7 @@ class Gripper:
         seen = facing[self._edge_faces]
         known = self._edge_faces >= 0
         visible = ~known.any(axis=1) | seen.any(axis=1)
-        crease = np.where(known.all(axis=1), seen.all(axis=1), self._edge_crease)
+        crease = np.where(known.all(axis=1), seen.all(axis=1), self.edge_crease)
         inside = np.full((len(self.edge_ids), 3), np.nan)
         for i in np.flatnonzero(seen.sum(axis=1) == 1):
             face = self.faces[self._edge_faces[i, 0 if seen[i, 0] else 1]]

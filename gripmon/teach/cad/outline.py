@@ -8,6 +8,7 @@ view changes, which its points' ``round`` follows.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -39,7 +40,10 @@ SHADED_PX = 0.1
 tips of 2 to 8 mm, rendered with a lamp from the side, outlines lay 0.05 to 0.17 px beside."""
 
 SHORTEST_PX = 8.0
-"""The shortest edge: as long as what the monitor leaves out at the ends of one."""
+"""The shortest edge by itself: as long as what the monitor leaves out at the ends of one.  What is shorter only joins
+two others: a bridge."""
+
+SHORTEST_M = 1e-4  # of a gripper file's edges
 
 TURN_RAD = 0.524
 """A curve that turns by more than this (30 degrees) within a few pixels has a corner there."""
@@ -66,7 +70,8 @@ class _Run:
 @dataclass(frozen=True, slots=True)
 class _Edge:
     """A straight edge, or a curve ``via_m`` (n, 3): its ends in space and in the image (2, 3 and 2), the centres of the
-    roundings there (2, 3), and by how much what is seen lies beside it, m (standard deviation).
+    roundings there (2, 3), and by how much what is seen lies beside it, m (standard deviation).  A ``bridge`` is too
+    short to be measured and says which edges go on in which.
     """
 
     points_m: Array
@@ -75,6 +80,7 @@ class _Edge:
     via_m: Array
     crease: bool
     spread_m: float
+    bridge: bool
 
 
 def outline_shape(surface: Surface, view: Pinhole, depth: DepthMap, lowest_m: float | None, mounted: bool) -> Shape:
@@ -150,13 +156,13 @@ def _edges(run: _Run, view: Pinhole) -> Iterator[_Edge]:
     m_per_px = float(np.linalg.norm(run.points_m - view.eye_grip_m, axis=1).mean()) / view.focal_px
     for first, last, straight in _parts(run.px):
         length_px = float(np.linalg.norm(np.diff(run.px[first : last + 1], axis=0), axis=1).sum())
-        if length_px < SHORTEST_PX:
+        ends, bridge = [first, last], length_px < SHORTEST_PX
+        if bridge and np.linalg.norm(run.points_m[last] - run.points_m[first]) <= SHORTEST_M:
             continue
-        ends = [first, last]
-        count = 0 if straight else int(np.clip(length_px / VIA_PX, 1, MOST_VIA))
-        via = np.rint(np.linspace(first, last, count + 2)[1:-1]).astype(int)
+        count = 0 if straight or bridge else int(np.clip(length_px / VIA_PX, 1, MOST_VIA))
+        via = run.points_m[np.rint(np.linspace(first, last, count + 2)[1:-1]).astype(int)]
         spread_m = SHADED_PX * m_per_px if np.isfinite(run.centre_m[ends]).all() else 0.0
-        yield _Edge(run.points_m[ends], run.centre_m[ends], run.px[ends], run.points_m[via], run.crease, spread_m)
+        yield _Edge(run.points_m[ends], run.centre_m[ends], run.px[ends], via, run.crease, spread_m, bridge)
 
 
 def _parts(px: Array) -> list[tuple[int, int, bool]]:
@@ -200,13 +206,15 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
     close = cKDTree(ends).query_pairs(_TOGETHER_PX * m_per_px, output_type="ndarray").reshape(-1, 2)
     graph = coo_matrix((np.ones(len(close), np.int8), close.T), shape=(len(ends),) * 2)
     count, label = connected_components(graph, directed=False)
+    bridging = np.repeat([edge.bridge for edge in edges], 2)
     straight = np.repeat([not len(edge.via_m) for edge in edges], 2)
-    count, label = _met(ends, px, label, straight, STEP_PX * m_per_px)
+    count, label = _met(ends, px, label, straight, bridging, STEP_PX * m_per_px)
     sharp = ~np.isfinite(centres).all(axis=1)
     points = np.zeros((count, 3))
     rounds: dict[int, tuple[Array, Array]] = {}
     for k in range(count):
         own = np.flatnonzero(label == k)
+        own = own[~bridging[own]] if not bridging[own].all() else own
         # A sharp edge's end is exact, an outline's end near it isn't.
         exact = own[sharp[own]] if sharp[own].any() else own
         points[k] = ends[exact].mean(axis=0)
@@ -222,25 +230,42 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
     for n, (a, b) in enumerate(found):
         if a != b:
             once.setdefault((min(a, b), max(a, b)), n)
-    kept = sorted(once.values())
+    kept = _bridged(sorted(once.values()), edges, found)
     shape = Shape(points, set(), [found[n] for n in kept], [edges[n].crease for n in kept], round_m=rounds)
     shape.spread_m = [edges[n].spread_m for n in kept]
     shape.via_m = [edges[n].via_m for n in kept]
-    shape.corners = _corners(shape, kept, label, px)
+    straight_ones = [n for n in kept if not edges[n].bridge and not len(edges[n].via_m)]
+    shape.corners = _corners(shape, straight_ones, label, px)
     return shape
 
 
+def _bridged(kept: list[int], edges: list[_Edge], found: list[tuple[int, int]]) -> list[int]:
+    """Those of the edges ``kept`` that aren't bridges to nowhere; ``found``: the two points of each edge."""
+    while True:
+        meeting = Counter(itertools.chain.from_iterable(found[n] for n in kept))
+        left = [n for n in kept if not edges[n].bridge or min(meeting[p] for p in found[n]) > 1]
+        if len(left) == len(kept):
+            return kept
+        kept = left
+
+
 def _met(
-    ends: Array, px: Array, label: NDArray[np.intp], straight: NDArray[np.bool_], apart_m: float
+    ends: Array,
+    px: Array,
+    label: NDArray[np.intp],
+    straight: NDArray[np.bool_],
+    bridging: NDArray[np.bool_],
+    apart_m: float,
 ) -> tuple[int, NDArray[np.intp]]:
     """Loose ends of two straight edges with no more than a few pixels of a tight curve between them, joined where
     their lines meet to ``apart_m``: at this distance that is a corner.  ``ends`` are moved there.  The number of
     points, and each end's (e,).
     """
-    loose = np.flatnonzero((np.bincount(label)[label] == 1) & straight)
+    others = np.where(bridging, -1, label)
+    loose = np.flatnonzero((np.bincount(label, ~bridging)[label] == 1) & straight & ~bridging)
     for a, b in cKDTree(px[loose]).query_pairs(LARGEST_GAP_PX) if len(loose) > 1 else ():
         i, j = loose[[a, b]].tolist()
-        if label[i] == label[j] or i ^ 1 == j or np.count_nonzero(np.isin(label, label[[i, j]])) > 2:
+        if label[i] == label[j] or i ^ 1 == j or np.count_nonzero(np.isin(others, label[[i, j]])) > 2:
             continue
         way_i, way_j = px[i] - px[i ^ 1], px[j] - px[j ^ 1]
         cross = float(way_i[0] * way_j[1] - way_i[1] * way_j[0])
@@ -256,6 +281,7 @@ def _met(
         if np.linalg.norm(met[1] - met[0]) > apart_m:
             continue
         ends[i] = ends[j] = 0.5 * (met[0] + met[1])
+        others[others == label[j]] = label[i]
         label[label == label[j]] = label[i]
     names, label = np.unique(label, return_inverse=True)
     return len(names), label.astype(np.intp)
@@ -264,8 +290,8 @@ def _met(
 def _corners(shape: Shape, kept: list[int], label: NDArray[np.intp], px: Array) -> set[int]:
     """Points in the front half where two straight edges meet at an angle."""
     away: dict[int, list[Array]] = {}
-    for n, via in zip(kept, shape.via_m, strict=True):
-        for end in () if len(via) else (2 * n, 2 * n + 1):
+    for n in kept:
+        for end in (2 * n, 2 * n + 1):
             away.setdefault(int(label[end]), []).append(px[end ^ 1] - px[end])
     z = shape.points_m[sorted({p for edge in shape.edges for p in edge}), 2]
     return {

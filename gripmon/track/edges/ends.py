@@ -3,6 +3,7 @@
 Edges along a finger say nothing about a motion along it; only its ends do, and a rim, a fold or a plate's border
 parallel to them looks like them.  But such a border goes on beside the finger, and a finger that reaches farther goes
 on beyond it.  A rounded fingertip has no corner: there the curve is seen, and the side that it begins at doesn't go on.
+Where little shows of a rounding it is like a corner, at which neither of its two edges goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Image
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
+from gripmon.track.edges.roundings import Roundings
 from gripmon.track.edges.settling import Measurement
 
 ALONG_COSINE = 0.87
@@ -120,10 +122,12 @@ class _Probes:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where fingers may end, s places: all corners of the gripper in their order, then where sides turn into curves.
+    """Where fingers may end, s places: all corners of the gripper in their order, then where sides turn into curves,
+    then roundings.
 
     ``point`` and ``finger`` (s,) of each, ``at_end`` (s,) whether its finger ends there; ``corner`` (s,), or -1 where
-    the edge ``side`` (s,) turns into the curved edge ``curve`` (s,), each -1 at a corner.
+    the edge ``side`` (s,) turns into the curved edge ``curve`` (s,), each -1 where none does; ``rounding`` (s,) its
+    number, or -1.
     """
 
     point: NDArray[np.intp]
@@ -132,27 +136,29 @@ class _Places:
     corner: NDArray[np.intp]
     side: NDArray[np.intp]
     curve: NDArray[np.intp]
+    rounding: NDArray[np.intp]
 
     @classmethod
-    def of(cls, gripper: Gripper, along: NDArray[np.bool_]) -> _Places:
-        rows: list[tuple[int, bool, int, int, int]] = []
+    def of(cls, gripper: Gripper, along: NDArray[np.bool_], roundings: NDArray[np.intp]) -> _Places:
+        rows: list[tuple[int, bool, int, int, int, int]] = []
         for number, point in enumerate(gripper.corner_points.tolist()):
             at_it = along[gripper.edges_at_corner(number)]
             # Without a direction of the fingers every corner is an end.
             at_end = bool(along.all() or (at_it.any() and not at_it.all()))
-            rows.append((point, at_end, number, -1, -1))
+            rows.append((point, at_end, number, -1, -1, -1))
         corners = set(gripper.corner_points.tolist())
         for curve in np.flatnonzero(gripper.edge_curved & ~along).tolist():
             for point in set(gripper.edge_points[curve].tolist()) - corners:
                 at_it = (gripper.edge_points == point).any(axis=1)
-                rows += [(point, True, -1, side, curve) for side in np.flatnonzero(at_it & along).tolist()[:1]]
-        columns = np.array(rows, dtype=np.intp).reshape(-1, 5).T
-        return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, columns[2], columns[3], columns[4])
+                rows += [(point, True, -1, side, curve, -1) for side in np.flatnonzero(at_it & along).tolist()[:1]]
+        rows += [(point, True, -1, -1, -1, number) for number, point in enumerate(roundings.tolist())]
+        point, at_end, *others = np.array(rows, dtype=np.intp).reshape(-1, 6).T
+        return cls(point, gripper.point_finger[point], at_end > 0, *others)
 
 
 def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
-    """(s,) the finger of each place at which one may end: the gripper's corners, then where sides turn into curves."""
-    return _Places.of(gripper, along_fingers(gripper)[1]).finger
+    """(s,) the finger of each place at which one may end: corners, where sides turn into curves, roundings."""
+    return FingerEnds(gripper, EdgeSettings()).finger
 
 
 class FingerEnds:
@@ -161,7 +167,8 @@ class FingerEnds:
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
         self.axis, self.along = along_fingers(gripper)
-        self._places = _Places.of(gripper, self.along)
+        self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], ALONG_COSINE)
+        self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
 
     @property
@@ -182,7 +189,8 @@ class FingerEnds:
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
         """(s,) the places that might be seen as ends in this view."""
         places, profiles = self._places, prediction.profiles
-        curved = (profiles[places.side] > 0) & (profiles[places.curve] > 0)
+        curved = (profiles[places.side] > 0) & (profiles[places.curve] > 0) & (places.rounding < 0)
+        curved[np.isin(places.rounding, list(self._roundings.seen_in(prediction)))] = True
         return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
     def at_places(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
@@ -195,10 +203,14 @@ class FingerEnds:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
         measured = places.at_end & _of_corners(measurement.corners.usable, places)
-        supported, share = measurement.consensus.supported, measurement.consensus.edge_share
-        for number, (beside, *turning) in probes.turns.items():
-            side_shows = supported[beside].mean() >= SHOWN * share[places.side[number]]
-            measured[number] = side_shows and all(supported[stretch].mean() >= SHOWN for stretch in turning)
+        consensus, edge = measurement.consensus, prediction.layout.edge
+        for number, stretches in probes.turns.items():
+            shown = [consensus.supported[stretch].mean() for stretch in stretches]
+            usual = np.ones(len(shown))
+            if places.rounding[number] < 0:
+                usual[0] = consensus.edge_share[places.side[number]]
+            seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
+            measured[number] = seen and (shown >= SHOWN * usual).all()
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
@@ -227,7 +239,7 @@ class FingerEnds:
         turns: dict[int, tuple[NDArray[np.intp], ...]] = {}
         for slot, edge in enumerate(prediction.layout.edges.tolist()):
             for number in np.flatnonzero(places.at_end & np.isin(places.point, points[edge])).tolist():
-                if places.corner[number] < 0 and places.side[number] != edge:
+                if places.rounding[number] >= 0 or (places.corner[number] < 0 and places.side[number] != edge):
                     continue
                 beyond = self._beyond(prediction, slot, edge, number)
                 if beyond is None:
@@ -238,6 +250,14 @@ class FingerEnds:
                 place.append(number)
                 sample.append(here)
                 at.append(from_uv_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
+                across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
+        for of_it, rounding in self._roundings.seen_in(prediction).items():
+            number = int(np.flatnonzero(places.rounding == of_it)[0])
+            turns[number] = rounding.beside
+            for here, way in zip(rounding.ends, rounding.ways, strict=True):
+                place.append(number)
+                sample.append(here)
+                at.append(rounding.meet_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
                 across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
         if not place:
             nowhere = np.zeros((0, 3), dtype=np.float32)
