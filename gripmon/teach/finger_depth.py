@@ -213,9 +213,7 @@ def _unit(xy: Array, piece: tuple[int, int]) -> Array:
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _in_space(
-    finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array
-) -> Array:
+def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array) -> Array:
     """Vertices (v, 3): the tip's in the contact plane, or in that of the sides which it leaves smoothly."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
@@ -223,7 +221,7 @@ def _in_space(
         ray = _ray(finger.xy[k])
         out[k] = ray * (height / float(direction @ ray))
     first = [(start, end) for start, end in sides if start in tip]
-    if len(first) == 2 and all(_leaves_smoothly(finger, tip, *side) for side in first):
+    if len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first):
         turns = [start for start, _ in first]
         _into_plane_of_sides(out, sorted(tip), turns, direction, height)
     for start, end in sides:
@@ -234,8 +232,10 @@ def _in_space(
     return out
 
 
-def _leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
-    """Whether a side that comes from ``behind`` turns into a curve at its ``start``: a corner turns all at once."""
+def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
+    """Whether a side that comes from ``behind`` turns into a curve of the ``tip`` at its ``start``: a corner turns all
+    at once.
+    """
     way, at, travelled_px, turns = finger.xy[start] - finger.xy[behind], start, 0.0, []
     used = {behind}
     while travelled_px < CURVE_PX:
