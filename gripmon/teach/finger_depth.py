@@ -2,8 +2,9 @@
 
 Long edges of a finger that run along it are parallel in space, so their images meet in one point, which is the fingers'
 direction (the vanishing point; Caprile and Torre 1990).  Fingertips end square to that: their outline lies in the
-contact
-plane, and the long edges run back from it.  Where edges don't meet so, the outline is taken as flat, facing the camera.
+contact plane, and the long edges run back from it.  A round tip's outline lies in the plane of the finger's sides: it
+leaves them smoothly, where one in the contact plane would bend by 90 degrees, and only from a few places not be seen
+to.  Where edges don't meet so, the outline is taken as flat, facing the camera.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ ALONG_RAD = math.radians(50.0)
 """Between an edge's image and the way to the tip: perspective turns edges along a finger by up to so much."""
 STEEPEST = 0.25
 """Cosine between line of sight and fingers below which a contact plane is seen too obliquely to place corners on it."""
+CURVE_PX = 24.0
+"""Along a tip, from its side on: as far as a corner may be cut off by a short piece and be one."""
+AT_ONCE = 0.75
+"""Part of the turn within that distance that a corner has; the three pieces of the tightest curve that is seen as one
+(three of 6 px) turn by a third each, scatter aside."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Of a plane whose tilt isn't known: anything up to 45 degrees (45 / sqrt(3))."""
@@ -82,13 +88,13 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     if any(not tip for tip, _ in runs):
         return _flat(fingers, centre, rotation, tcp)
     plane_at = _ray(centre) if tcp is None else tcp
-    points = [
-        _on_contact_plane(f, tip, sides, direction, plane_at) for f, (tip, sides) in zip(fingers, runs, strict=True)
-    ]
+    points = [_in_space(f, tip, sides, direction, plane_at) for f, (tip, sides) in zip(fingers, runs, strict=True)]
     tips = [sorted(tip) for tip, _ in runs]
     if rotation is None or tcp is None:
         inner = _innermost([p[t] for p, t in zip(points, tips, strict=True)])
+        # Between the fingers, where they end: what is innermost of round tips lies farther back.
         tcp = np.mean(inner, axis=0)
+        tcp = tcp + direction * float(direction @ (plane_at - tcp))
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, across=_across_inner_edges(fingers, points, tips, direction))
     kept = tuple(
@@ -207,20 +213,55 @@ def _unit(xy: Array, piece: tuple[int, int]) -> Array:
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _on_contact_plane(
-    finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array
-) -> Array:
+def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array) -> Array:
+    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides which it leaves smoothly."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
         ray = _ray(finger.xy[k])
         out[k] = ray * (height / float(direction @ ray))
+    first = [(start, end) for start, end in sides if start in tip]
+    if len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first):
+        turns = [start for start, _ in first]
+        _into_plane_of_sides(out, sorted(tip), turns, direction, height)
     for start, end in sides:
         if np.isfinite(out[end]).all() or not np.isfinite(out[start]).all():
             continue
         out[end] = nearest_on_ray(_ray(finger.xy[end]), out[start], direction)
     out[out[:, 2] <= 0.0] = np.nan
     return out
+
+
+def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
+    """Whether a side that comes from ``behind`` turns into a curve of the ``tip`` at its ``start``: a corner turns all
+    at once.
+    """
+    way, at, travelled_px, turns = finger.xy[start] - finger.xy[behind], start, 0.0, []
+    used = {behind}
+    while travelled_px < CURVE_PX:
+        used.add(at)
+        onwards = [
+            (next(iter({*piece} - {at})), length)
+            for piece, length in zip(finger.pieces, finger.length_px.tolist(), strict=True)
+            if at in piece and {*piece} - {at} <= tip - used
+        ]
+        if not onwards:
+            break
+        to, length_px = onwards[0]
+        ahead = finger.xy[to] - finger.xy[at]
+        turns.append(math.atan2(way[0] * ahead[1] - way[1] * ahead[0], float(way @ ahead)))
+        way, at, travelled_px = ahead, to, travelled_px + length_px
+    return bool(turns) and abs(turns[0]) < AT_ONCE * abs(sum(turns))
+
+
+def _into_plane_of_sides(points: Array, tip: list[int], turns: list[int], direction: Array, height: float) -> None:
+    """Move the tip's vertices, in the contact plane so far, along their lines of sight into the plane of the two sides,
+    which begin at ``turns`` equally far from the tip; what reaches farthest out then lies in the contact plane.
+    """
+    normal = np.cross(direction, points[turns[1]] - points[turns[0]])
+    rays = points[tip] / points[tip][:, 2:]
+    flat = rays * (float(normal @ points[turns[0]]) / (rays @ normal))[:, None]
+    points[tip] = flat * (height / float((flat @ direction).max()))
 
 
 def nearest_on_ray(ray: Array, start: Array, direction: Array) -> Array:

@@ -7,13 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.gripper import EdgeModel, FingerModel, GripperModel, JawModel, PointModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, nearest_on_ray
+from gripmon.teach.curved_edges import smooth_curve
+from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, leaves_smoothly, nearest_on_ray
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
@@ -27,8 +29,8 @@ LARGEST_GAP = 0.5
 """Between such an edge and its corner, over its length: its line is then known there as well as along itself."""
 LONG_SIDE = 0.5
 """Length of a finger's side over that of its longest, from which it is one, and no piece of the curve at its end."""
-ON_THE_CURVE = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
-"""Where on its length the best line through a stretch of a curve crosses it: the parabola's mean square is least so."""
+LONGEST_SHARE = 0.25
+"""Of a side: at most so much of it before a curve counts with the curve."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +92,12 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
     for outline, places, placed, finger in parts:
         dropped += len(outline.pieces) - len(placed)
         long = dict(zip(outline.pieces, (outline.length_px >= SHORTEST_EDGE_PX).tolist(), strict=True))
-        local = ((places - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
-        curves = _curves(outline, placed, local)
+        curves = _curves(outline, placed, places @ seen.placed.rotation)
         of_curves = {piece for curve in curves for piece in curve}
         kept = [piece for piece in placed if long[piece] and piece not in of_curves]
+        places = places.copy()
+        vias = [_curve_in_space(seen, outline, finger.mask, places, curve, kept) for curve in curves]
+        local = ((places - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
         met = np.bincount(np.ravel(kept).astype(int), minlength=len(local)) if kept else np.zeros(len(local), int)
         known = sorted({k for piece in kept for k in piece} | {k for c in curves for k in (c[0][0], c[-1][1])})
         for k in known:
@@ -102,10 +106,10 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
             points[f"{outline.name}_{k}"] = PointModel(finger=outline.name, xyz_m=(x, y, z), corner=corner)
         for a, b in kept:
             edges[f"{outline.name}_{a}_{b}"] = EdgeModel(start=f"{outline.name}_{a}", end=f"{outline.name}_{b}")
-        for curve in curves:
+        for curve, via in zip(curves, vias, strict=True):
             first, last = (f"{outline.name}_{k}" for k in (curve[0][0], curve[-1][1]))
-            via = [local[a] + share * (local[b] - local[a]) for a, b in curve for share in ON_THE_CURVE]
-            places_m = tuple((round(float(x), 7), round(float(y), 7), round(float(z), 7)) for x, y, z in via)
+            via_m = ((via - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
+            places_m = tuple((round(float(x), 7), round(float(y), 7), round(float(z), 7)) for x, y, z in via_m)
             edges[f"{first}_{curve[-1][1]}"] = EdgeModel(start=first, end=last, via=places_m)
         for number, edge in enumerate(finger.inner):
             start = _starts_at(seen, outline, known, edge)
@@ -147,6 +151,42 @@ def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -
     ):
         runs[0] = runs.pop() + runs[0]  # a closed outline begins anywhere
     return [run for run in runs if len(run) > 1]
+
+
+def _curve_in_space(
+    seen: Seen,
+    outline: Outline,
+    mask: NDArray[np.bool_],
+    places: Array,
+    curve: Sequence[tuple[int, int]],
+    straight: Sequence[tuple[int, int]],
+) -> Array:
+    """Points (n, 3) on a curve between its ends, at unit depth.  Where it goes on from a straight edge it begins on
+    that, where it leaves it: its end in ``places`` (v, 3) moves there.
+    """
+    vertices = [curve[0][0], *(b for _, b in curve)]
+    of_curve = places[vertices]
+    tangent = [False, False]
+    for side, (end, piece) in enumerate(((vertices[0], curve[0]), (vertices[-1], curve[-1]))):
+        behind = [a + b - end for a, b in straight if end in (a, b)]
+        if len(behind) != 1 or not leaves_smoothly(outline, set(vertices), end, behind[0]):
+            continue
+        tangent[side] = True
+        length = float(np.linalg.norm(outline.xy[behind[0]] - outline.xy[end]))
+        share = min(float(np.linalg.norm(np.subtract(*outline.xy[list(piece)]))) / length, LONGEST_SHARE)
+        far, near = places[behind[0]], places[end]
+        in_space = share * near[2] / ((1.0 - share) * far[2] + share * near[2])
+        on_side = near + in_space * (far - near)
+        of_curve = np.vstack([on_side, of_curve] if side == 0 else [of_curve, on_side])
+    uv_px = seen.camera.project(of_curve)
+    curve_px, along = smooth_curve(seen.camera, seen.opening, mask, uv_px, (tangent[0], tangent[1]))
+    rays = np.column_stack([seen.camera.undistort(curve_px), np.ones(len(curve_px))])
+    # In one plane the inverse depth is linear over the image.
+    points = rays / np.interp(along, np.arange(len(of_curve)), 1.0 / of_curve[:, 2])[:, None]
+    for side, end in enumerate((vertices[0], vertices[-1])):
+        if tangent[side]:
+            places[end] = points[-side]
+    return np.asarray(points[1:-1])
 
 
 def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEdge) -> tuple[int, int] | None:

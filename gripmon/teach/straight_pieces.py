@@ -36,6 +36,8 @@ LONGEST_CUT_PX = 24.0
 """Of a piece that may only be the smoothed contour cutting a corner off, which two edges that go on then decide."""
 CORNER_BLUR_PX = 2.0
 """Next to a corner its two edges' blur runs together."""
+STATION_MARGIN_PX = 6.0
+"""From the image's border: search lines reach so far, with what interpolation reads beside them."""
 _GAP_PX = 12.0
 _OUTLIER_PX = 1.0
 _MOST_POINTS = 1500
@@ -345,7 +347,7 @@ def _stations_on(
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     if float((normal * outward.mean(axis=0)).sum()) < 0.0:
         normal = -normal
-    return Stations(uv, normal, in_image(uv, shape, 6.0))
+    return Stations(uv, normal, in_image(uv, shape, STATION_MARGIN_PX))
 
 
 def _weighted_line(p: Array, chosen: NDArray[np.bool_]) -> tuple[Array, float]:

@@ -60,7 +60,6 @@ def coverage(simulator: Simulator) -> NDArray[np.float32]:
 def beside_truth_px(chains: list[Chain], covered: NDArray[np.float32]) -> Array:
     """How far the outline lies beside the true silhouette, at a point each pixel of all pieces of 8 px and more."""
     out = []
-    s = np.arange(-6.0, 6.01, 0.1)
     for chain in chains:
         for a, b in chain.pieces:
             ends = CAMERA.undistort(chain.uv_px[[a, b]])
@@ -68,14 +67,20 @@ def beside_truth_px(chains: list[Chain], covered: NDArray[np.float32]) -> Array:
             if length < 8.0:
                 continue
             share = np.linspace(2.0, length - 2.0, max(int(length) - 3, 4))[:, None] / length
-            uv = CAMERA.distort(ends[0] + share * (ends[1] - ends[0]))
-            way = np.gradient(uv, axis=0)
-            way /= np.linalg.norm(way, axis=1)[:, None]
-            normal = np.column_stack([-way[:, 1], way[:, 0]])
-            maps = [(uv[:, k, None] + normal[:, k, None] * s).astype(np.float32) for k in (0, 1)]
-            values = cv2.remap(covered, maps[0], maps[1], cv2.INTER_CUBIC) - 0.5
-            for row in values:
-                at = np.flatnonzero(np.sign(row[:-1]) != np.sign(row[1:]))
-                crossing = s[at] + 0.1 * row[at] / (row[at] - row[at + 1])
-                out.append(float(np.abs(crossing).min()) if len(at) else 6.0)
+            out.append(crossing_px(CAMERA.distort(ends[0] + share * (ends[1] - ends[0])), covered))
+    return np.concatenate(out)
+
+
+def crossing_px(uv_px: Array, covered: NDArray[np.float32]) -> Array:
+    """How far from each point (n, 2) of a line the true silhouette crosses the line's normal; 6 where it doesn't."""
+    s = np.arange(-6.0, 6.01, 0.1)
+    way = np.gradient(uv_px, axis=0)
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    normal = np.column_stack([-way[:, 1], way[:, 0]])
+    maps = [(uv_px[:, k, None] + normal[:, k, None] * s).astype(np.float32) for k in (0, 1)]
+    out = []
+    for row in cv2.remap(covered, maps[0], maps[1], cv2.INTER_CUBIC) - 0.5:
+        at = np.flatnonzero(np.sign(row[:-1]) != np.sign(row[1:]))
+        crossing = s[at] + 0.1 * row[at] / (row[at] - row[at + 1])
+        out.append(float(np.abs(crossing).min()) if len(at) else 6.0)
     return np.array(out)
