@@ -127,8 +127,6 @@ def plane(arguments: argparse.Namespace) -> None:
 def _check_options(arguments: argparse.Namespace) -> None:
     """Refuse, before any work, options that don't go together and files that can't be written."""
     infer, config, corners = arguments.infer, arguments.config, arguments.corners
-    outputs = {name: getattr(arguments, name) for name in ("out", "gripper_out", "picture")}
-    given = {f"--{name.replace('_', '-')}": path for name, path in outputs.items() if path is not None}
     known = "has no effect with a gripper that is known; --infer, or leave it out"
     wrong = ""
     if infer and arguments.gripper_out is None:
@@ -143,11 +141,9 @@ def _check_options(arguments: argparse.Namespace) -> None:
         wrong = "the camera isn't given; --camera FILE.yaml (of gripmon calibrate intrinsics), or --config CONFIG"
     elif not corners and config is None:
         wrong = "nothing says where the gripper is in the image; --corners FILE.yaml, or --config CONFIG"
-    elif len({path.resolve() for path in given.values()}) < len(given):
-        wrong = f"{', '.join(given)}: name the same file twice; different files"
     if wrong:
         raise InputError(f"calibrate plane: {wrong}")
-    check_outputs(arguments, *outputs)
+    check_outputs(arguments, "out", "gripper_out", "picture")
 
 
 def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:

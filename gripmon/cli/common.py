@@ -248,11 +248,17 @@ def make_directory(path: Path, option: str = "--out") -> Path:
 
 
 def check_outputs(arguments: argparse.Namespace, *names: str) -> None:
-    """Refuse, before any work, files that can't be written; or are there already, of a command with ``--force``."""
+    """Refuse, before any work, files that can't be written; or are there already, of a command with ``--force``; or
+    are one and the same.
+    """
+    written: dict[Path, str] = {}
     for name in names:
         path, option = getattr(arguments, name), f"--{name.replace('_', '-')}"
         if path is None:
             continue
+        other = written.setdefault(path.resolve(), option)
+        if other != option:
+            raise InputError(f"{other} and {option}: both are {path}; different files")
         make_directory(path.parent, option)
         if path.is_dir():
             raise InputError(f"{option} {path}: is a folder; a file")

@@ -16,7 +16,6 @@ from gripmon.cli.common import (
     write_document,
     write_picture,
 )
-from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.teach.from_images import GripperFromImages
@@ -91,10 +90,6 @@ def from_images(arguments: argparse.Namespace) -> None:
     from gripmon.teach.from_images import gripper_from_images
     from gripmon.teach.hand_eye import gripper_values
 
-    outputs = [arguments.out, arguments.reference_out, arguments.picture]
-    paths = [path.resolve() for path in outputs if path is not None]
-    if len(set(paths)) < len(paths):
-        raise InputError("gripper from-images: --out, --reference-out, --picture name the same file; different files")
     check_outputs(arguments, "out", "reference_out", "picture")
     cv2.setNumThreads(1)
     images = image_paths(arguments.image)

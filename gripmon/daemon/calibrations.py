@@ -108,7 +108,7 @@ def _hand_eye(path: Path) -> Calibrated:
         notes=_origin(found.provenance),
         pose_notes=(
             *_uncertainty(found.covariance),
-            f"rms {1e3 * residuals.rms_m:.4f} mm on the plate; {residuals.corners} corners, {residuals.images} images",
+            f"rms {1e3 * residuals.rms_m:.4f} mm; {residuals.corners} corners, {residuals.images} images",
         ),
     )
 

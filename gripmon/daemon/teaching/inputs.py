@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
-from gripmon.daemon.calibrations import read_given_camera
+from gripmon.daemon.calibrations import read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
 from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
@@ -138,7 +139,7 @@ def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSe
     if camera is not None:
         with contextlib.suppress(ConfigError):  # reading the camera says what is wrong
             target = read_yaml(camera).get("target")
-        lens, _ = _read_lens(camera)
+        lens, _ = read_lens(camera)
         height, width = shown.shape[:2]
         if (width, height) != (lens.width_px, lens.height_px):
             wrong = f"{width} x {height} px; the camera's {lens.width_px} x {lens.height_px} px, as it was calibrated"
@@ -171,7 +172,7 @@ def _calibrations(
     camera_path: Path | None, reference_path: Path | None, gripper: Gripper
 ) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, CameraError | None]:
     """What teaching begins with, from files; a reference's file holds its camera, too."""
-    lens, error = (None, None) if camera_path is None else _read_lens(camera_path)
+    lens, error = (None, None) if camera_path is None else read_lens(camera_path)
     reference = None
     if reference_path is not None:
         values = read_yaml(reference_path)
@@ -191,16 +192,21 @@ def _calibrations(
     return camera, gripper, MonitorSettings(), reference, error
 
 
-def _read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
-    """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
-    values = read_yaml(path)
-    if "model" in values and "schema" not in values:
-        lens: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
-        return lens, None
-    given = read_given_camera(path)
-    if given.covariance is None or not given.parameters:
-        return given.lens, None
-    return given.lens, CameraError(given.parameters, given.covariance)
+def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
+    """The camera of a calibration or configuration, or the section ``camera`` of one by itself; with its error, where
+    the file knows one.  :class:`~gripmon.model.errors.InputError`.
+    """
+    if path.is_file() and path.suffix in (".yaml", ".yml"):
+        values = read_yaml(path)
+        if "model" in values and "schema" not in values:
+            lens: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
+            return lens, None
+    found = read_calibrated(path)
+    if found.lens is None:
+        raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
+    if not found.parameters:
+        return found.lens, None
+    return found.lens, CameraError(found.parameters, np.reshape(found.lens_covariance, (len(found.parameters), -1)))
 
 
 def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:

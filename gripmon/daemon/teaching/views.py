@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 
 from gripmon.daemon.calibrations import read_calibrated
-from gripmon.daemon.config.yaml_file import read_settings, read_yaml
-from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.daemon.teaching.inputs import read_lens
+from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array
@@ -22,7 +22,7 @@ def read_view(
     ``rough``: distance of the TCP (m) in the image's middle and tilt of the optical axis against the gripper's z
     (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
-    lens = None if camera_path is None else _lens(camera_path)
+    lens = None if camera_path is None else read_lens(camera_path)[0]
     cam_T_grip = None
     if reference_path is not None:
         found = read_calibrated(reference_path)
@@ -38,16 +38,3 @@ def read_view(
         middle = 0.5 * (camera.width_px - 1.0), 0.5 * (camera.height_px - 1.0)
         cam_T_grip = Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).cam_T_grip(towards(camera, middle))
     return camera, cam_T_grip
-
-
-def _lens(path: Path) -> LensSettings:
-    """Of a calibration or configuration, or the section ``camera`` of one by itself."""
-    if path.is_file() and path.suffix in (".yaml", ".yml"):
-        values = read_yaml(path)
-        if "model" in values and "schema" not in values:
-            settings: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
-            return settings
-    found = read_calibrated(path)
-    if found.lens is None:
-        raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
-    return found.lens
