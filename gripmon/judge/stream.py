@@ -9,7 +9,6 @@ import bisect
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -87,8 +86,7 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class StreamFault:
+class StreamFault(NamedTuple):
     """What is wrong with the stream now: of each ``kind`` there is one at a time.
 
     A fault of the stamps is told for :data:`CALM_FRAMES` frames more; a ``gap`` is over by then.  Its cause is unknown:
@@ -118,7 +116,7 @@ class StreamWatch:
             self._kind.add(frame.image),
             self._frozen.add(frame, self._rate.usual_ns),
         )
-        return tuple(fault for fault in faults if fault is not None)
+        return tuple(filter(None, faults))
 
     @property
     def pixels(self) -> Image | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from gripmon.judge.causes import CauseJudge
 from gripmon.model.errors import in_short
-from gripmon.model.records import Array, EdgeEvidence, Explanation, Frame
+from gripmon.model.records import Array, Cause, EdgeEvidence, Explanation, Frame
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 
 CALM_FRAMES, LULL_FRAMES = 30, 3
@@ -25,8 +25,8 @@ and after how many more each further one: gathering takes as long as measuring, 
 """
 
 CONFIRMED_AFTER_S = 1.0
-"""From a further conclusion's frame to the one that it counts in.  One is known, so that it isn't urgent; and where
-frames come one right after the other, as in a replay, a second of them takes longer than the 20 to 40 ms of this.
+"""From a further conclusion's frame to the one that it counts in, where a cause is known, so that it isn't urgent; and
+where frames come one right after the other, as in a replay, a second of them takes longer than the 20 to 40 ms of this.
 """
 
 
@@ -83,12 +83,12 @@ class CauseAnalysis:
         ref_cam_T_grip: Array,
         now_s: float,
     ) -> Explanation:
-        """What the frames before have shown; and one more in which something looks ``wrong`` or not.
+        """What the frames before have shown; and one more in which something looks ``wrong`` or not, that of ``now_s``,
+        up to which :meth:`catch_up` has taken over what was due.
 
         ``gather`` its evidence only if it is needed, from an image of its own: the caller may read the next one into
         the same memory.
         """
-        self.catch_up(now_s)
         if not wrong:
             self._calm += 1
         known = self.known
@@ -111,7 +111,8 @@ class CauseAnalysis:
             (judge.add if wrong else judge.well)(gather(kept))
             return judge.explanation(ref_cam_T_grip) if concludes else None
 
-        self._do(work, now_s, CONFIRMED_AFTER_S if confirms else RESULT_AFTER_S)
+        urgent = not confirms or self._explanation.probable.cause is Cause.UNKNOWN
+        self._do(work, now_s, RESULT_AFTER_S if urgent else CONFIRMED_AFTER_S)
         return known
 
     @property

@@ -62,13 +62,14 @@ def corner_records(
 ) -> tuple[CornerRecord, ...]:
     """Each corner, where it was measured, and whether it is among those ``taken`` (c,)."""
     corners = measurement.corners
+    each = zip(names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, taken.tolist(), strict=True)
     return tuple(
-        CornerRecord(name, None, None, False, fault)
-        if fault is not None
-        else CornerRecord(name, (u, v), sigma, used, None if used else CornerFault.LEFT_OUT)
-        for name, (u, v), sigma, fault, used in zip(
-            names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, taken.tolist(), strict=True
-        )
+        [
+            CornerRecord(name, None, None, False, fault)
+            if fault is not None
+            else CornerRecord(name, (u, v), sigma, used, None if used else CornerFault.LEFT_OUT)
+            for name, (u, v), sigma, fault, used in each
+        ]
     )
 
 
@@ -79,25 +80,29 @@ def measured_record(
     standing: Standing,
     gripper: Gripper,
     taken: NDArray[np.bool_],
+    origin: Origin,
+    smoothed: Smoothed | None,
+    drift: Drift,
+    alerts: tuple[Alert, ...],
 ) -> FrameRecord:
-    """The record of a frame whose pose stands, without what rests on other frames; ``taken`` (c,): corners used."""
+    """The record of a frame whose pose stands; ``taken`` (c,): corners used."""
     measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
     return FrameRecord(
         seq=frame.seq,
         stamp_ns=frame.stamp_ns,
         verdict=judgement.verdict,
         state=judgement.state,
-        source=Origin.UPDATE,
+        source=origin,
         cam_T_grip=to_record(cam_T_grip),
         covariance=flat(standing.covariance),
-        smoothed=None,
-        drift=None,
+        smoothed=smoothed,
+        drift=drift,
         reference_id=reference.reference_id,
         revision=reference.revision,
         rms_px=measurement.corner_rms_px(cam_T_grip),
         jaw_opening_m=measurement.jaw_opening_m if gripper.has_jaw else None,
         corners=corner_records(measurement, gripper.corner_ids, taken),
-        alerts=(),
+        alerts=alerts,
         reason=judgement.reason,
         name=frame.name,
         protection=standing.protection,
@@ -122,7 +127,10 @@ def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float
 
 def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
     """An image that repeats an earlier one shows what was, not what is."""
-    return next(((Refusal.FROZEN, fault.text) for fault in faults if fault.kind == "frozen"), None)
+    for fault in faults:
+        if fault.kind == "frozen":
+            return Refusal.FROZEN, fault.text
+    return None
 
 
 def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:

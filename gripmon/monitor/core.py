@@ -13,7 +13,7 @@ import numpy as np
 from gripmon.judge.causes import CauseJudge, Watches
 from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.judge.inspection import inspect
-from gripmon.judge.policy import Evidence, Judgement, Policy
+from gripmon.judge.policy import Evidence, Policy
 from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.recalibrate import Refusal as Refused
 from gripmon.judge.references import CommandRefused, Keep
@@ -202,7 +202,8 @@ class Monitor:
         measurement = self._newest = standing.measurement
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
-        evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
+        drift = self._drift()
+        evidence = self._evidence(frame, measurement, before_T, drift, doubtful=bool(faults))
         self._jumped = self._jumped or evidence.jumped
         if standing.believed:
             self._follow(measurement, evidence.motion)
@@ -214,10 +215,17 @@ class Monitor:
             else:
                 self._restarted = False
                 alerts = (after_restart(self.reference, evidence, self._settings.policy.warn_m), *alerts)
-        before = self.reference
-        alerts += self._renew(frame, standing, evidence, judgement)
-        origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
-        return self._record(frame, judgement, origin, alerts, standing)
+        origin = Origin.UPDATE
+        if self._renewal.collect(frame, standing, judgement):
+            before = self.reference
+            alerts += self._renew(drift, evidence.explanation, frame.stamp_ns)
+            if self.reference is not before:
+                drift, origin = self._drift(), Origin.RECALIBRATION
+        taken = self._tracker.taken(standing.measurement, self._settings.update_corners)
+        smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._noted(), *alerts)
+        return measured_record(
+            frame, self.reference, judgement, standing, self._gripper, taken, origin, smoothed, drift, alerts
+        )
 
     def _follow(self, measurement: Measurement, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
@@ -231,14 +239,10 @@ class Monitor:
         if motion.stepped and not jumped:
             self._average.step(motion.step_frames)
 
-    def _renew(self, frame: Frame, standing: Standing, evidence: Evidence, judgement: Judgement) -> tuple[Alert, ...]:
-        """Past the limit, or when an operator wants it: still frames are collected, and become a new reference."""
+    def _renew(self, drift: Drift, explanation: Explanation, stamp_ns: int) -> tuple[Alert, ...]:
+        """Past the limit, or when an operator wants it: the still frames become a new reference."""
         before = self.reference
-        if not self._renewal.collect(frame, standing, judgement):
-            return ()
-        alerts = self._renewal.recalibrate(
-            self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns
-        )
+        alerts = self._renewal.recalibrate(drift, self._cam_T_grip, explanation, self._now_s, stamp_ns)
         if self.reference is not before:
             self._begin()
         return alerts
@@ -284,17 +288,19 @@ class Monitor:
     def _look_at_stream(self, frame: Frame) -> tuple[StreamFault, ...]:
         """What is wrong with the stream, told of in the next record; its rate, for the drift test."""
         faults = self._stream.add(frame)
-        if any(fault.kind == "gap" for fault in faults):
-            self._analysis.interrupted()
-        told = tuple((fault.kind, fault.cause, fault.text) for fault in faults)
-        self._due += self._policy.stream(told, self._now_s, frame.stamp_ns)
-        if self._stream.frames_per_s is not None:
-            self._watch.set_frames_per_s(self._stream.frames_per_s)
+        for fault in faults:
+            if fault.kind == "gap":
+                self._analysis.interrupted()
+        self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)
+        frames_per_s = self._stream.frames_per_s
+        if frames_per_s is not None:
+            self._watch.set_frames_per_s(frames_per_s)
         return faults
 
-    def _evidence(self, frame: Frame, measurement: Measurement, before_T: Array, doubtful: bool) -> Evidence:
+    def _evidence(
+        self, frame: Frame, measurement: Measurement, before_T: Array, drift: Drift, doubtful: bool
+    ) -> Evidence:
         assert self._covariance is not None and self._standing is not None
-        drift = self._drift()
         # Motion that the profiles can follow from frame to frame is no jump.
         looked_far = measurement.effort is not Effort.NARROW
         reach_px = self._settings.corners.sampling.reach_px
@@ -312,15 +318,14 @@ class Monitor:
         if motion.stepped:
             self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
-        blur_px, residual_px = self._tracker.blur_px(measurement), self._tracker.edge_residuals_px(measurement)
-        odd = self._watches.add(blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
+        residual_px = self._tracker.edge_residuals_px(measurement)
+        odd = self._watches.add(measurement.blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
-        d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(
             shift,
             sigma,
-            d_m,
-            delta_rad,
+            drift.translation_m,
+            drift.rotation_rad,
             motion,
             jumped,
             explanation,
@@ -422,18 +427,6 @@ class Monitor:
             smoothed=smoothed_record(self._average, self._tracker.floor + growth),
             drift=self._drift(),
             protection=None if standing is None else self._trust.held(standing, growth, unseen_s, hidden),
-        )
-
-    def _record(
-        self, frame: Frame, judgement: Judgement, origin: Origin, alerts: tuple[Alert, ...], standing: Standing
-    ) -> FrameRecord:
-        taken = self._tracker.taken(standing.measurement, self._settings.update_corners)
-        return msgspec.structs.replace(
-            measured_record(frame, self.reference, judgement, standing, self._gripper, taken),
-            source=origin,
-            smoothed=smoothed_record(self._average, self._tracker.floor),
-            drift=self._drift(),
-            alerts=(*self._noted(), *alerts),
         )
 
     def _noted(self) -> list[Alert]:

@@ -81,11 +81,13 @@ class Renewal:
         """Past the limit, or when an operator wants it, collect a frame whose pose is believed: whether there are
         enough to measure the reference anew.
         """
-        still_frames = self._policy.still_frames
-        collects = judgement.state is State.RECALIBRATING or self.wanted
-        if not collects or still_frames <= 1:
+        if judgement.state is not State.RECALIBRATING and not self.wanted:
             self.moved()
-        if not collects or not standing.believed:
+            return False
+        still_frames = self._policy.still_frames
+        if still_frames <= 1:
+            self.moved()
+        if not standing.believed:
             return False
         self.still(frame, standing.measurement, standing.cam_T_grip, standing.covariance)
         return judgement.recalibrate or (self.wanted and still_frames >= self._settle_frames)

@@ -130,8 +130,10 @@ class Tracker:
         (17).
         """
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
+        if self._settings.measurement == "edges":
+            return cam_T_grip, covariance + self._floor
         taken = self.taken(measurement, self._settings.update_corners)
-        if self._settings.measurement == "corners" and np.count_nonzero(taken) >= 3:
+        if np.count_nonzero(taken) >= 3:
             covariance_xy = measurement.corners.joint_covariance_xy(taken)
             try:
                 update = self._corner_update(measurement, taken, covariance_xy, measurement.jaw_opening_m)
@@ -166,10 +168,6 @@ class Tracker:
     def moved_px(self, measurement: Measurement, before_T: Array) -> float:
         """How far the measured edges are from where ``before_T`` (4, 4) would have them."""
         return self._meter.moved_px(measurement, before_T)
-
-    def blur_px(self, measurement: Measurement) -> float | None:
-        """How blurred the edges are, px; None where too few are seen."""
-        return self._meter.blur_px(measurement)
 
     def edge_residuals_px(self, measurement: Measurement) -> Array:
         """(e,) mean residual of each edge, px; NaN where it isn't seen."""

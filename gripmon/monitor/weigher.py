@@ -147,7 +147,7 @@ class Weigher:
         if not len(edges):
             return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen"), False)
         wander = self._wander(now_s)
-        fits, anchored = self._refitted(measurement, now_s)
+        fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses = fits.hypotheses
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
@@ -255,15 +255,15 @@ class Weigher:
             return self.swing
         return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
 
-    def _refitted(self, measurement: Measurement, now_s: float) -> tuple[Refits, Anchored]:
-        """The fits of a measurement, alone and with the anchor.  A frame is weighed anew when its ends were looked at,
-        and for another pose that it allows.
+    def _refitted(self, measurement: Measurement, now_s: float, wander: Array) -> tuple[Refits, Anchored]:
+        """The fits of a measurement, alone and with the anchor after a way with the variances ``wander`` (6,).  A frame
+        is weighed anew when its ends were looked at, and for another pose that it allows.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
             of_model = NOT_OFF if self.anchor is None else self.anchor.of_model
             covariance = covariance.copy()
-            covariance.flat[::7] += self._wander(now_s)
+            covariance.flat[::7] += wander
             known = Known(expected_T, covariance, of_model)
             fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model, known)
             self._newest = measurement, now_s, fits

@@ -128,20 +128,20 @@ class Policy:
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
         past_limit = past_limit and evidence.believed
         unreliable = probable.cause in NO_REFERENCE
-        recalibrate = False
+        recalibrate, moved = False, evidence.moved
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
             state: State = State.ACQUIRING if self.state is State.LOST else self.state
         elif past_limit and self._may_recalibrate and not unreliable:
             state = State.RECALIBRATING
             recalibrate = self._still >= settings.settle_frames
-        elif evidence.moved:
+        elif moved:
             state = State.DRIFTING
         else:
             state = State.TRACKING
         self.state = state
         reason = self._doubt(evidence, confirmed)
         verdict = Verdict.VALID if reason is None else Verdict.SUSPECT
-        return Judgement(state, verdict, self._alerts_of(evidence, now_s, stamp_ns), recalibrate, reason)
+        return Judgement(state, verdict, self._alerts_of(evidence, moved, now_s, stamp_ns), recalibrate, reason)
 
     def _doubt(self, evidence: Evidence, confirmed: bool) -> str | None:
         """Why a measured transform isn't valid; None where it is."""
@@ -281,19 +281,19 @@ class Policy:
         """Frames since the transform last left the place where it came to rest: by half of what is worth a warning, and
         beyond its noise.
         """
-        leeway = np.maximum(0.5 * self.worth_a_warning, 5.0 * evidence.sigma)
+        leeway = np.maximum(0.5 * self._worth_a_warning, 5.0 * evidence.sigma)
         if evidence.jumped or self._still == 0 or (np.abs(evidence.shift - self._still_shift) > leeway).any():
             self._still, self._still_shift = 1, evidence.shift
         else:
             self._still += 1
 
-    def _alerts_of(self, evidence: Evidence, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
+    def _alerts_of(self, evidence: Evidence, moved: bool, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
         book, motion, probable = self.alerts, evidence.motion, evidence.explanation.probable
         not_the_camera = probable.cause in NOT_THE_CAMERA
         alerts = book.absent(VIEW, "the gripper is measured again", now_s)
         alerts += book.absent(IMAGE, "images are good again", now_s)
         # What lies in the gripper or the lens is told once, as that.
-        if evidence.moved and (not not_the_camera or book.about(MOTION) is not None):
+        if moved and (not not_the_camera or book.about(MOTION) is not None):
             alerts += book.present(MOTION, self._motion_alert(evidence), now_s, stamp_ns)
         else:
             alerts += book.absent(MOTION, "the camera is where the reference has it", now_s)

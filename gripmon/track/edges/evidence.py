@@ -104,10 +104,6 @@ class FingerMeter(Settler):
             reach_px=zoom * self._settings.sampling.reach_px,
         )
 
-    def blur_px(self, measurement: Measurement) -> float | None:
-        """How blurred the edges of a measured frame are: standard deviation across them, px; None with few of them."""
-        return measurement.blur_px
-
     def edge_residuals_px(self, measurement: Measurement) -> Array:
         """(e,) weighted mean of each edge's residuals in the joint fit, px; NaN for edges that none of them shows."""
         consensus, edge = measurement.consensus, measurement.prediction.layout.edge

@@ -199,7 +199,7 @@ def intersect_edges(
         math.sin(settings.smallest_angle_rad),
         settings.largest_sigma_px,
     )
-    faults = tuple(_FAULTS[k] for k in fault.tolist())
+    faults = tuple(map(_FAULTS.__getitem__, fault.tolist()))
     return Corners(xy, covariance_xy, uv_px, sigma_px, faults, fault == 0, lines, rests, geometry)
 
 

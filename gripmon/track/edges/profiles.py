@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import numpy as np
@@ -142,7 +142,12 @@ def _pixels(image: Image) -> Image:
 
 def full_scale(image: Image) -> float:
     """Largest grey level of an image's type; 1 for float images."""
-    return 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype.str).max)
+    return _largest(image.dtype)
+
+
+@cache
+def _largest(dtype: np.dtype[Any]) -> float:
+    return 1.0 if dtype.kind == "f" else float(np.iinfo(dtype.str).max)
 
 
 def quantum(image: Image) -> float:

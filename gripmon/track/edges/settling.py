@@ -342,8 +342,10 @@ class Settler:
 
     def _from_prediction(self, prediction: Prediction, expected: Expected) -> Array:
         """(m,) from the prediction's pose and opening to the expected ones."""
-        xi = perturbation_between(prediction.cam_T_grip, expected.cam_T_grip)
-        return np.append(xi, expected.jaw_opening_m - prediction.jaw_opening_m) if len(self._prior) == 7 else xi
+        xi = np.empty(len(self._prior))
+        xi[:6] = perturbation_between(prediction.cam_T_grip, expected.cam_T_grip)
+        xi[6:] = expected.jaw_opening_m - prediction.jaw_opening_m
+        return xi
 
     def moved_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
         """How far the measured gripper shows from where ``cam_T_grip`` had put it, px."""
@@ -362,4 +364,5 @@ class Settler:
         gripper = self._gripper
         jaw_opening_m = prediction.jaw_opening_m + (float(xi[6]) if len(xi) == 7 else 0.0)
         jaw_opening_m = min(max(jaw_opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
-        return replace(expected, cam_T_grip=perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m=jaw_opening_m)
+        cam_T_grip = perturb(prediction.cam_T_grip, xi[:6])
+        return Expected(cam_T_grip, jaw_opening_m, expected.jaw_reported_m, expected.held_T, expected.held_sigma)

@@ -69,7 +69,7 @@ class Sums(NamedTuple):
         ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
         """
         add_up = kernel.add_up if COMPILES else plain.add_up
-        pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
+        pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
         return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
 
     def fits(self, unknowns: int = 6) -> Separation:
@@ -94,7 +94,7 @@ def with_and_without(
     but for a ``covariance`` (6, 6), and off by ``of_model`` (f, 6), or (1, 6) of zeros.  And the normalised squares
     (h,) of the former's distances from there, by ``times`` their own covariances and that one.
     """
-    pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
+    pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
     of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
     alone, together, squares = _first_that_can(kernel.with_and_without, plain.with_and_without, *of)
     return Separation(*alone), Separation(*together), squares
