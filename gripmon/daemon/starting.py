@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import logging
 import threading
 import time
@@ -119,6 +120,8 @@ def run_monitor(
         opened.callback(network.publisher.close)
         on_network()
         compiled = warm_up()  # before frames come
+        gc.collect()  # in 0.1 s; of what is kept out of sight here the loop's own start needn't look through anything
+        gc.freeze()
         source = open_configured(config, network.link)
         opened.callback(source.close)
         if compiled:
