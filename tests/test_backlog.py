@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import FPS, frames_of, new_monitor, rendered, replaced
 
 from gripmon.model.camera import make_camera
-from gripmon.model.records import Origin, to_json
+from gripmon.model.records import Cause, CauseWeight, Explanation, Frame, Origin, to_json
 from gripmon.monitor import Tracker
+from gripmon.monitor.analysis import CONFIRMED_AFTER_S, EVERY, CauseAnalysis
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario
@@ -84,6 +86,28 @@ def test_who_waits_for_a_result_does_not_do_what_comes_after_it():
     assert after == [] and backlog.undone and len(backlog) == 1
     backlog.run()
     assert not backlog.undone and len(backlog) == 1, "done, and still to be taken"
+
+
+def test_a_further_conclusion_is_urgent_only_while_no_cause_is_known():
+    """The first cause counts after the usual time, also where it is found late; then a second is soon enough."""
+    named = CauseWeight(Cause.CAMERA_MOUNT, 1.0)
+    told: list[Explanation] = []
+
+    def explanation(_: np.ndarray) -> Explanation:
+        told.append(Explanation((named,), named, f"{len(told) + 1}") if len(told) >= 3 else Explanation())
+        return told[-1]
+
+    judge = SimpleNamespace(wants_baseline=False, add=lambda _: None, reset=lambda: None, explanation=explanation)
+    analysis = CauseAnalysis(judge)
+    texts = []
+    for number in range(3 * EVERY + 1):
+        now_s = number / 60.0
+        analysis.catch_up(now_s)
+        frame = Frame(number, number, np.zeros((2, 2), np.uint8), None)
+        texts.append(analysis.ask(True, frame, lambda kept: None, np.eye(4), now_s).text)
+    known = [next(n for n, text in enumerate(texts) if text == each) for each in ("4", "5")]
+    asked = np.array([1, 2]) * EVERY - 1  # of these frames the first conclusion that names a cause, and one more
+    assert (known - asked).tolist() == [round(60.0 * RESULT_AFTER_S), round(60.0 * CONFIRMED_AFTER_S)]
 
 
 @pytest.mark.parametrize("scene", ["bump", "bent_finger"])

@@ -20,8 +20,8 @@ again, at 60 frames/s. "daemon" is a live camera in a process of its own, with r
 is its own processor time. "start" is `gripmon run` with a camera on the network, from the start of the process until a
 subscriber has the first measured transform; "replay" is `gripmon replay`, less the time for reading and decoding files.
 
-The 99 % of "frame" are taken to be frames that wait for the analysis of causes: back to back, 0.1 s of the stream pass
-in some milliseconds, and what was begun in one frame is due in the third after it.
+The 99 % of "frame" are taken to be frames that share their core with the analysis of causes, which a drift that goes on
+asks for in one of 60: no frame waits for it, but back to back it takes its part of the time.
 
 What the way to other processes takes is in [The network, measured](network.md), what recording costs in
 [Recording, measured](recording.md)."""
