@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from support.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 import gripmon
@@ -17,6 +16,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.teach.cad import gripper_from_cad
+from tools.benchmarks.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
 
 MICROMETRE = 1e-6
 CUBE = Path(__file__).resolve().parents[2] / "shared" / "data" / "visp_cube" / "cube.cao"
