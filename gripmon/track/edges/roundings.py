@@ -77,10 +77,14 @@ class Roundings:
         """
         self._gripper, self._reach_px, self._cosine = gripper, reach_px, cosine
         outline = ~gripper.edge_crease
-        corners = set(gripper.corner_points.tolist())
+        # Points at the same place are one: of these one may wander over what is round, and another stay.
+        _, same = np.unique(gripper.points_grip_m(), axis=0, return_inverse=True)
+        _, first = np.unique(same, return_index=True)
+        one = first[same.ravel()]
+        self._ends, corners = one[gripper.edge_points], set(one[gripper.corner_points].tolist())
         self._meeting: dict[int, tuple[int, int]] = {}
-        for point in sorted(set(gripper.edge_points[outline].ravel().tolist()) - corners):
-            edges = np.flatnonzero(outline & (gripper.edge_points == point).any(axis=1)).tolist()
+        for point in sorted(set(self._ends[outline].ravel().tolist()) - corners):
+            edges = np.flatnonzero(outline & (self._ends == point).any(axis=1)).tolist()
             if len(edges) == 2:
                 self._meeting[point] = edges[0], edges[1]
         self.point = np.array([p for p, pair in self._meeting.items() if not along[list(pair)].all()], dtype=np.intp)
@@ -127,7 +131,7 @@ class Roundings:
         """The first edge that is looked at on the way from a point along an edge, its profiles from there on, and
         whether others that are too short lie between.
         """
-        layout, ends = prediction.layout, self._gripper.edge_points
+        layout, ends = prediction.layout, self._ends
         for passed in range(len(ends)):
             at_start = bool(ends[edge, 0] == point)
             if prediction.profiles[edge] >= FEWEST_SAMPLES:
