@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,24 @@ def test_fingers_end_where_their_sides_turn_into_curves():
     assert finger_of_ends(model)[:4].tolist() == [0, 0, 1, 1]
     ends = FingerEnds(model, EdgeSettings())
     assert [model.edge_ids[e] for e in np.flatnonzero(~ends.along)] == ["left_tip", "right_tip"]
+
+
+def test_a_side_of_which_nothing_is_seen_is_not_seen_to_turn():
+    """However well the curve is seen: half as much as on the rest of the side would be none, too."""
+    model, solids = rounded(0.004)
+    image = Simulator(make_camera(PAPER_LENS), solids, nominal_cam_T_grip(), plain_scenario(), 1).render(0)
+    found = measure(image, using=meter(model), jaw_opening_m=model.jaw_nominal_m)
+    ends = FingerEnds(model, EdgeSettings())
+    assert ends.seen(image, found).seen.tolist() == [2, 2]
+    side, consensus = model.edge_ids.index("left_side_a"), found.consensus
+    hidden = np.arange(len(model.edge_ids)) == side
+    consensus = replace(
+        consensus,
+        supported=consensus.supported & (found.prediction.layout.edge != side),
+        edge_share=np.where(hidden, 0.0, consensus.edge_share),
+        edge_seen=consensus.edge_seen & ~hidden,
+    )
+    assert ends.seen(image, replace(found, consensus=consensus)).seen.tolist() == [1, 2]
 
 
 # --- a monitor ---
