@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from support.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 import gripmon
@@ -17,6 +16,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.teach.cad import gripper_from_cad
+from tools.benchmarks.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
 
 MICROMETRE = 1e-6
 CUBE = Path(__file__).resolve().parents[2] / "shared" / "data" / "visp_cube" / "cube.cao"
@@ -143,6 +143,31 @@ def test_a_rounded_tip_shows_the_line_that_sight_touches_and_it_wanders(tmp_path
             (line,) = ends[across & (np.abs(ends[:, :, 1].mean(axis=1) - y) < 0.002)]
             # Mesh and view both are exact to some micrometres; a line that stood would be off by up to 0.3 mm.
             np.testing.assert_allclose(line[:, 1:], [[y, z], [y, z]], atol=25 * MICROMETRE)
+
+
+@pytest.mark.parametrize("radius_m", [0.004, 0.008])
+def test_the_rim_of_a_rounded_tip_stays_where_the_outline_wanders(tmp_path: Path, radius_m: float):
+    """Its curves lie on the profile that the fingers were drawn with, also from 10 degrees aside."""
+    gripper = gripper_from_cad(write_meshes(rounded_fingers(radius_m), tmp_path), unit="mm", **seen()).gripper
+    curved = np.flatnonzero(gripper.edge_curved & ~gripper.edge_crease)
+    assert len(curved)
+    for tcp_m in ((0.0004, 0.0013, 0.115), (0.0004, 0.02, 0.1)):
+        points = gripper.points_grip_m(None, invert(nominal_cam_T_grip(tcp_m=tcp_m))[:3, 3])
+        on_rim = gripper.outlines_m(points, curved, 101).reshape(-1, 3)
+        y, z = np.abs(on_rim[:, 1]), on_rim[:, 2]
+        beside, above = np.maximum(y - (0.008 - radius_m), 0.0), np.maximum(z + radius_m, 0.0)
+        np.testing.assert_allclose(np.hypot(beside, above), radius_m, atol=10 * MICROMETRE)
+
+
+def test_what_is_too_short_to_be_measured_joins_the_edges_beside_it(tmp_path: Path):
+    """Round a finger's outline each edge goes on in the next one, from side to side."""
+    for radius_m in (0.002, 0.004, 0.008):
+        gripper = gripper_from_cad(write_meshes(rounded_fingers(radius_m), tmp_path), unit="mm", **seen()).gripper
+        places, same = np.unique(gripper.points_grip_m(), axis=0, return_inverse=True)
+        ends = same.ravel()[gripper.edge_points[~gripper.edge_crease]]
+        meeting = np.bincount(ends.ravel(), minlength=len(places))
+        assert np.count_nonzero(meeting == 1) == 4, "the rear ends of two sides of each finger"
+        assert meeting.max() == 2
 
 
 def test_a_curved_finger_shows_its_sharp_edges_and_hides_what_is_behind(tmp_path: Path):

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from support.meshes import MeshCamera, curved_fingers, finger_mesh, rounded_fingers, wandering, write_meshes
 from support.meters import difference, measure, meter
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import pose_of, reference_of
@@ -17,18 +15,14 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.teach.cad import gripper_from_cad
+from tools.benchmarks.meshes import MeshCamera, box_fingers, curved_fingers, rounded_fingers, wandering, write_meshes
 
 FRAMES = 45
 ROUNDED_M = (0.002, 0.004, 0.008)
 
 
-def sharp_boxes() -> list[trimesh.Trimesh]:
-    profile = np.array([[0.008, -0.04], [0.008, 0.0], [-0.008, 0.0], [-0.008, -0.04]])
-    return [finger_mesh(profile, x) for x in ((-0.027, -0.017), (0.017, 0.027))]
-
-
 SHAPES = {
-    "box": (sharp_boxes, (15e-6, 60e-6)),
+    "box": (box_fingers, (15e-6, 60e-6)),
     "2 mm": (lambda: rounded_fingers(0.002), (45e-6, 120e-6)),
     "4 mm": (lambda: rounded_fingers(0.004), (45e-6, 120e-6)),
     "8 mm": (lambda: rounded_fingers(0.008), (45e-6, 120e-6)),

@@ -20,6 +20,7 @@ from benchmarks import (
     record,
     recovery,
     series,
+    shapes,
     smoothing,
     wire,
 )
@@ -38,6 +39,7 @@ _BENCHMARKS = (
     record,
     recovery,
     series,
+    shapes,
     smoothing,
     wire,
 )

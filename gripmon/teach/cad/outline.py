@@ -225,6 +225,8 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
             way *= np.where(way @ way[0] < 0.0, -1.0, 1.0)[:, None]
             axis = way.sum(axis=0) / np.linalg.norm(way.sum(axis=0))
             rounds[k] = (centres[wanders].mean(axis=0), axis)
+    curved_on = [k for k in np.flatnonzero(~straight & sharp).tolist() if int(label[k]) in rounds]
+    points, label = _left_in_place(points, label, curved_on)
     found = [(int(label[2 * n]), int(label[2 * n + 1])) for n in range(len(edges))]
     once: dict[tuple[int, int], int] = {}
     for n, (a, b) in enumerate(found):
@@ -237,6 +239,17 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
     straight_ones = [n for n in kept if not edges[n].bridge and not len(edges[n].via_m)]
     shape.corners = _corners(shape, straight_ones, label, px)
     return shape
+
+
+def _left_in_place(points: Array, label: NDArray[np.intp], ends: list[int]) -> tuple[Array, NDArray[np.intp]]:
+    """A point of their own, at the same place, for ``ends`` of curves on the body: what is round ends there in such a
+    curve, and wanders along it, but the curve stays.
+    """
+    label = label.copy()
+    for k in sorted({int(label[end]) for end in ends}):
+        label[[end for end in ends if label[end] == k]] = len(points)
+        points = np.vstack([points, points[k]])
+    return points, label
 
 
 def _bridged(kept: list[int], edges: list[_Edge], found: list[tuple[int, int]]) -> list[int]:

@@ -17,7 +17,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Image
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
-from gripmon.track.edges.roundings import Roundings
+from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settling import Measurement
 
 ALONG_COSINE = 0.87
@@ -190,7 +190,7 @@ class FingerEnds:
         """(s,) the places that might be seen as ends in this view."""
         places, profiles = self._places, prediction.profiles
         curved = (profiles[places.side] > 0) & (profiles[places.curve] > 0) & (places.rounding < 0)
-        curved[np.isin(places.rounding, list(self._roundings.seen_in(prediction)))] = True
+        curved[np.isin(places.rounding, list(self._rounded(prediction)))] = True
         return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
     def at_places(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
@@ -219,12 +219,14 @@ class FingerEnds:
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
         prediction, candidates = measurement.prediction, measurement.candidates
-        profiles = read_profiles(image, probes.map_x, probes.map_y)
+        # Where the measurement has them: the edge filter sees less far than the profiles reach.
+        offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
+        shift_px = np.repeat(offset_px[:, None] * prediction.normal[probes.sample], PROBES, axis=0).astype(np.float32)
+        profiles = read_profiles(image, probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:])
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
         step = _own_step(measurement)[prediction.layout.edge[probes.sample]]
-        offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
         of = found.sample // PROBES
-        near = np.abs(found.offset_px - offset_px[of]) < NEAR_PX
+        near = np.abs(found.offset_px) < NEAR_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
         strong = near & (np.abs(found.step) > AS_STRONG * np.abs(step[of]))
         shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
@@ -237,6 +239,7 @@ class FingerEnds:
         places, points = self._places, self._gripper.edge_points
         place, sample, at, across = [], [], [], []
         turns: dict[int, tuple[NDArray[np.intp], ...]] = {}
+        further: list[tuple[int, GoesOn]] = []
         for slot, edge in enumerate(prediction.layout.edges.tolist()):
             for number in np.flatnonzero(places.at_end & np.isin(places.point, points[edge])).tolist():
                 if places.rounding[number] >= 0 or (places.corner[number] < 0 and places.side[number] != edge):
@@ -247,18 +250,21 @@ class FingerEnds:
                 here, from_uv_px, way = beyond
                 if places.corner[number] < 0:
                     turns[number] = self._turn(prediction, number, here, from_uv_px)
+                    back = crossing(prediction, turns[number][2], from_uv_px, way, ALONG_COSINE)
+                    further += [] if back is None else [(number, back)]
                 place.append(number)
                 sample.append(here)
                 at.append(from_uv_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
                 across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
-        for of_it, rounding in self._roundings.seen_in(prediction).items():
-            number = int(np.flatnonzero(places.rounding == of_it)[0])
-            turns[number] = rounding.beside
-            for here, way in zip(rounding.ends, rounding.ways, strict=True):
-                place.append(number)
-                sample.append(here)
-                at.append(rounding.meet_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
-                across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
+        for number, rounding in self._rounded(prediction).items():
+            here = int(np.flatnonzero(places.rounding == number)[0])
+            turns[here] = rounding.beside
+            further += [(here, goes_on) for goes_on in rounding.go_on]
+        for number, goes_on in further:
+            place.append(number)
+            sample.append(goes_on.profile)
+            at.append(goes_on.from_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * goes_on.way)
+            across.append(np.broadcast_to(prediction.normal[goes_on.profile], (PROBES, 2)))
         if not place:
             nowhere = np.zeros((0, 3), dtype=np.float32)
             none = np.zeros(0, dtype=np.intp)
@@ -276,6 +282,13 @@ class FingerEnds:
             inside,
             turns,
         )
+
+    def _rounded(self, prediction: Prediction) -> dict[int, Rounding]:
+        """The roundings that this view has, where it isn't seen how a side turns into a curve."""
+        places, profiles = self._places, prediction.profiles
+        turning = (places.side >= 0) & (profiles[places.side] > 0) & (profiles[places.curve] > 0)
+        pairs = np.column_stack([places.side, places.curve])[turning].tolist()
+        return self._roundings.seen_in(prediction, {frozenset(pair) for pair in pairs})
 
     def _turn(
         self, prediction: Prediction, number: int, here: int, clear_px: Array

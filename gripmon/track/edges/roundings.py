@@ -7,6 +7,7 @@ a few pixels show.  Nothing is intersected there for a pose: what counts is that
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,53 @@ from gripmon.model.records import Array
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 
 
+class GoesOn(NamedTuple):
+    """A tangent to the edge of a ``profile`` where it is beyond another edge: place (2,), px, and unit way (2,)."""
+
+    profile: int
+    from_px: Array
+    way: Array
+
+
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """One in a prediction: where its two edges' tangents meet, ``meet_px`` (2,); of each edge its last profile before
-    the rounding (``ends``), the way (2, 2) in which it would go on, and its profiles beside the rounding (``beside``).
+    """One in a prediction: its two ``edges``, of each the profiles beside it, outwards from it, and how they ``go_on``
+    beyond it.
     """
 
     edges: frozenset[int]
-    meet_px: Array
-    ends: tuple[int, int]
-    ways: Array
     beside: tuple[NDArray[np.intp], NDArray[np.intp]]
+    go_on: tuple[GoesOn, ...]
+
+
+def crossing(
+    prediction: Prediction, profiles: NDArray[np.intp], at_px: Array, way: Array, cosine: float
+) -> GoesOn | None:
+    """How an edge's ``profiles``, outwards from a line through ``at_px`` (2,) along the unit ``way`` (2,), go on across
+    it, by the tangent of the last one: what straight thing the edge may be.  None where they don't, or where the two
+    are nearly parallel, ``cosine`` that of the smallest angle.
+    """
+    last = int(profiles[-1])
+    tangent = _tangent(prediction, last, prediction.uv_px[profiles[0]])
+    ahead_px = _ahead_px(prediction.uv_px[last], tangent, at_px, way)
+    if abs(float(tangent @ way)) > cosine or not ahead_px[0] > 0.0:
+        return None
+    return GoesOn(last, prediction.uv_px[last] + ahead_px[0] * tangent, tangent)
+
+
+def _tangent(prediction: Prediction, profile: int, towards_px: Array) -> Array:
+    """(2,) the way of the edge at a profile, of the two the one towards a place (2,)."""
+    normal = prediction.normal[profile]
+    way = np.array([-normal[1], normal[0]])
+    return way if way @ (towards_px - prediction.uv_px[profile]) > 0.0 else -way
+
+
+def _ahead_px(one_px: Array, one: Array, other_px: Array, other: Array) -> Array:
+    """(2,) how far two places (2,) have to go along their unit ways (2,) to meet; infinite if these are parallel."""
+    gap, sine = other_px - one_px, float(one[0] * other[1] - one[1] * other[0])
+    if sine == 0.0:
+        return np.full(2, np.inf)
+    return np.array([gap[0] * other[1] - gap[1] * other[0], gap[0] * one[1] - gap[1] * one[0]]) / sine
 
 
 class Roundings:
@@ -40,18 +77,22 @@ class Roundings:
         """
         self._gripper, self._reach_px, self._cosine = gripper, reach_px, cosine
         outline = ~gripper.edge_crease
-        corners = set(gripper.corner_points.tolist())
+        # Points at the same place are one: of these one may wander over what is round, and another stay.
+        _, same = np.unique(gripper.points_grip_m(), axis=0, return_inverse=True)
+        _, first = np.unique(same, return_index=True)
+        one = first[same.ravel()]
+        self._ends, corners = one[gripper.edge_points], set(one[gripper.corner_points].tolist())
         self._meeting: dict[int, tuple[int, int]] = {}
-        for point in sorted(set(gripper.edge_points[outline].ravel().tolist()) - corners):
-            edges = np.flatnonzero(outline & (gripper.edge_points == point).any(axis=1)).tolist()
+        for point in sorted(set(self._ends[outline].ravel().tolist()) - corners):
+            edges = np.flatnonzero(outline & (self._ends == point).any(axis=1)).tolist()
             if len(edges) == 2:
                 self._meeting[point] = edges[0], edges[1]
         self.point = np.array([p for p, pair in self._meeting.items() if not along[list(pair)].all()], dtype=np.intp)
 
-    def seen_in(self, prediction: Prediction) -> dict[int, Rounding]:
-        """Those that this view has, by number (0 to r - 1), each pair of edges once."""
+    def seen_in(self, prediction: Prediction, known: set[frozenset[int]]) -> dict[int, Rounding]:
+        """Those that this view has, by number (0 to r - 1), each pair of edges once and none that is ``known``."""
         out: dict[int, Rounding] = {}
-        known: set[frozenset[int]] = set()
+        known = set(known)
         for number, point in enumerate(self.point.tolist()):
             rounding = self._at(prediction, point)
             if rounding is not None and rounding.edges not in known:
@@ -70,25 +111,27 @@ class Roundings:
         if not (passed or also or self._gripper.edge_curved[[one, other]].any()):
             return None  # two edges that end in a point which the file doesn't take for a corner
         uv_px = prediction.uv_px
-        ways = np.stack([self._way(prediction, profiles) for profiles in (own, others)])
-        sine = float(ways[0, 0] * ways[1, 1] - ways[0, 1] * ways[1, 0])
-        if abs(float(ways[0] @ ways[1])) > self._cosine or not abs(sine) > 0.0:
+        first = [int(own[0]), int(others[0])]
+        ways = [_tangent(prediction, k, 2.0 * uv_px[k] - uv_px[after]) for k, after in ((own[:2]), (others[:2]))]
+        ahead_px = _ahead_px(uv_px[first[0]], ways[0], uv_px[first[1]], ways[1])
+        near = ((ahead_px >= 0.0) & (ahead_px <= self._reach_px)).all()
+        if abs(float(ways[0] @ ways[1])) > self._cosine or not near:
             return None
-        gap = uv_px[others[0]] - uv_px[own[0]]
-        ahead_px = np.array(
-            [gap[0] * ways[1, 1] - gap[1] * ways[1, 0], gap[0] * ways[0, 1] - gap[1] * ways[0, 0]]
-        ) / sine  # fmt: skip
-        if not ((ahead_px >= 0.0) & (ahead_px <= self._reach_px)).all():
-            return None
-        meet_px = uv_px[own[0]] + ahead_px[0] * ways[0]
-        beside = tuple(self._beside(uv_px, profiles) for profiles in (own, others))
-        return Rounding(frozenset((one, other)), meet_px, (int(own[0]), int(others[0])), ways, (beside[0], beside[1]))
+        meet_px = uv_px[first[0]] + ahead_px[0] * ways[0]
+        beside = self._beside(uv_px, own), self._beside(uv_px, others)
+        straight = [GoesOn(k, meet_px, way) for k, way in zip(first, ways, strict=True)]
+        curved = [
+            crossing(prediction, beside[k], meet_px, ways[1 - k], self._cosine)
+            for k, edge in enumerate((one, other))
+            if self._gripper.edge_curved[edge]
+        ]
+        return Rounding(frozenset((one, other)), beside, (*straight, *(each for each in curved if each is not None)))
 
     def _sampled(self, prediction: Prediction, point: int, edge: int) -> tuple[int, NDArray[np.intp], bool] | None:
         """The first edge that is looked at on the way from a point along an edge, its profiles from there on, and
         whether others that are too short lie between.
         """
-        layout, ends = prediction.layout, self._gripper.edge_points
+        layout, ends = prediction.layout, self._ends
         for passed in range(len(ends)):
             at_start = bool(ends[edge, 0] == point)
             if prediction.profiles[edge] >= FEWEST_SAMPLES:
@@ -100,13 +143,6 @@ class Roundings:
             one, other = self._meeting[point]
             edge = other if one == edge else one
         return None
-
-    @staticmethod
-    def _way(prediction: Prediction, profiles: NDArray[np.intp]) -> Array:
-        """(2,) the way in which an edge goes on towards the rounding."""
-        normal = prediction.normal[profiles[0]]
-        way = np.array([-normal[1], normal[0]])
-        return way if way @ (prediction.uv_px[profiles[0]] - prediction.uv_px[profiles[1]]) > 0.0 else -way
 
     def _beside(self, uv_px: Array, profiles: NDArray[np.intp]) -> NDArray[np.intp]:
         near = np.linalg.norm(uv_px[profiles] - uv_px[profiles[0]], axis=1) < self._reach_px

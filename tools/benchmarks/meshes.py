@@ -29,6 +29,21 @@ def finger_mesh(profile_yz_m: np.ndarray, x_m: tuple[float, float]) -> trimesh.T
     return mesh
 
 
+def toned(mesh: trimesh.Trimesh, z_m: float, gain: float) -> list[tuple[trimesh.Trimesh, float]]:
+    """A finger's surface in two parts with their gains."""
+    parts = []
+    for sign, of_part in ((1.0, gain), (-1.0, 1.0)):
+        cut = trimesh.intersections.slice_faces_plane(mesh.vertices, mesh.faces, [0.0, 0.0, sign], [0.0, 0.0, z_m])
+        parts.append((trimesh.Trimesh(*cut[:2], process=False), of_part))
+    return parts
+
+
+def box_fingers() -> list[trimesh.Trimesh]:
+    """Two sharp fingers of the size and at the places of the rounded ones."""
+    profile = np.array([[0.008, -0.04], [0.008, 0.0], [-0.008, 0.0], [-0.008, -0.04]])
+    return [finger_mesh(profile, x) for x in ((-0.027, -0.017), (0.017, 0.027))]
+
+
 def rounded_profile(radius_m: float, width_m: float = 0.016, length_m: float = 0.04, parts: int = 48) -> np.ndarray:
     """Of a finger whose tip's two edges are rounded: (n, 2), the tip at z = 0."""
     turn = np.linspace(0.0, 0.5 * np.pi, parts + 1)
@@ -88,9 +103,21 @@ def write_meshes(
 class MeshCamera:
     """Pictures of meshes before a background that moves; exact masks of triangles, which must not cover each other."""
 
-    def __init__(self, camera: Camera, meshes: Sequence[trimesh.Trimesh], seed: int = 1) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        meshes: Sequence[trimesh.Trimesh],
+        seed: int = 1,
+        tone: tuple[float, float] | None = None,
+    ) -> None:
+        """``tone``: beyond this z (m) towards the tips the fingers are that much brighter."""
         self._camera, self._raster = camera, CoverageRaster(camera, 0.7)
-        self._meshes = [(np.asarray(m.vertices), np.asarray(m.faces), np.asarray(m.face_normals)) for m in meshes]
+        parts = [toned(mesh, *tone) if tone else [(mesh, 1.0)] for mesh in meshes]
+        self._meshes = [
+            (k, np.asarray(part.vertices), np.asarray(part.faces), np.asarray(part.face_normals), gain)
+            for k, of_finger in enumerate(parts)
+            for part, gain in of_finger
+        ]
         self._rng = np.random.default_rng(seed)
         table = sum(
             weight * cv2.resize(self._rng.normal(0.0, 1.0, (1440 // cell, 1920 // cell)), (1920, 1440), None, 0, 0, 2)
@@ -114,12 +141,12 @@ class MeshCamera:
         table = self._table[v : v + height, u : u + width]
         table = self._covered(table, behind)
         passes, light = np.ones((height, width)), np.zeros((height, width))
-        for k, (vertices, faces, normals) in enumerate(self._meshes):
+        for k, vertices, faces, normals, gain in self._meshes:
             shift = np.zeros(3) if offsets_m is None else offsets_m[k]
             cam = (vertices + shift) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
             n_cam = normals @ cam_T_grip[:3, :3].T
             facing = np.flatnonzero(np.einsum("ti,ti->t", n_cam, cam[faces[:, 0]]) < 0.0)
-            level = 130.0 + 90.0 * np.clip(n_cam @ LAMP, 0.0, 1.0)
+            level = gain * (130.0 + 90.0 * np.clip(n_cam @ LAMP, 0.0, 1.0))
             for t, mask in zip(facing, self._raster.masks([cam[faces[t]] for t in facing]), strict=True):
                 if mask is not None:
                     part = (
