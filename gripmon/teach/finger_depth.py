@@ -62,7 +62,8 @@ class Outline:
 class Placed:
     """Outlines in space at unit depth of the TCP.  ``points`` for each finger (v, 3) in the camera frame, NaN where
     not known; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
-    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.
+    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some are taken to
+    lie in the plane of their sides.
     """
 
     points: tuple[Array, ...]
@@ -71,6 +72,7 @@ class Placed:
     tcp: Array
     flat: bool
     sigma_rad: Array
+    round_tips: bool = False
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
@@ -88,7 +90,11 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     if any(not tip for tip, _ in runs):
         return _flat(fingers, centre, rotation, tcp)
     plane_at = _ray(centre) if tcp is None else tcp
-    points = [_in_space(f, tip, sides, direction, plane_at) for f, (tip, sides) in zip(fingers, runs, strict=True)]
+    turns = [_smooth_turns(finger, tip, sides) for finger, (tip, sides) in zip(fingers, runs, strict=True)]
+    points = [
+        _in_space(finger, tip, sides, direction, plane_at, turn)
+        for finger, (tip, sides), turn in zip(fingers, runs, turns, strict=True)
+    ]
     tips = [sorted(tip) for tip, _ in runs]
     if rotation is None or tcp is None:
         inner = _innermost([p[t] for p, t in zip(points, tips, strict=True)])
@@ -101,7 +107,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         tuple(piece for piece in finger.pieces if np.isfinite(p[list(piece)]).all())
         for finger, p in zip(fingers, points, strict=True)
     )
-    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma))
+    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
 
 
 def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
@@ -213,16 +219,21 @@ def _unit(xy: Array, piece: tuple[int, int]) -> Array:
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array) -> Array:
-    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides which it leaves smoothly."""
+def _in_space(
+    finger: Outline,
+    tip: set[int],
+    sides: list[tuple[int, int]],
+    direction: Array,
+    plane_at: Array,
+    turns: Sequence[int],
+) -> Array:
+    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides, which it leaves smoothly at ``turns``."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
         ray = _ray(finger.xy[k])
         out[k] = ray * (height / float(direction @ ray))
-    first = [(start, end) for start, end in sides if start in tip]
-    if len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first):
-        turns = [start for start, _ in first]
+    if turns:
         _into_plane_of_sides(out, sorted(tip), turns, direction, height)
     for start, end in sides:
         if np.isfinite(out[end]).all() or not np.isfinite(out[start]).all():
@@ -230,6 +241,13 @@ def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], dire
         out[end] = nearest_on_ray(_ray(finger.xy[end]), out[start], direction)
     out[out[:, 2] <= 0.0] = np.nan
     return out
+
+
+def _smooth_turns(finger: Outline, tip: set[int], sides: Sequence[tuple[int, int]]) -> list[int]:
+    """The two vertices at which a finger's sides turn into its tip's curve; none where one is a corner."""
+    first = [(start, end) for start, end in sides if start in tip]
+    smooth = len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first)
+    return [start for start, _ in first] if smooth else []
 
 
 def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
@@ -254,7 +272,7 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
     return bool(turns) and abs(turns[0]) < AT_ONCE * abs(sum(turns))
 
 
-def _into_plane_of_sides(points: Array, tip: list[int], turns: list[int], direction: Array, height: float) -> None:
+def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], direction: Array, height: float) -> None:
     """Move the tip's vertices, in the contact plane so far, along their lines of sight into the plane of the two sides,
     which begin at ``turns`` equally far from the tip; what reaches farthest out then lies in the contact plane.
     """
