@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
+from gripmon.teach.straight_pieces import LONGEST_CUT_PX
 
 LONG_PX = 30.0
 """Edges that tell a direction: 0.1 px at each end is 0.3 degrees."""
@@ -30,11 +31,9 @@ ALONG_RAD = math.radians(50.0)
 """Between an edge's image and the way to the tip: perspective turns edges along a finger by up to so much."""
 STEEPEST = 0.25
 """Cosine between line of sight and fingers below which a contact plane is seen too obliquely to place corners on it."""
-CURVE_PX = 24.0
-"""Along a tip, from its side on: as far as a corner may be cut off by a short piece and be one."""
 AT_ONCE = 0.75
-"""Part of the turn within that distance that a corner has; the three pieces of the tightest curve that is seen as one
-(three of 6 px) turn by a third each, scatter aside."""
+"""Part of the turn within the length of a cut corner that a corner has: of the tightest curve that shows as one, three
+pieces of 6 px, each vertex has a third, twice that by their scatter."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Of a plane whose tilt isn't known: anything up to 45 degrees (45 / sqrt(3))."""
@@ -227,7 +226,7 @@ def _in_space(
     plane_at: Array,
     turns: Sequence[int],
 ) -> Array:
-    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides, which it leaves smoothly at ``turns``."""
+    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides, which turn into it at ``turns``."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
@@ -256,7 +255,7 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
     """
     way, at, travelled_px, turns = finger.xy[start] - finger.xy[behind], start, 0.0, []
     used = {behind}
-    while travelled_px < CURVE_PX:
+    while travelled_px < LONGEST_CUT_PX:
         used.add(at)
         onwards = [
             (next(iter({*piece} - {at})), length)
