@@ -145,6 +145,8 @@ def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(ra
     gripper = found.gripper
     assert len(gripper.edge_ids) == 6 and np.count_nonzero(gripper.edge_curved) == 2 and not len(gripper.corner_ids)
     assert any("plane of their sides" in note for note in found.notes)
+    apart = perturbation_between(nominal_cam_T_grip(), found.cam_T_grip)
+    assert np.abs(apart[3:]).max() < np.radians(1.0)
     # The tips lie in the plane of their sides; how far behind the tip a curve leaves its side shows less exactly.
     off = _curve_ends(gripper, invert(nominal_cam_T_grip()) @ found.cam_T_grip)
     off -= _curve_ends(rounded_model(0.012, radius_m), np.eye(4))

@@ -339,7 +339,8 @@ def _across_inner_edges(
             for a, b in finger.pieces
             if a in tip and b in tip and side * float((0.5 * (p[a] + p[b]) - middle) @ across) > 0.0
         ]
-        steep = [way for way in ways if abs(float(way @ across)) < math.sin(math.radians(30.0)) * np.linalg.norm(way)]
+        most = math.sin(math.radians(30.0))
+        steep = [w for w in ways if max(abs(float(w @ across)), abs(float(w @ direction))) < most * np.linalg.norm(w)]
         if not steep:
             return None
         longest = max(steep, key=lambda way: float(np.linalg.norm(way)))
