@@ -68,7 +68,7 @@ def test_the_outline_lies_within_a_fifth_of_a_pixel_of_the_true_silhouette(name:
 
 def test_fingers_are_told_apart_and_placed_in_space_by_their_perspective(box: tuple) -> None:
     _, found = box
-    assert found.gripper.finger_ids == ("left", "right")
+    assert found.gripper.finger_ids == ("left", "right") and not any("round" in note for note in found.notes)
     assert len(found.gripper.corner_ids) >= 5
     apart = perturbation_between(nominal_cam_T_grip(), found.cam_T_grip)
     # One length was given, so only its own error may be along the axis; here it was given exactly.
@@ -144,6 +144,9 @@ def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(ra
     found = gripper_from_images(images_of(moving_robot(311, gripper=solids)), PAPER_LENS, distance_m=DISTANCE)
     gripper = found.gripper
     assert len(gripper.edge_ids) == 6 and np.count_nonzero(gripper.edge_curved) == 2 and not len(gripper.corner_ids)
+    assert any("plane of their sides" in note for note in found.notes)
+    apart = perturbation_between(nominal_cam_T_grip(), found.cam_T_grip)
+    assert np.abs(apart[3:]).max() < np.radians(1.0)
     # The tips lie in the plane of their sides; how far behind the tip a curve leaves its side shows less exactly.
     off = _curve_ends(gripper, invert(nominal_cam_T_grip()) @ found.cam_T_grip)
     off -= _curve_ends(rounded_model(0.012, radius_m), np.eye(4))

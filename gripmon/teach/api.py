@@ -241,7 +241,7 @@ _HEADER = """\
 #                       standard deviation
 #   edges.*.depth_m     how much deeper it lies, along the line of sight; follows from the shape of a bevel (m)
 #   edges.*.crease      true: between two visible faces; false: an outline
-#   edges.*.brighter    the brighter side, where it may be relied on
+#   edges.*.brighter    the brighter side of a crease, where it may be relied on
 #   edges.*.rms_px      scatter of the edge points about the line (px); seen: part of its profiles that showed it
 #   edges.*.left, right grey level of the finger on that side over the median of all edges, its spread along the edge
 #   corners.*.uv_px     where taught edges meet in the first image (px), and its standard deviation

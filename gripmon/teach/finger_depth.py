@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
+from gripmon.teach.straight_pieces import LONGEST_CUT_PX
 
 LONG_PX = 30.0
 """Edges that tell a direction: 0.1 px at each end is 0.3 degrees."""
@@ -30,11 +31,9 @@ ALONG_RAD = math.radians(50.0)
 """Between an edge's image and the way to the tip: perspective turns edges along a finger by up to so much."""
 STEEPEST = 0.25
 """Cosine between line of sight and fingers below which a contact plane is seen too obliquely to place corners on it."""
-CURVE_PX = 24.0
-"""Along a tip, from its side on: as far as a corner may be cut off by a short piece and be one."""
 AT_ONCE = 0.75
-"""Part of the turn within that distance that a corner has; the three pieces of the tightest curve that is seen as one
-(three of 6 px) turn by a third each, scatter aside."""
+"""Part of the turn within the length of a cut corner that a corner has: of the tightest curve that shows as one, three
+pieces of 6 px, each vertex has a third, twice that by their scatter."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Of a plane whose tilt isn't known: anything up to 45 degrees (45 / sqrt(3))."""
@@ -62,7 +61,8 @@ class Outline:
 class Placed:
     """Outlines in space at unit depth of the TCP.  ``points`` for each finger (v, 3) in the camera frame, NaN where
     not known; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
-    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.
+    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some are taken to
+    lie in the plane of their sides.
     """
 
     points: tuple[Array, ...]
@@ -71,6 +71,7 @@ class Placed:
     tcp: Array
     flat: bool
     sigma_rad: Array
+    round_tips: bool = False
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
@@ -88,7 +89,11 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     if any(not tip for tip, _ in runs):
         return _flat(fingers, centre, rotation, tcp)
     plane_at = _ray(centre) if tcp is None else tcp
-    points = [_in_space(f, tip, sides, direction, plane_at) for f, (tip, sides) in zip(fingers, runs, strict=True)]
+    turns = [_smooth_turns(finger, tip, sides) for finger, (tip, sides) in zip(fingers, runs, strict=True)]
+    points = [
+        _in_space(finger, tip, sides, direction, plane_at, turn)
+        for finger, (tip, sides), turn in zip(fingers, runs, turns, strict=True)
+    ]
     tips = [sorted(tip) for tip, _ in runs]
     if rotation is None or tcp is None:
         inner = _innermost([p[t] for p, t in zip(points, tips, strict=True)])
@@ -101,7 +106,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         tuple(piece for piece in finger.pieces if np.isfinite(p[list(piece)]).all())
         for finger, p in zip(fingers, points, strict=True)
     )
-    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma))
+    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
 
 
 def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
@@ -213,16 +218,21 @@ def _unit(xy: Array, piece: tuple[int, int]) -> Array:
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], direction: Array, plane_at: Array) -> Array:
-    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides which it leaves smoothly."""
+def _in_space(
+    finger: Outline,
+    tip: set[int],
+    sides: list[tuple[int, int]],
+    direction: Array,
+    plane_at: Array,
+    turns: Sequence[int],
+) -> Array:
+    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides, which turn into it at ``turns``."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
         ray = _ray(finger.xy[k])
         out[k] = ray * (height / float(direction @ ray))
-    first = [(start, end) for start, end in sides if start in tip]
-    if len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first):
-        turns = [start for start, _ in first]
+    if turns:
         _into_plane_of_sides(out, sorted(tip), turns, direction, height)
     for start, end in sides:
         if np.isfinite(out[end]).all() or not np.isfinite(out[start]).all():
@@ -232,13 +242,20 @@ def _in_space(finger: Outline, tip: set[int], sides: list[tuple[int, int]], dire
     return out
 
 
+def _smooth_turns(finger: Outline, tip: set[int], sides: Sequence[tuple[int, int]]) -> list[int]:
+    """The two vertices at which a finger's sides turn into its tip's curve; none where one is a corner."""
+    first = [(start, end) for start, end in sides if start in tip]
+    smooth = len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first)
+    return [start for start, _ in first] if smooth else []
+
+
 def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
     """Whether a side that comes from ``behind`` turns into a curve of the ``tip`` at its ``start``: a corner turns all
     at once.
     """
     way, at, travelled_px, turns = finger.xy[start] - finger.xy[behind], start, 0.0, []
     used = {behind}
-    while travelled_px < CURVE_PX:
+    while travelled_px < LONGEST_CUT_PX:
         used.add(at)
         onwards = [
             (next(iter({*piece} - {at})), length)
@@ -254,7 +271,7 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
     return bool(turns) and abs(turns[0]) < AT_ONCE * abs(sum(turns))
 
 
-def _into_plane_of_sides(points: Array, tip: list[int], turns: list[int], direction: Array, height: float) -> None:
+def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], direction: Array, height: float) -> None:
     """Move the tip's vertices, in the contact plane so far, along their lines of sight into the plane of the two sides,
     which begin at ``turns`` equally far from the tip; what reaches farthest out then lies in the contact plane.
     """
@@ -322,7 +339,8 @@ def _across_inner_edges(
             for a, b in finger.pieces
             if a in tip and b in tip and side * float((0.5 * (p[a] + p[b]) - middle) @ across) > 0.0
         ]
-        steep = [way for way in ways if abs(float(way @ across)) < math.sin(math.radians(30.0)) * np.linalg.norm(way)]
+        most = math.sin(math.radians(30.0))
+        steep = [w for w in ways if max(abs(float(w @ across)), abs(float(w @ direction))) < most * np.linalg.norm(w)]
         if not steep:
             return None
         longest = max(steep, key=lambda way: float(np.linalg.norm(way)))

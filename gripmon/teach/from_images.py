@@ -321,6 +321,11 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
         )
+    if placed.round_tips:
+        notes.append(
+            "round fingertips are taken to lie in the plane of their sides. Corrections of the camera's tilt, and of "
+            "motions of some per cent of the distance, are too small or too large by what they stand out of it"
+        )
     if left_out:
         notes.append(f"{len(left_out)} of {count} images left out")
     return notes

@@ -36,7 +36,6 @@ from gripmon.teach.views import ImageRefused, Sampled, TeachingImage, TeachingRe
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
-from gripmon.track.edges.profiles import full_scale
 from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdges
 
 T = TypeVar("T")
@@ -248,12 +247,6 @@ NEAR_PX, FAR_PX = 1.5, 3.0
 AGREEING_SHARE = 0.95
 """Part of the edge points of all images that must have the same side brighter."""
 
-FEWEST_BACKGROUNDS = 3
-"""Images that an outline's brighter side must be seen in: it depends on the background."""
-
-DIFFERENT_SHARE = 0.1
-"""Backgrounds differ clearly if their levels beside an edge span at least this part of the full scale."""
-
 Side = Literal["left", "right", "any"]
 
 
@@ -281,15 +274,14 @@ def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
     """
     sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
     gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
-    scale = full_scale(views[0].image.image)
     found = {}
     for index, side in sides.items():
         gain = np.array(gains)[side.image]
         inside, crease = viewer.inside[index], viewer.crease[index]
         left = _look(side.left / gain) if crease or inside < 0.0 else None
         right = _look(side.right / gain) if crease or inside > 0.0 else None
-        sure = crease or (inside != 0.0 and _shows_on_any_background(side, inside, scale))
-        found[index] = _Appearance(_brighter(side.step) if sure else "any", left, right)
+        # Beside an outline the background decides, and there are others than the teaching images'.
+        found[index] = _Appearance(_brighter(side.step) if crease else "any", left, right)
     return found
 
 
@@ -343,17 +335,3 @@ def _look(relative: Array) -> Look | None:
 def _brighter(step: Array) -> Side:
     right = float(np.mean(step > 0.0))
     return "right" if right >= AGREEING_SHARE else "left" if right <= 1.0 - AGREEING_SHARE else "any"
-
-
-def _shows_on_any_background(side: _Sides, inside: float, scale: float) -> bool:
-    """Whether an outline's polarity can be relied on: several clearly different backgrounds, all of them on one side of
-    the finger's level and farther from it than they differ among themselves.
-    """
-    finger, beyond = (side.right, side.left) if inside > 0.0 else (side.left, side.right)
-    images = np.unique(side.image)
-    if len(images) < FEWEST_BACKGROUNDS:
-        return False
-    levels = np.array([np.nanmedian(beyond[side.image == number]) for number in images])
-    span = float(levels.max() - levels.min())
-    nearest = float(np.nanpercentile(np.abs(beyond - finger), 100.0 * (1.0 - AGREEING_SHARE)))
-    return span >= DIFFERENT_SHARE * scale and nearest >= span
