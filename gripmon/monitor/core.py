@@ -310,7 +310,9 @@ class Monitor:
         if 0 < self._astray < DOUBTED_FRAMES or not self._standing.believed:
             motion = self._watch.skip()
         else:
-            motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
+            of_change = self._standing.of_change
+            covariance = self._covariance if of_change is None else of_change
+            motion = self._watch.add(self._since_start(shift), covariance, self._now_s)
         if motion.stepped:
             self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None

@@ -16,7 +16,7 @@ from gripmon.monitor.standing import Standing
 from gripmon.track.look import GripperLook, LookAlignment, LookFusion, LookMotion, another_background
 
 DIFFERENT = 0.5
-"""Share of a finger's pixels that look as learnt, below which it looks different: grasps often hide half of one."""
+"""Share of a finger's blocks that look otherwise than at first, from which it looks different: grasps hide a half."""
 
 DIFFERENT_S = 300.0
 """For how long it does, or the look contradicts the edges, until that is told and the look learnt anew, s: robots hold
@@ -46,24 +46,24 @@ class FinerLook:
         self._pending = None
         if not standing.believed or frame.image is None:
             return standing
-        refined_T, (opening_m, sigma_m) = None, self._opening(frame, standing)
+        refined, (opening_m, sigma_m) = None, self._opening(frame, standing)
         motion = self._alignment.measure(frame.image, standing.cam_T_grip, opening_m, sigma_m)
         if motion is not None:
             of_background = standing.covariance - self._floor
-            refined_T = self._fusion.fuse(standing.cam_T_grip, of_background, motion)
-        pose = standing.cam_T_grip if refined_T is None else refined_T
+            refined = self._fusion.fuse(standing.cam_T_grip, of_background, motion)
+        pose = standing.cam_T_grip if refined is None else refined[0]
         # A copy: learning can wait, and the caller may read the next image into the same memory.
         self._pending = frame.image.copy(), pose, opening_m, now_s, motion
-        if refined_T is None:
+        if refined is None:
             return standing
-        bound, away = standing.protection, perturbation_between(standing.cam_T_grip, refined_T)
+        bound, away = standing.protection, perturbation_between(standing.cam_T_grip, pose)
         wider = Protection(
             bound.position_m + float(np.linalg.norm(away[:3])),
             bound.rotation_rad + float(np.linalg.norm(away[3:])),
             bound.risk,
             bound.hypothesis,
         )
-        return replace(standing, cam_T_grip=refined_T, protection=wider)
+        return replace(standing, cam_T_grip=pose, protection=wider, of_change=refined[1] + self._floor)
 
     def learn(self) -> None:
         """Learn from the newest frame if its background is a new one."""
@@ -78,9 +78,8 @@ class FinerLook:
             return
         if motion is not None:
             self._fusion.learn()
-            if self._looks_different(motion, now_s):
-                return
         self._alignment.learn(image, cam_T_grip, opening_m)
+        self._tell(self._alignment.renewed > DIFFERENT, now_s)
 
     def _opening(self, frame: Frame, standing: Standing) -> tuple[float | None, float]:
         """The jaw's opening with its standard deviation, m: as earlier frames showed it, which errs alike in all."""
@@ -96,20 +95,20 @@ class FinerLook:
         due, self._due = self._due, []
         return due
 
-    def _looks_different(self, motion: LookMotion, now_s: float) -> bool:
-        """Whether it has for so long that it is told, and the look learnt anew."""
-        astray = np.append(motion.agree < DIFFERENT, self._fusion.contradicts)
-        self._since_s = np.where(astray, np.minimum(self._since_s, now_s), np.inf)
+    def _tell(self, different: NDArray[np.bool_], now_s: float) -> None:
+        """Fingers (f,) that look different, and a look that contradicts the edges, once they have for long enough."""
+        self._since_s = np.where(
+            np.append(different, self._fusion.contradicts), np.minimum(self._since_s, now_s), np.inf
+        )
         long = now_s - self._since_s >= DIFFERENT_S
         if not long.any():
-            return False
+            return
         names = [f"finger {name}" for name, now in zip(self._names, long[:-1].tolist(), strict=True) if now]
-        text = (
-            f"the gripper looks different: {', '.join(names) or 'its look contradicts its edges'}, for "
-            f"{now_s - self._since_s.min():.0f} s; its look is learnt anew, and the edges count alone meanwhile"
-        )
+        text = f"the gripper looks different: {', '.join(names)}, for {now_s - self._since_s[long].min():.0f} s"
+        if long[-1]:
+            text = "the gripper's look contradicts its edges, which count alone while it is learnt anew"
+            self._alignment.forget()
+            self._fusion.forget()
         self._due.append(Alert(AlertKind.GRIPPER, Cause.UNKNOWN, Severity.WARNING, text))
-        self._alignment.forget()
-        self._fusion.forget()
+        self._alignment.renew()
         self._since_s[:] = np.inf
-        return True

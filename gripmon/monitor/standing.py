@@ -13,7 +13,8 @@ class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
 
     ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
-    it; ``where_it_was``: the anchor has it there.
+    it; ``where_it_was``: the anchor has it there; ``of_change`` (6, 6): the covariance by which the pose changes while
+    nothing moves, where that is known to be less.
     """
 
     measurement: Measurement
@@ -22,3 +23,4 @@ class Standing:
     protection: Protection
     believed: bool
     where_it_was: bool
+    of_change: Array | None = None

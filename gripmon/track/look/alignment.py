@@ -55,8 +55,13 @@ TEXTURE = 5.0
 would show a gripper that never moves.
 """
 
-CLIP = 4.0
-"""Standard deviations that a residual counts for in the scatter, so that one flash isn't remembered for an hour."""
+UNLIKE = 2.0
+"""Root mean square of a block's residuals, in standard deviations, from which it looks otherwise than learnt: noise
+gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is learnt anew: what covered it is gone.
+"""
+
+RENEWED = 0.5
+"""Correlation of a block with what it was first, below which it shows something else."""
 
 GREY_BGR = np.array([0.114, 0.587, 0.299])
 
@@ -153,6 +158,7 @@ class LookAlignment:
         """Learn anew."""
         self.views = 0
         self._learnt: _Placed | None = None
+        self._count: Array = np.zeros(0)
         self._measured: _Placed | None = None
         self._last: tuple[Array, float | None] | None = None
 
@@ -160,6 +166,23 @@ class LookAlignment:
     def ready(self) -> bool:
         """Whether it measures: some blocks were seen often enough."""
         return self._measured is not None
+
+    @property
+    def renewed(self) -> Array:
+        """(f,) share of each finger's textured blocks that look otherwise than when they were first learnt."""
+        fingers = len(self._gripper.finger_ids)
+        if self._learnt is None:
+            return np.zeros(fingers)
+        now, first = (m - m.mean(axis=1, keepdims=True) for m in (self._mean, self._at_first))
+        told = (self._count >= FEWEST_VIEWS) & (np.sqrt((first**2).mean(axis=1)) > 2.0 * LEAST_DN)
+        alike = (now * first).sum(axis=1) > RENEWED * np.sqrt((now**2).sum(axis=1) * (first**2).sum(axis=1))
+        other = np.bincount(self._finger[told], ~alike[told], fingers)
+        return np.asarray(other / np.maximum(np.bincount(self._finger[told], minlength=fingers), 1))
+
+    def renew(self) -> None:
+        """The present look counts as the first."""
+        if self._learnt is not None:
+            self._at_first = np.where(self._count[:, None] >= FEWEST_VIEWS, self._mean, np.nan)
 
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
         """Learn from an image whose pose (4, 4) is trusted, some 2 ms; the first time 0.1 s, to choose blocks."""
@@ -228,8 +251,9 @@ class LookAlignment:
 
     def _agree(self, share: Array) -> Array:
         fingers = len(self._gripper.finger_ids)
-        count = np.bincount(self._finger_in, minlength=fingers)
-        total = np.bincount(self._finger_in, share, fingers)
+        known = self._weight_in.any(axis=1)
+        count = np.bincount(self._finger_in[known], minlength=fingers)
+        total = np.bincount(self._finger_in[known], share[known], fingers)
         return np.divide(total, count, out=np.full(fingers, np.nan), where=count > 0)
 
     def _lay_out(self, grey: tuple[Image, Array], cam_T_grip: Array, jaw_opening_m: float | None) -> bool:
@@ -251,7 +275,8 @@ class LookAlignment:
         # How a motion changes what is seen was the same from everywhere near: as where they were laid out.
         self._flow = self._learnt.flow.copy()
         self._mean, self._variance = np.zeros(self._points.shape[:2]), np.zeros(self._points.shape[:2])
-        self._count = np.zeros(len(best))
+        self._at_first = np.full(self._points.shape[:2], np.nan)
+        self._count, self._unlike = np.zeros(len(best)), np.zeros(len(best), dtype=np.intp)
         return True
 
     def _add(self, values: Array) -> None:
@@ -268,13 +293,19 @@ class LookAlignment:
         told = seen & (gain[:, 0] >= kernel.GAINS[0]) & (gain[:, 0] <= kernel.GAINS[1])
         with np.errstate(invalid="ignore", divide="ignore"):
             away = np.where(told[:, None], (values - level) / gain + middle, values) - self._mean
+        usual = np.sqrt(self._variance) + LEAST_DN
+        unlike = seen & (self._count >= FEWEST_VIEWS) & (((away / usual) ** 2).mean(axis=1) > UNLIKE**2)
+        self._unlike = np.where(seen, np.where(unlike, self._unlike + 1, 0), self._unlike)
+        again = self._unlike >= FEWEST_VIEWS
+        self._mean[again], away[again] = values[again], 0.0
+        self._variance[again], self._count[again], self._unlike[again] = 0.0, 0.0, 0
+        seen &= ~unlike | again
         self._count[seen] += 1.0
         share = 1.0 / np.minimum(self._count[seen], MOST_VIEWS)[:, None]
-        away = away[seen]
-        usual = np.sqrt(self._variance[seen]) + LEAST_DN
-        tame = np.where(self._count[seen, None] > FEWEST_VIEWS, np.clip(away, -CLIP * usual, CLIP * usual), away)
-        self._mean[seen] += share * away
-        self._variance[seen] += share * ((1.0 - share) * tame**2 - self._variance[seen])
+        self._mean[seen] += share * away[seen]
+        self._variance[seen] += share * ((1.0 - share) * away[seen] ** 2 - self._variance[seen])
+        known = seen & (self._count == FEWEST_VIEWS) & np.isnan(self._at_first[:, 0])
+        self._at_first[known] = self._mean[known]
 
     def _choose(self) -> None:
         weight = self._weights()

@@ -47,12 +47,13 @@ class LookFusion:
         self._before: Array | None = None
         self._pending: tuple[Array, Array, Array, Array, float] | None = None
 
-    def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> Array | None:
-        """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one; None where they
-        contradict each other, and before a bias is known.
+    def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> tuple[Array, Array] | None:
+        """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one, with the covariance
+        (6, 6) by which that changes while nothing moves; None where they contradict each other, and before a bias is
+        known.
 
-        What errors of the edges outlast all backgrounds nobody knows: the edges' covariance holds for the result, too,
-        which lies nearer to the truth.
+        What errors of the edges outlast all backgrounds nobody knows: as a place, the result is to be trusted no more
+        than the edges.
         """
         difference = perturbation_between(cam_T_grip, look.cam_T_grip)
         opening_m = 0.0 if look.jaw_opening_m is None else look.jaw_opening_m
@@ -64,7 +65,8 @@ class LookFusion:
         weighed = np.linalg.solve(of_both, innovation)
         if float(innovation @ weighed) > CONTRADICTION:
             return None
-        return perturb(cam_T_grip, covariance @ weighed)
+        left = covariance - covariance @ np.linalg.solve(of_both, covariance)
+        return perturb(cam_T_grip, covariance @ weighed), 0.5 * (left + left.T)
 
     def learn(self) -> None:
         """Learn the bias from the newest frame, whose background is a new one: a Kalman update."""
