@@ -28,7 +28,7 @@ from gripmon.model.records import (
     Severity,
     Smoothed,
 )
-from gripmon.monitor.trust import Standing
+from gripmon.monitor.standing import Standing
 from gripmon.track.edges import Measurement
 
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35

@@ -63,8 +63,9 @@ from gripmon.monitor.notes import NoteTaker
 from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.trust import Integrity, Standing
+from gripmon.monitor.trust import Integrity
 from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 
 RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
@@ -174,6 +175,7 @@ class Monitor:
         not looked at after that.
         """
         self.learn()
+        self._due += self._trust.told()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
@@ -314,7 +316,9 @@ class Monitor:
         if 0 < self._astray < DOUBTED_FRAMES or not self._standing.believed:
             motion = self._watch.skip()
         else:
-            motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
+            of_change = self._standing.of_change
+            covariance = self._covariance if of_change is None else of_change
+            motion = self._watch.add(self._since_start(shift), covariance, self._now_s)
         if motion.stepped:
             self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None

@@ -27,8 +27,8 @@ from gripmon.model.records import (
     State,
 )
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import CORNER_COUNTS
-from gripmon.monitor.trust import Standing
 from gripmon.track.edges import Measurement, edge_sums
 
 KEEP_AGAIN_S = 10.0

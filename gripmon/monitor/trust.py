@@ -6,7 +6,7 @@ learned look doesn't contradict: mounts are knocked rarely, objects hide fingers
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,10 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord
+from gripmon.model.records import Alert, Array, Frame, Image, MonitorState, Protection, ReferenceRecord
+from gripmon.monitor.finer import FinerLook
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.track.edges import Measurement
@@ -41,22 +43,6 @@ class _Candidate(NamedTuple):
     trust: Trust
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
-
-    ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
-    it; ``where_it_was``: the anchor has it there.
-    """
-
-    measurement: Measurement
-    cam_T_grip: Array
-    covariance: Array
-    protection: Protection
-    believed: bool
-    where_it_was: bool
-
-
 class Integrity:
     """Decides for one monitor's frames, one after the other."""
 
@@ -72,6 +58,7 @@ class Integrity:
         self._weigher = Weigher(tracker, gripper, settings, reference)
         self._look = GripperLook(camera, gripper, tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z)
         self._strips = FingerStrips(camera, gripper, tracker.along)
+        self._finer = FinerLook(camera, gripper, self._look, tracker.floor) if settings.look.enabled else None
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
@@ -108,6 +95,12 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
+        if self._finer is not None:
+            self._finer.learn()
+
+    def told(self) -> list[Alert]:
+        """What the gripper's look has to tell."""
+        return [] if self._finer is None else self._finer.told()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed, else the anchor's."""
@@ -133,6 +126,8 @@ class Integrity:
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
+        if self._finer is not None and standing is not None:
+            standing = self._finer.refine(frame, standing, now_s)
         return standing
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:

@@ -1,7 +1,19 @@
-"""The gripper's own learned look: a second witness of where it is, which fails in other ways than its edges."""
+"""The gripper's own learned look: a second witness of where it is, and a finer measure of how it moves."""
 
 from gripmon.track.look.agreement import LookAgreement
-from gripmon.track.look.core import GripperLook, LookRefused
+from gripmon.track.look.alignment import LookAlignment, LookMotion, warm_up
+from gripmon.track.look.core import GripperLook, LookRefused, another_background
+from gripmon.track.look.fusion import LookFusion
 from gripmon.track.look.strips import FingerStrips
 
-__all__ = ["FingerStrips", "GripperLook", "LookAgreement", "LookRefused"]
+__all__ = [
+    "FingerStrips",
+    "GripperLook",
+    "LookAgreement",
+    "LookAlignment",
+    "LookFusion",
+    "LookMotion",
+    "LookRefused",
+    "another_background",
+    "warm_up",
+]

@@ -153,9 +153,8 @@ class GripperLook:
             self._begin(lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m))
             if not len(self._points):
                 return False
-        poses = cam_T_grip[None]
-        behind = self._look(image, poses, jaw_opening_m, self._guards, self._guard_finger)[0][0]
-        if self._behind is not None and not _another_background(behind, self._behind):
+        behind = self.behind(image, cam_T_grip, jaw_opening_m)
+        if self._behind is not None and not another_background(behind, self._behind):
             return False
         self._behind = behind
         pair = 2 * (self.views % len(SLIDES_M))
@@ -169,6 +168,12 @@ class GripperLook:
         if self.views >= FEWEST_VIEWS:
             self._choose()
         return True
+
+    def behind(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> NDArray[np.float32]:
+        """Textures (n, POINTS) beside the fingers at a pose (4, 4), for :func:`another_background`; none before patches
+        are laid out.
+        """
+        return self._look(image, cam_T_grip[None], jaw_opening_m, self._guards, self._guard_finger)[0][0]
 
     def compare(self, image: Image, poses_cam_T_grip: Array, jaw_opening_m: float | None) -> LookAgreement:
         """Hold the look against poses (k, 4, 4), or one (4, 4); all say nothing before :attr:`ready`."""
@@ -356,7 +361,7 @@ def _texture(values: NDArray[np.float32], quantum: float) -> NDArray[np.float32]
     return texture
 
 
-def _another_background(now: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
+def another_background(now: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
     """Whether enough of the patches beside the fingers (n, POINTS) show something else than before."""
     if not len(now):
         return True  # nothing but the gripper is in view

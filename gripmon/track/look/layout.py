@@ -54,10 +54,7 @@ class Layout:
 
 def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> Layout:
     """Patches for a gripper seen at ``cam_T_grip`` (4, 4); none for a finger that doesn't show, or is too small."""
-    points_grip_m = gripper.points_grip_m(jaw_opening_m)
-    points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-    visible = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3]).visible
-    depths = [_finger_depth_m(camera, gripper, points_cam_m, visible, f) for f in range(len(gripper.finger_ids))]
+    depths = finger_depths_m(camera, gripper, cam_T_grip, jaw_opening_m)
     anywhere = np.any([np.isfinite(d) for d in depths], axis=0).astype(np.uint8)
     free = 1 - _dilated(anywhere, BESIDE_PX[0])
     points, finger, guard = [], [], []
@@ -79,6 +76,14 @@ def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: 
     every, whose, aside = np.concatenate(points), np.concatenate(finger), np.concatenate(guard)
     sound = np.isfinite(every).all(axis=(1, 2))
     return Layout(every[sound], whose[sound], aside[sound])
+
+
+def finger_depths_m(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> list[Array]:
+    """Depth (h, w) of each finger's nearest surface at every pixel, NaN beside it."""
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+    visible = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3]).visible
+    return [_finger_depth_m(camera, gripper, points_cam_m, visible, f) for f in range(len(gripper.finger_ids))]
 
 
 def _dilated(mask: NDArray[np.uint8], radius_px: int) -> NDArray[np.uint8]:

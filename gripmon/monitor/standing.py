@@ -1,0 +1,26 @@
+"""What is published of a frame in which the gripper was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gripmon.model.records import Array, Protection
+from gripmon.track.edges import Measurement
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
+
+    ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
+    it; ``where_it_was``: the anchor has it there; ``of_change`` (6, 6): the covariance by which the pose changes while
+    nothing moves, where that is known to be less.
+    """
+
+    measurement: Measurement
+    cam_T_grip: Array
+    covariance: Array
+    protection: Protection
+    believed: bool
+    where_it_was: bool
+    of_change: Array | None = None
