@@ -114,9 +114,9 @@ def export(arguments: Arguments) -> None:
     arguments.check_outputs("out")
     camera = arguments.format in CAMERA_FORMATS
     # An option that would do nothing was meant for something.
-    unused = (*_FRAMES, "gripper_in_camera") if camera else ("fit",)
+    unused = [*_FRAMES, "gripper_in_camera"] if camera else ["fit"]
     if not camera and arguments.format != "easy_handeye2":
-        unused += ("robot_base_frame", "tracking_marker_frame")
+        unused += ["robot_base_frame", "tracking_marker_frame"]
     arguments.refuse(unused, f"has no meaning with --format {arguments.format}; leave it out")
     source = read_calibrated(arguments.calibration)
     notes = export_notes(source, arguments.command_line(), with_pose=not camera)

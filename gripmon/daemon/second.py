@@ -37,7 +37,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import SpotRecorder
+from gripmon.record.write import Recorder
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
@@ -57,7 +57,7 @@ class SecondCamera(Loop):
         pulsed: PulsedWatch,
         source: Source,
         publisher: SpotPublisher,
-        recorder: SpotRecorder,
+        recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
         *,

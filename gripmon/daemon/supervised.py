@@ -42,7 +42,7 @@ from gripmon.model.records import (
     accepting,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import EventRecorder
+from gripmon.record.write import Recorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -67,7 +67,7 @@ class Loop(ABC):
         self,
         source: Source,
         publisher: StatePublisher,
-        recorder: EventRecorder,
+        recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
         *,
