@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -32,7 +31,7 @@ from gripmon.analyse.summary import headline, paragraph
 from gripmon.analyse.track import SECOND_NS, Clock, Track, curves_of, displacement, make_track, straightened
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import AlertKind, Array, ReferenceRecord, StateRecord, Verdict
-from gripmon.record.read import Recording
+from gripmon.record.read import FrameTable, Recording
 
 _END_FRAMES = 15
 _OVERLAY_FRAMES = 6
@@ -201,9 +200,6 @@ def _summary(reports: Sequence[RecordingReport]) -> str:
     head = f"{which}; the camera moved in {len(moved) or 'none'} of them."
     return " ".join([head, *(headline(r) for r in moved)])
 
-
-if TYPE_CHECKING:
-    from gripmon.record.read import FrameTable
 
 _FEWEST = 30
 _SLICES = 120

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -189,9 +189,6 @@ def _in_short(alert: Alert) -> str:
     return f"{alert.kind}{event} ({alert.cause})"
 
 
-if TYPE_CHECKING:
-    from gripmon.model.records import Alert, FrameRecord
-
 _MOST_SHOWN = 3
 
 
@@ -207,8 +204,6 @@ class Differences:
 
     def add(self, then: FrameRecord, now: FrameRecord) -> None:
         """The same frame, as it was recorded and as it is replayed."""
-        import msgspec
-
         self.frames += 1
         self._same += msgspec.structs.replace(then, latency_ns=now.latency_ns) == now
         for what in ("verdict", "state"):

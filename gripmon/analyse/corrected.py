@@ -52,11 +52,7 @@ def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
     length = np.linalg.norm(frames.cam_T_grip[:, 3:], axis=1)
     measured = np.isfinite(frames.cam_T_grip).all(axis=1) & (frames.source != held) & ~frames.refused & (length > 0.0)
     poses = np.full((len(frames), 4, 4), np.nan)
-    good = frames.cam_T_grip[measured]
-    poses[measured] = np.eye(4)
-    if len(good):
-        poses[measured, :3, :3] = Rotation.from_quat(good[:, 3:]).as_matrix()
-    poses[measured, :3, 3] = good[:, :3]
+    poses[measured] = frames.take(measured).matrices()
     return correct(frames.stamp_ns, poses, frames.covariance, measured, step)
 
 

@@ -7,7 +7,7 @@ the sum of their covariances, so that differences then look less significant tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -154,31 +154,15 @@ class Verdict:
     def values(self) -> dict[str, Any]:
         """As plain values: m, rad, px."""
         found = self.difference
+        parts = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(found).items()
+        }
         if isinstance(found, HandEyeDifference):
-            difference: dict[str, Any] = {
-                "kind": "hand_eye",
-                "position_m": found.position_m.tolist(),
-                "position_sigma_m": found.position_sigma_m.tolist(),
-                "rotation_rad": found.rotation_rad.tolist(),
-                "rotation_sigma_rad": found.rotation_sigma_rad.tolist(),
-                "chi2": found.chi2,
-                "degrees_of_freedom": 6,
-                "p_value": found.p_value,
-                "position_p_value": found.position_p,
-                "rotation_p_value": found.rotation_p,
-            }
+            more = {f"{part}_p_value": parts.pop(f"{part}_p") for part in ("position", "rotation")}
+            difference = {"kind": "hand_eye", **parts, "degrees_of_freedom": 6, **more}
         else:
-            difference = {
-                "kind": "camera",
-                "largest_px": found.largest_px,
-                "largest_sigma_px": found.largest_sigma_px if found.p_value is not None else None,
-                "at_px": found.at_px.tolist(),
-                "rms_px": found.rms_px,
-                "turn_rad": found.turn_rad.tolist(),
-                "largest_turned_px": found.largest_turned_px,
-                "p_value": found.p_value,
-                "compared": found.compared,
-            }
+            known = found.p_value is not None
+            difference = {"kind": "camera", **parts, "largest_sigma_px": found.largest_sigma_px if known else None}
         within = {"within_tolerance": self.within, "same": self.same, "level": self.level}
         return {**difference, **within, "warnings": list(self.warnings)}
 

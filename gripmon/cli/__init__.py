@@ -19,7 +19,8 @@ from gripmon.cli import (
     certificates,
     check,
     demo,
-    gripper,
+    gripper_cad,
+    gripper_images,
     network,
     recordings,
     replay,
@@ -30,7 +31,7 @@ from gripmon.cli import (
     teach,
     watch,
 )
-from gripmon.cli.common import Command
+from gripmon.cli.common import Arguments, Command
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_INTERRUPTED
 
@@ -42,6 +43,7 @@ _METHODS = (
     calibrate_intrinsics.intrinsics, calibrate_plane.plane, calibrate_arm.laser, calibrate_arm.robot_world,
     calibrate_verify.verify, calibrate_exchange.import_, calibrate_exchange.export,
 )  # fmt: skip
+_WAYS = (gripper_cad.from_cad, gripper_images.from_images)
 _LAST = (setup.setup, setup.target, teach.teach, certificates.certificates)
 
 _EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
@@ -87,6 +89,23 @@ examples:
 exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why"""
 
 
+_GRIPPER = """\
+Make a gripper file from what there is of a gripper.  Each way writes it whole or not at all, and
+replaces none without --force."""
+
+_GROUPS = (
+    (
+        "calibrate",
+        "calibrate from images: camera, hand/eye and more",
+        _CALIBRATE,
+        _CALIBRATE_EPILOG,
+        "method",
+        _METHODS,
+    ),
+    ("gripper", "make a gripper file", _GRIPPER, None, "way", _WAYS),
+)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all subcommands; each sets ``command``."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -96,17 +115,12 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in _COMMANDS:
         command.add_to(commands)
-    calibrate = commands.add_parser(
-        "calibrate",
-        help="calibrate from images: camera, hand/eye and more",
-        description=_CALIBRATE,
-        epilog=_CALIBRATE_EPILOG,
-        formatter_class=raw,
-    )
-    methods = calibrate.add_subparsers(title="methods", metavar="METHOD", required=True)
-    for method in _METHODS:
-        method.add_to(methods)
-    gripper.add_to(commands)
+    for name, summary, description, epilog, called, members in _GROUPS:
+        group = commands.add_parser(
+            name, help=summary, description=description, epilog=epilog, formatter_class=raw
+        ).add_subparsers(title=f"{called}s", metavar=called.upper(), required=True)
+        for member in members:
+            member.add_to(group)
     for command in _LAST:
         command.add_to(commands)
     return parser
@@ -127,7 +141,7 @@ class _PrintCompletion(argparse.Action):
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line (default: the process's own) return its exit code; wrong usage raises ``SystemExit(2)``."""
     parser = build_parser()
-    chosen = parser.parse_args(arguments)
+    chosen = parser.parse_args(arguments, Arguments())
     if not hasattr(chosen, "command"):
         parser.print_help()
         return 0
@@ -150,7 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _in_words(error: InputError | NoResultError, arguments: argparse.Namespace) -> str:
+def _in_words(error: InputError | NoResultError, arguments: Arguments) -> str:
     """The line that says it; where a function's argument is wrong, the option stands in front."""
     command: Command = arguments.command
     if isinstance(error, InputError):

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli.common import (
     REQUIRED,
+    Arguments,
     Command,
     arm_noise,
-    check_outputs,
-    command_line,
+    note,
     positive_number,
     progress_bar,
     whole_number,
-    write,
-    write_document,
-    write_picture,
     writing,
 )
 from gripmon.model.errors import InputError
@@ -29,14 +25,6 @@ if TYPE_CHECKING:
     from gripmon.laser.setup import LaserCalibration
 
 LONGEST_ARM_M = 20.0
-_LASER = """\
-Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
-plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
-row for each spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
-base_T_ee as tx_m, ty_m, tz_m with qx, qy, qz, qw or with rx_rad, ry_rad, rz_rad, or as m00 to m33; in
-YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of three orientations
-or more, better nine, the end-effector is shifted along three directions without turning: ten spots."""
-
 _LASER_OPTIONS = """
 DATA...               table of samples: .csv, .yaml or .json
 --camera CAMERA.yaml  the camera: a file of gripmon calibrate intrinsics
@@ -61,15 +49,6 @@ _LASER_EXAMPLES = """\
 
 exit codes: 0 written; 2 wrong usage or files; 3 the spots can't be calibrated from, and why:
 nothing is written then"""
-
-_ROBOT_WORLD = """\
-Calibrate a fixed camera against an arm that holds a target, or with --eye-in-hand a camera on the arm
-against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
-DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
-qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
-or image, from which --camera and --target find it (a charuco board, or a chequerboard with an even and
-an odd number of corners, wholly in view: others don't tell which way up they are).
-Turn the hand about at least two axes; ten poses or more are good."""
 
 _ROBOT_WORLD_OPTIONS = """
 DATA...               table of poses: .csv, .yaml or .json
@@ -96,40 +75,44 @@ def _reach(text: str) -> float:
 
 
 @Command(
-    "laser", "a fixed camera, its plane and a laser pointer on the arm", _LASER, _LASER_OPTIONS, _LASER_EXAMPLES,
+    "laser", "a fixed camera, its plane and a laser pointer on the arm", _LASER_OPTIONS, _LASER_EXAMPLES,
     camera=REQUIRED, out=REQUIRED, arm_noise=arm_noise, reach=_reach,
     poses={"type": whole_number(1, 200, "isn't a number of poses; 1 to 200"), "default": 10},
 )  # fmt: skip
-def laser(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate laser``."""
+def laser(arguments: Arguments) -> None:
+    """Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
+    plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
+    row for each spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
+    base_T_ee as tx_m, ty_m, tz_m with qx, qy, qz, qw or with rx_rad, ry_rad, rz_rad, or as m00 to m33; in
+    YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of three orientations
+    or more, better nine, the end-effector is shifted along three directions without turning: ten spots.
+    """
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
     from gripmon.laser.samples import plan_table
     from gripmon.model.provenance import provenance_of
     from gripmon.record.spots import write_calibration
 
-    check_outputs(arguments, "out", "picture")
+    arguments.check_outputs("out", "picture")
     if arguments.plan is not None and arguments.reach is None:
         raise InputError("--plan needs --reach: how far the arm reaches; metres")
-    check_outputs(arguments, "recording", "plan")
+    arguments.check_outputs("recording", "plan")
     noise = None if arguments.arm_noise is None else PoseNoise(*arguments.arm_noise)
     found = calibrate_laser(
         arguments.data, read_camera(arguments.camera), refine_lens=arguments.refine_lens, arm_noise=noise,
         progress=progress_bar,
     )  # fmt: skip
-    for line in found.unseen:
-        print(line, file=sys.stderr)
+    note(found.unseen)
     planned = None if arguments.plan is None else found.plan(arguments.reach, arguments.poses)
     inputs = [*arguments.data, arguments.camera, *found.files]
-    written = found.document(provenance_of(command_line(arguments), inputs, SEED))
-    if arguments.picture is not None:
-        write_picture(found.picture(), arguments.picture)
+    written = found.document(provenance_of(arguments.command_line(), inputs, SEED))
+    arguments.save("picture", found.picture)
     if arguments.recording is not None:
         with writing(arguments.recording, "--recording"):
             write_calibration(arguments.recording, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
     if planned is not None:
-        write(plan_table(planned), arguments.plan, "--plan")
-    write_document(written, arguments.out)
+        arguments.save("plan", plan_table(planned))
+    arguments.save("out", written)
     print("\n".join([*_laser_lines(written), *_plan_lines(planned), f"written: {arguments.out}"]))
 
 
@@ -168,34 +151,36 @@ _TILTS = ("plane.tilt_a", "plane.tilt_b", "laser.turn_a", "laser.turn_b")
 
 
 @Command(
-    "robot-world", "camera and arm, from poses of a target on the hand", _ROBOT_WORLD, _ROBOT_WORLD_OPTIONS,
-    _ROBOT_WORLD_EXAMPLES, out=REQUIRED,
+    "robot-world", "camera and arm, from poses of a target on the hand", _ROBOT_WORLD_OPTIONS, _ROBOT_WORLD_EXAMPLES,
+    out=REQUIRED,
 )  # fmt: skip
-def robot_world(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate robot-world``."""
+def robot_world(arguments: Arguments) -> None:
+    """Calibrate a fixed camera against an arm that holds a target, or with --eye-in-hand a camera on the arm
+    against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
+    DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
+    qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
+    or image, from which --camera and --target find it (a charuco board, or a chequerboard with an even and
+    an odd number of corners, wholly in view: others don't tell which way up they are).
+    Turn the hand about at least two axes; ten poses or more are good.
+    """
     from gripmon.calibrate.api import calibrate_robot_world
     from gripmon.calibrate.documents import robot_world_document
     from gripmon.calibrate.tables import read_arm_poses
     from gripmon.daemon.calibrations import read_given_camera, target_of
     from gripmon.model.provenance import provenance_of
 
-    check_outputs(arguments, "out")
+    arguments.check_outputs("out")
     target = None if arguments.target is None else target_of(arguments.target)
     camera = None if arguments.camera is None else read_given_camera(arguments.camera)
     poses = read_arm_poses(arguments.data, camera, target, progress_bar)
-    for line in poses.unseen:
-        print(line, file=sys.stderr)
+    note(poses.unseen)
     found = calibrate_robot_world(
-        poses.base_T_ee,
-        poses.cam_T_target,
-        poses.covariance,
-        common=poses.common,
-        eye_in_hand=arguments.eye_in_hand,
-    )
+        poses.base_T_ee, poses.cam_T_target, poses.covariance, common=poses.common, eye_in_hand=arguments.eye_in_hand,
+    )  # fmt: skip
     inputs = [*arguments.data, *([arguments.camera, *poses.images] if poses.images else [])]
-    provenance = provenance_of(command_line(arguments), inputs)
+    provenance = provenance_of(arguments.command_line(), inputs)
     written = robot_world_document(found, poses.names, provenance, eye_in_hand=arguments.eye_in_hand)
-    write_document(written, arguments.out)
+    arguments.save("out", written)
     print("\n".join([*_robot_world_lines(written), f"written: {arguments.out}"]))
 
 

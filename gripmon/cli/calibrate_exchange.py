@@ -7,7 +7,7 @@ import re
 import sys
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Command, check_outputs, command_line, refuse_without, write, write_document
+from gripmon.cli.common import REQUIRED, Arguments, Command, input_errors, note
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,16 +15,7 @@ if TYPE_CHECKING:
 
 CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
-_FRAMES = {
-    "gripper_frame": "gripper_tcp",
-    "camera_frame": "camera_optical_frame",
-    "robot_base_frame": "base_link",
-    "tracking_marker_frame": "calibration_plate",
-}
-
-_IMPORT = """\
-Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
-FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content."""
+_FRAMES = ("gripper_frame", "camera_frame", "robot_base_frame", "tracking_marker_frame")
 
 _IMPORT_OPTIONS = """
 FILE                file of the other program
@@ -43,15 +34,6 @@ _IMPORT_EXAMPLES = """\
   gripmon calibrate import intrinsics.xml --size 1280x960 --out camera.yaml
 
 exit codes: 0 written; 2 wrong usage or files: nothing is written then"""
-
-_EXPORT = """\
-Write a camera as ROS camera_info, Kalibr camchain, OpenCV FileStorage or mrcal .cameramodel, or a
-hand/eye transform as a tf2 static transform command, a URDF joint with its origin, an easy_handeye2
-file or JSON.  CALIBRATION is a file of gripmon calibrate, a configuration, a monitor's state file
-(its reference in force) or estimates.jsonl (the last valid one).
-
-A hand/eye transform is written as the camera's pose in the gripper's frame (origin at the TCP, x
-across the jaws, z out of the gripper), as a robot's tree runs; --gripper-in-camera turns it round."""
 
 _EXPORT_OPTIONS = """
 CALIBRATION  file with the calibration
@@ -94,17 +76,19 @@ def _name(text: str) -> str:
 
 
 @Command(
-    "import", "a camera from a file of ROS, Kalibr, OpenCV or mrcal", _IMPORT, _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
+    "import", "a camera from a file of ROS, Kalibr, OpenCV or mrcal", _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
     format={"choices": CAMERA_FORMATS}, size=_size, fisheye={"default": None}, out=REQUIRED,
 )  # fmt: skip
-def import_(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate import``."""
+def import_(arguments: Arguments) -> None:
+    """Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
+    FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content.
+    """
     from gripmon.daemon.calibrations import import_camera
 
-    check_outputs(arguments, "out")
+    arguments.check_outputs("out")
     said = arguments.camera, arguments.size, arguments.fisheye
-    kind, found = import_camera(arguments.file, arguments.format, *said, command_line(arguments))
-    write_document(found, arguments.out)
+    kind, found = import_camera(arguments.file, arguments.format, *said, arguments.command_line())
+    arguments.save("out", found)
     camera = found.camera
     lens = camera.__struct_config__.tag
     print(f"{kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px")
@@ -112,57 +96,61 @@ def import_(arguments: argparse.Namespace) -> None:
 
 
 @Command(
-    "export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2", _EXPORT, _EXPORT_OPTIONS,
-    _EXPORT_EXAMPLES, {"frames of a hand/eye transform": (None, _EXPORT_FRAMES)},
+    "export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2", _EXPORT_OPTIONS, _EXPORT_EXAMPLES,
+    {"frames of a hand/eye transform": (None, _EXPORT_FRAMES)},
     format={"required": True, "choices": (*CAMERA_FORMATS, *HAND_EYE_FORMATS)}, name=_name,
 )  # fmt: skip
-def export(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate export``."""
+def export(arguments: Arguments) -> None:
+    """Write a camera as ROS camera_info, Kalibr camchain, OpenCV FileStorage or mrcal .cameramodel, or a
+    hand/eye transform as a tf2 static transform command, a URDF joint with its origin, an easy_handeye2
+    file or JSON.  CALIBRATION is a file of gripmon calibrate, a configuration, a monitor's state file
+    (its reference in force) or estimates.jsonl (the last valid one).
+
+    A hand/eye transform is written as the camera's pose in the gripper's frame (origin at the TCP, x
+    across the jaws, z out of the gripper), as a robot's tree runs; --gripper-in-camera turns it round.
+    """
     from gripmon.daemon.calibrations import export_notes, read_calibrated
 
-    check_outputs(arguments, "out")
+    arguments.check_outputs("out")
     camera = arguments.format in CAMERA_FORMATS
     # An option that would do nothing was meant for something.
-    unused = (*_FRAMES, "gripper_in_camera") if camera else ("fit",)
+    unused = [*_FRAMES, "gripper_in_camera"] if camera else ["fit"]
     if not camera and arguments.format != "easy_handeye2":
-        unused += ("robot_base_frame", "tracking_marker_frame")
-    refuse_without(arguments, unused, f"has no meaning with --format {arguments.format}; leave it out")
+        unused += ["robot_base_frame", "tracking_marker_frame"]
+    arguments.refuse(unused, f"has no meaning with --format {arguments.format}; leave it out")
     source = read_calibrated(arguments.calibration)
-    notes = export_notes(source, command_line(arguments), with_pose=not camera)
+    notes = export_notes(source, arguments.command_line(), with_pose=not camera)
     data = (_camera if camera else _hand_eye)(source, notes, arguments)
     if arguments.out is None:
         sys.stdout.write(data.decode())
     else:
-        write(data, arguments.out)
+        arguments.save("out", data)
         print(f"written: {arguments.out}")
 
 
-def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
+def _camera(source: Calibrated, notes: tuple[str, ...], arguments: Arguments) -> bytes:
     from gripmon.calibrate.interchange import write_camera
 
     if source.lens is None:
         right = "a camera calibration, a hand/eye calibration or a configuration"
         raise InputError(f"{source.name}: is {source.kind} without a camera; {right}")
     suffix = "" if arguments.out is None else arguments.out.suffix
-    name = arguments.name or "gripmon"
     exported = write_camera(
-        source.lens, arguments.format, notes, name=name, file=source.name, suffix=suffix, fit=arguments.fit
-    )
-    for warning in exported.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        source.lens, arguments.format, notes, name=arguments.name or "gripmon", file=source.name, suffix=suffix,
+        fit=arguments.fit,
+    )  # fmt: skip
+    note(f"warning: {warning}" for warning in exported.warnings)
     return exported.data
 
 
-def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
+def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: Arguments) -> bytes:
     from gripmon.calibrate.interchange import HandEye, write_hand_eye
 
     if source.cam_T_grip is None:
         right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
         raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
-    frames = {key: getattr(arguments, key) or default for key, default in _FRAMES.items()}
+    frames = {key: name for key in _FRAMES if (name := getattr(arguments, key))}
     turned, name = arguments.gripper_in_camera, arguments.name or "gripmon"
-    try:
+    with input_errors("calibrate export"):
         hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=turned, name=name, **frames)
         return write_hand_eye(hand_eye, arguments.format, notes).encode()
-    except ValueError as error:
-        raise InputError(f"calibrate export: {error}") from None

@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import (
-    REQUIRED,
-    Command,
-    check_outputs,
-    command_line,
-    progress_bar,
-    write_document,
-    write_picture,
-)
+from gripmon.cli.common import REQUIRED, Arguments, Command, note, progress_bar
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.calibrate.api import CameraFromViews
 
 MODELS = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
-
-_DESCRIPTION = """\
-Calibrate a camera from images of a flat target, each of which may show a part of it: focal lengths,
-principal point and lens with their standard deviations.  Best are ten to thirty images that fill the
-view, corners included, the target tilted by 20 to 45 degrees to different sides.  From one image
-comes a calibration with the principal point at the image's centre and square pixels, as in the
-self-viewing method."""
 
 _OPTIONS = """
 IMAGE...               image file, or folder with images
@@ -57,11 +40,16 @@ nothing is written then"""
 
 
 @Command(
-    "intrinsics", "a camera from images of a flat target", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    target=REQUIRED, model={"choices": (*MODELS, "auto")}, fix={"default": []}, out=REQUIRED,
+    "intrinsics", "a camera from images of a flat target", _OPTIONS, _EXAMPLES, target=REQUIRED,
+    model={"choices": (*MODELS, "auto")}, fix={"default": []}, out=REQUIRED,
 )  # fmt: skip
-def intrinsics(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate intrinsics``."""
+def intrinsics(arguments: Arguments) -> None:
+    """Calibrate a camera from images of a flat target, each of which may show a part of it: focal lengths,
+    principal point and lens with their standard deviations.  Best are ten to thirty images that fill the
+    view, corners included, the target tilted by 20 to 45 degrees to different sides.  From one image
+    comes a calibration with the principal point at the image's centre and square pixels, as in the
+    self-viewing method.
+    """
     import cv2
 
     from gripmon.calibrate.api import calibrate_intrinsics, draw_maps
@@ -70,22 +58,20 @@ def intrinsics(arguments: argparse.Namespace) -> None:
     from gripmon.model.provenance import provenance_of
 
     cv2.setNumThreads(1)
-    check_outputs(arguments, "out", "picture")
+    arguments.check_outputs("out", "picture")
     target, fixed, paths = target_of(arguments.target), _fixed(arguments), image_paths(arguments.image)
     found = calibrate_intrinsics(paths, target, model=arguments.model, fixed=fixed, progress=progress_bar)
-    for name, reason in found.not_found.items():
-        print(f"{name}: {reason}", file=sys.stderr)
-    document = found.document(provenance_of(command_line(arguments), paths))
-    if arguments.picture is not None:
-        write_picture(draw_maps(found.fit, found.sightings), arguments.picture)
-    write_document(document, arguments.out)
+    note(f"{name}: {reason}" for name, reason in found.not_found.items())
+    document = found.document(provenance_of(arguments.command_line(), paths))
+    arguments.save("picture", lambda: draw_maps(found.fit, found.sightings))
+    arguments.save("out", document)
     if arguments.json:
         print(json.dumps({"out": str(arguments.out), **found.values()}, indent=2))
     else:
         print("\n".join([*_summary(found, fixed), f"written: {arguments.out}"]))
 
 
-def _fixed(arguments: argparse.Namespace) -> dict[str, float | None]:
+def _fixed(arguments: Arguments) -> dict[str, float | None]:
     """What is held, and at which value."""
     from gripmon.calibrate.api import check_fixed
 

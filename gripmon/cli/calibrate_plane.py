@@ -2,50 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import (
-    REQUIRED,
-    Command,
-    check_outputs,
-    command_line,
-    jaw_opening,
-    jaw_range,
-    progress_bar,
-    write_document,
-    write_picture,
-)
+from gripmon.cli.common import REQUIRED, Arguments, Command, jaw_opening, jaw_range, note, progress_bar
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.calibrate.plane import Coincidence
     from gripmon.calibrate.plane_average import PlaneCalibration
     from gripmon.teach.hand_eye import HandEyeOnPlate
-
-_DESCRIPTION = """\
-Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
-Plane Coincidence Constraint of the self-viewing method): the contact plane of its fingertips is the
-plate.  The fingers may hide part of the pattern.  Several images, the gripper put down again for each,
-are averaged.
-
-The gripper is known (--gripper), or it is inferred from the same images (--infer): the four innermost
-corners of two parallel fingertips form a rectangle about the TCP.
-
---corners names a file with rough positions, several pixels off is fine:
-  corners:
-    L_in_near: [241, 240]      # name: [u, v] in px
-Names are those of the gripper file (two at least; those that are given are used), or with --infer
-  left_inner_near, left_inner_far, right_inner_near, right_inner_far
-where near is the upper one in an image that shows the left finger on the left, and, on the next edge of
-each, one or two of
-  left_outer_near   the contact face's outer corner
-  left_end_near     any point on an edge in the contact plane, whose end is out of view
-  left_rise_near    any point on an edge that rises from the contact plane
-With --config, the configuration's calibration tells where the corners are expected, good to some pixels."""
 
 _OPTIONS = """
 IMAGE...                image file, or folder with images
@@ -79,11 +46,30 @@ nothing is written then"""
 
 
 @Command(
-    "plane", "camera to gripper, from images of it on a plate", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    target=REQUIRED, jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED,
+    "plane", "camera to gripper, from images of it on a plate", _OPTIONS, _EXAMPLES, target=REQUIRED,
+    jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
-def plane(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon calibrate plane``."""
+def plane(arguments: Arguments) -> None:
+    """Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
+    Plane Coincidence Constraint of the self-viewing method): the contact plane of its fingertips is the
+    plate.  The fingers may hide part of the pattern.  Several images, the gripper put down again for each,
+    are averaged.
+
+    The gripper is known (--gripper), or it is inferred from the same images (--infer): the four innermost
+    corners of two parallel fingertips form a rectangle about the TCP.
+
+    --corners names a file with rough positions, several pixels off is fine:
+      corners:
+        L_in_near: [241, 240]      # name: [u, v] in px
+    Names are those of the gripper file (two at least; those that are given are used), or with --infer
+      left_inner_near, left_inner_far, right_inner_near, right_inner_far
+    where near is the upper one in an image that shows the left finger on the left, and, on the next edge of
+    each, one or two of
+      left_outer_near   the contact face's outer corner
+      left_end_near     any point on an edge in the contact plane, whose end is out of view
+      left_rise_near    any point on an edge that rises from the contact plane
+    With --config, the configuration's calibration tells where the corners are expected, good to some pixels.
+    """
     import cv2
 
     from gripmon.daemon.calibrations import is_target_file, plane_inputs, target_of
@@ -103,28 +89,24 @@ def plane(arguments: argparse.Namespace) -> None:
         paths, given.camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
         cam_T_grip=given.cam_T_grip, progress=progress_bar,
     )  # fmt: skip
-    for reason in found.not_used:
-        print(f"not used: {reason}", file=sys.stderr)
+    note(f"not used: {reason}" for reason in found.not_used)
     # As itself where a file named it: the hand/eye calibration holds its target nowhere else.
     described = name_of(target) if is_target_file(arguments.target) else arguments.target
-    provenance = provenance_of(command_line(arguments, target=described), list(dict.fromkeys([*paths, *given.files])))
+    provenance = provenance_of(arguments.command_line(target=described), list(dict.fromkeys([*paths, *given.files])))
     made = found.gripper(arguments.name, arguments.jaw_range, arguments.jaw_opening, provenance)
-    written = [arguments.gripper_out, arguments.out] if arguments.infer else [arguments.out]
-    if arguments.infer:
-        write_document(gripper_values(made.model), arguments.gripper_out, "--gripper-out")
-    write_document(found.document(made, provenance), arguments.out)
-    for warning in found.fit.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    written = [path for path in (arguments.gripper_out, arguments.out) if path is not None]
+    arguments.save("gripper_out", lambda: gripper_values(made.model))
+    arguments.save("out", found.document(made, provenance))
+    note(f"warning: {warning}" for warning in found.fit.warnings)
     notes = [*given.notes, *found.notes]
     if arguments.json:
         print(json.dumps({**found.values(), "notes": notes, "written": [str(path) for path in written]}, indent=2))
     else:
         print("\n".join([*_lines(found, notes), *(f"written: {path}" for path in written)]))
-    if arguments.picture is not None:
-        write_picture(found.picture(), arguments.picture)
+    arguments.save("picture", found.picture)
 
 
-def _check_options(arguments: argparse.Namespace) -> None:
+def _check_options(arguments: Arguments) -> None:
     """Refuse, before any work, options that don't go together and files that can't be written."""
     infer, config, corners = arguments.infer, arguments.config, arguments.corners
     known = "has no effect with a gripper that is known; --infer, or leave it out"
@@ -143,7 +125,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
         wrong = "nothing says where the gripper is in the image; --corners FILE.yaml, or --config CONFIG"
     if wrong:
         raise InputError(f"calibrate plane: {wrong}")
-    check_outputs(arguments, "out", "gripper_out", "picture")
+    arguments.check_outputs("out", "gripper_out", "picture")
 
 
 def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:

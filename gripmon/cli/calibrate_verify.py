@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import Command, positive_number, refuse_without
+from gripmon.cli.common import Arguments, Command, positive_number
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
@@ -17,15 +17,6 @@ if TYPE_CHECKING:
     from gripmon.calibrate.verify import Calibrated, CameraDifference, HandEyeDifference, Verdict
 
 DEFAULT_LEVEL = 0.01
-
-_DESCRIPTION = """\
-Compare two hand/eye calibrations (difference at the TCP, mm and degrees along the camera's axes), two
-cameras (by what they do: the largest difference in the image), or a hand/eye calibration with fresh
-images of the gripper: on the calibration plate (--target), or anywhere, measured as the monitor does;
-then three or more before different backgrounds, since one that contradicts the others is left out.
-Each may also be a configuration, a monitor's state file (its reference in force) or estimates.jsonl
-(the last valid one).  How much of a difference is chance follows from both covariances; what they
-share, such as the camera, makes differences look less significant than they are."""
 
 _OPTIONS = """
 A                    calibration
@@ -61,13 +52,21 @@ def _share(text: str) -> float:
 
 
 @Command(
-    "verify", "are two calibrations the same, does one still hold", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "verify", "are two calibrations the same, does one still hold", _OPTIONS, _EXAMPLES,
     level={"type": _share, "default": DEFAULT_LEVEL}, jaw_opening=positive_number, tolerance_mm=positive_number,
     tolerance_deg=positive_number, tolerance_px=positive_number,
 )  # fmt: skip
-def verify(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon calibrate verify``."""
+def verify(arguments: Arguments) -> int:
+    """Compare two hand/eye calibrations (difference at the TCP, mm and degrees along the camera's axes), two
+    cameras (by what they do: the largest difference in the image), or a hand/eye calibration with fresh
+    images of the gripper: on the calibration plate (--target), or anywhere, measured as the monitor does;
+    then three or more before different backgrounds, since one that contradicts the others is left out.
+    Each may also be a configuration, a monitor's state file (its reference in force) or estimates.jsonl
+    (the last valid one).  How much of a difference is chance follows from both covariances; what they
+    share, such as the camera, makes differences look less significant than they are.
+    """
     from gripmon.calibrate.api import verify
+    from gripmon.calibrate.verify import HandEyeDifference
     from gripmon.daemon.calibrations import read_calibrated
 
     mm, deg, px = arguments.tolerance_mm, arguments.tolerance_deg, arguments.tolerance_px
@@ -76,23 +75,21 @@ def verify(arguments: argparse.Namespace) -> int:
     first = read_calibrated(Path(arguments.a))
     second, doubts = _second(first, arguments)
     found = verify(
-        first,
-        second,
-        level=arguments.level,
-        tolerance_m=None if mm is None else 1e-3 * mm,
-        tolerance_rad=None if deg is None else math.radians(deg),
-        tolerance_px=px,
-    )
+        first, second, level=arguments.level, tolerance_m=None if mm is None else 1e-3 * mm,
+        tolerance_rad=None if deg is None else math.radians(deg), tolerance_px=px,
+    )  # fmt: skip
     found = replace(found, warnings=(*doubts, *found.warnings))
     given = mm is not None or px is not None
     if arguments.json:
         print(json.dumps(found.values() | {"within_tolerance": found.within if given else None}))
     else:
-        print("\n".join([*_lines(found), *(f"warning: {w}" for w in found.warnings), _verdict(found, given=given)]))
+        apart = found.difference
+        lines = _hand_eye_lines(apart) if isinstance(apart, HandEyeDifference) else _camera_lines(apart)
+        print("\n".join([*lines, *(f"warning: {w}" for w in found.warnings), _verdict(found, given=given)]))
     return EXIT_DONE if found.same else EXIT_FAILED
 
 
-def _second(first: Calibrated, arguments: argparse.Namespace) -> tuple[Calibrated, tuple[str, ...]]:
+def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[str, ...]]:
     """The other calibration, or what images show; and what is doubtful about it."""
     from gripmon.daemon.calibrations import measure_again, read_calibrated, target_of
     from gripmon.model.images import IMAGE_SUFFIXES
@@ -101,17 +98,10 @@ def _second(first: Calibrated, arguments: argparse.Namespace) -> tuple[Calibrate
     if any(Path(n).is_dir() or Path(n).suffix.lower() in IMAGE_SUFFIXES for n in names):
         target = None if arguments.target is None else target_of(arguments.target)
         return measure_again(first, names, arguments.config, target, jaw_opening_m=arguments.jaw_opening)
-    refuse_without(arguments, ("config", "target", "jaw_opening"), "has a meaning only with images; leave it out")
+    arguments.refuse(("config", "target", "jaw_opening"), "has a meaning only with images; leave it out")
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(Path(names[0])), ()
-
-
-def _lines(found: Verdict) -> list[str]:
-    from gripmon.calibrate.verify import HandEyeDifference
-
-    difference = found.difference
-    return _hand_eye_lines(difference) if isinstance(difference, HandEyeDifference) else _camera_lines(difference)
 
 
 def _verdict(found: Verdict, *, given: bool) -> str:

@@ -6,20 +6,11 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Command, make_directory, writing
+from gripmon.cli.common import REQUIRED, Arguments, Command, input_errors, make_directory, writing
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.io.wire.certificates import Issued
-
-_DESCRIPTION = """\
-Make a small private certificate authority in a folder, and certificates for those who shall talk to
-each other: the names that the access rules of configs/zenoh/router.json5 know. Every robot has two of
-its own, monitor-NAME and robot-NAME (gripper and camera driver), which can't speak for another robot.
-What is there already stays, so that names can be added later. Private keys can be read by their owner
-alone.
-
-The authority's key, ca-key.pem, makes more certificates: keep it away from the robots."""
 
 _OPTIONS = """
 [NAME...]         common names; default: router, controller, operator and those of the robots
@@ -53,11 +44,18 @@ def _name(text: str) -> str:
 
 
 @Command(
-    "certificates", "make keys and certificates for mutual TLS", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    name=_name, robot={"default": []}, out=REQUIRED, host={"default": []},
+    "certificates", "make keys and certificates for mutual TLS", _OPTIONS, _EXAMPLES, name=_name, robot={"default": []},
+    out=REQUIRED, host={"default": []},
 )  # fmt: skip
-def certificates(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon certificates``."""
+def certificates(arguments: Arguments) -> None:
+    """Make a small private certificate authority in a folder, and certificates for those who shall talk to
+    each other: the names that the access rules of configs/zenoh/router.json5 know. Every robot has two of
+    its own, monitor-NAME and robot-NAME (gripper and camera driver), which can't speak for another robot.
+    What is there already stays, so that names can be added later. Private keys can be read by their owner
+    alone.
+
+    The authority's key, ca-key.pem, makes more certificates: keep it away from the robots.
+    """
     try:
         from gripmon.io.wire.certificates import Authority, read
     except ImportError:
@@ -67,24 +65,19 @@ def certificates(arguments: argparse.Namespace) -> None:
 
     if arguments.rules and not arguments.robot:
         raise InputError("certificates: --rules for whom? add --robot NAME")
-    try:
+    with input_errors("certificates: --robot"):
         wanted = wanted_names(arguments.name, arguments.robot, arguments.host)
-    except ValueError as error:
-        raise InputError(f"certificates: --robot: {error}") from None
     folder = make_directory(arguments.out)
     if arguments.rules:
         _add_rules(arguments)
-    try:
-        with writing(folder):
-            authority = Authority(folder)
-            if authority.is_new:
-                print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
-            for name, hosts in wanted.items():
-                made = authority.issue(name, hosts)
-                issued = _issued(made, read(folder / f"{name}.pem"), hosts)
-                print(f"{folder / name}.pem, {name}-key.pem: {issued}")
-    except ValueError as error:
-        raise error if isinstance(error, InputError) else InputError(f"certificates: {error}") from None
+    with input_errors("certificates"), writing(folder):
+        authority = Authority(folder)
+        if authority.is_new:
+            print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
+        for name, hosts in wanted.items():
+            made = authority.issue(name, hosts)
+            issued = _issued(made, read(folder / f"{name}.pem"), hosts)
+            print(f"{folder / name}.pem, {name}-key.pem: {issued}")
 
 
 def _issued(made: bool, issued: Issued, hosts: list[str]) -> str:
@@ -96,7 +89,7 @@ def _issued(made: bool, issued: Issued, hosts: list[str]) -> str:
     return f"made, {what}" if made else f"there already, left alone: {what}; to change that, delete both files"
 
 
-def _add_rules(arguments: argparse.Namespace) -> None:
+def _add_rules(arguments: Arguments) -> None:
     """Put rules for the robots into a router's file."""
     from gripmon.io.wire.rules import add_robots
 

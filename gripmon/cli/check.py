@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import check_laser, check_text, sweep
-from gripmon.cli.common import Command, arm_noise, positive_number, progress_bar, refuse_without
+from gripmon.cli.common import Arguments, Command, arm_noise, positive_number, progress_bar
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
     from gripmon.laser.judgement import SpotWatchSettings
-
-_DESCRIPTION = """\
-Validate a configuration, its gripper file and its source, and say of each thing that matters whether
-it is in order: OK, WARN (the monitor runs, but not all that is expected of it will come) or FAIL (it
-can't do its work).
-
-With --verbose, also what the calibration expects to see: where the fingertip corners are in the image
-(px), which of them and which edges are visible, how far away the gripper is (mm), how exact one frame
-will be along each axis, what the view can't separate (an unknown jaw opening and the distance), whether
-its corners suffice to recalibrate, how far camera and jaws may move until too little is in view.  Of a
-second camera (a configuration with a section laser): its calibration, what is known of its errors, and
-what fresh spots would show.
-
-With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
-camera, plane and laser pointer fresh spots would tell, or do tell.
-
-With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
-anyone drills a hole."""
 
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
@@ -70,26 +51,42 @@ _MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
 @Command(
-    "check", "validate a configuration and show what it expects to see", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "check", "validate a configuration and show what it expects to see", _OPTIONS, _EXAMPLES,
     {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
     arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
 )  # fmt: skip
-def check(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon check``."""
+def check(arguments: Arguments) -> int:
+    """Validate a configuration, its gripper file and its source, and say of each thing that matters whether
+    it is in order: OK, WARN (the monitor runs, but not all that is expected of it will come) or FAIL (it
+    can't do its work).
+
+    With --verbose, also what the calibration expects to see: where the fingertip corners are in the image
+    (px), which of them and which edges are visible, how far away the gripper is (mm), how exact one frame
+    will be along each axis, what the view can't separate (an unknown jaw opening and the distance), whether
+    its corners suffice to recalibrate, how far camera and jaws may move until too little is in view.  Of a
+    second camera (a configuration with a section laser): its calibration, what is known of its errors, and
+    what fresh spots would show.
+
+    With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
+    camera, plane and laser pointer fresh spots would tell, or do tell.
+
+    With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
+    anyone drills a hole.
+    """
     if arguments.laser is not None and arguments.sweep:
         raise InputError("--sweep: not with --laser; one of them")
     if not arguments.sweep:
-        refuse_without(arguments, sweep.NAMES, "only has a meaning for a sweep; add --sweep")
+        arguments.refuse(sweep.NAMES, "only has a meaning for a sweep; add --sweep")
     if arguments.laser is not None:
         return _check_laser(arguments)
     names, why = ("arm_noise", *_MOST), "only has a meaning for a laser calibration; add --laser LASER.yaml"
-    refuse_without(arguments, names, why)
+    arguments.refuse(names, why)
     if len(arguments.config) != 1:
         raise InputError(f"check: {len(arguments.config)} configurations; one, or --laser LASER.yaml")
     return sweep.run(arguments) if arguments.sweep else _check(arguments)
 
 
-def _check(arguments: argparse.Namespace) -> int:
+def _check(arguments: Arguments) -> int:
     from gripmon.daemon.findings import check_file
 
     found = check_file(arguments.config[0])
@@ -105,7 +102,7 @@ def _check(arguments: argparse.Namespace) -> int:
     return EXIT_FAILED if any(each.level == "FAIL" for each in found.findings) else EXIT_DONE
 
 
-def _check_laser(arguments: argparse.Namespace) -> int:
+def _check_laser(arguments: Arguments) -> int:
     from gripmon.daemon.config.second import read_laser
     from gripmon.laser.api import check_laser as judge
     from gripmon.laser.report import check_values, expectation
@@ -124,7 +121,7 @@ def _check_laser(arguments: argparse.Namespace) -> int:
     return EXIT_DONE if found.verdict == "same" else EXIT_FAILED
 
 
-def _watch_settings(arguments: argparse.Namespace) -> SpotWatchSettings:
+def _watch_settings(arguments: Arguments) -> SpotWatchSettings:
     from gripmon.laser.judgement import SpotWatchSettings
 
     given: dict[str, Any] = {}

@@ -51,7 +51,8 @@ def details(report: forecasts.Forecast) -> list[str]:
     lines += [_corner_line(corner, width) for corner in report.corners]
     lines += _accuracy_lines(report.accuracy)
     lines.append(f"promise    {report.promise}")
-    return lines + _in_view_lines(report.in_view)
+    view = report.in_view
+    return [*lines, *_border_lines(view), *_camera_lines(view), *_jaw_lines(view.jaw_travel)]
 
 
 def _camera_line(camera: forecasts.CameraValues) -> str:
@@ -169,10 +170,6 @@ def _mm(values: Sequence[float]) -> str:
 
 def _degrees(values: Sequence[float]) -> str:
     return "({:+.3f}, {:+.3f}, {:+.3f})".format(*(math.degrees(v) for v in values))
-
-
-def _in_view_lines(values: forecasts.InView) -> list[str]:
-    return [*_border_lines(values), *_camera_lines(values), *_jaw_lines(values.jaw_travel)]
 
 
 def _border_lines(values: forecasts.InView) -> list[str]:

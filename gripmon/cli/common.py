@@ -6,19 +6,17 @@ Nothing heavy at the top: this is imported for ``--help``.
 from __future__ import annotations
 
 import argparse
+import inspect
 import math
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 from gripmon.model.errors import InputError
-
-if TYPE_CHECKING:
-    from gripmon.model.records import Image
 
 REQUIRED = {"required": True}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
@@ -39,7 +37,8 @@ PORT_OPTIONS = """
 
 
 class Command:
-    """A command's declaration, and the decorator of the function that carries it out.
+    """A command's declaration, and the decorator of the function that carries it out, whose docstring is the
+    description in ``--help``.
 
     ``options`` is a table like that of ``--help``.  A row is what is typed, two blanks or a new line, and its meaning,
     which goes on in lines that are indented: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most
@@ -53,33 +52,31 @@ class Command:
         self,
         name: str,
         summary: str,
-        description: str,
         options: str,
         examples: str,
         groups: Mapping[str, tuple[str | None, str]] | None = None,
         /,
         **more: Any,
     ) -> None:
-        self._name, self._summary, self._texts = name, summary, (description, f"examples:\n{examples}")
+        self._name, self._summary, self._epilog = name, summary, f"examples:\n{examples}"
         self._tables, self._more = {"": (None, options), **(groups or {})}, more
         self.arguments: dict[str, str] = {}  # by name: the option, empty for a positional one
         self.defaults: dict[str, Any] = {}
         self.prog = ""
 
-    def __call__(self, handler: Callable[[argparse.Namespace], int | None]) -> Command:
+    def __call__(self, handler: Callable[[Arguments], int | None]) -> Command:
         self._handler = handler
         return self
 
-    def run(self, arguments: argparse.Namespace) -> int:
+    def run(self, arguments: Arguments) -> int:
         """Carry it out; the exit code."""
         return self._handler(arguments) or 0
 
     def add_to(self, commands: Any) -> None:
         """Add it below a parser."""
-        description, epilog = self._texts
-        raw = argparse.RawDescriptionHelpFormatter
+        raw, description = argparse.RawDescriptionHelpFormatter, inspect.getdoc(self._handler)
         parser: argparse.ArgumentParser = commands.add_parser(
-            self._name, help=self._summary, description=description, epilog=epilog, formatter_class=raw
+            self._name, help=self._summary, description=description, epilog=self._epilog, formatter_class=raw
         )
         parser.set_defaults(command=self)
         self.prog = parser.prog.partition(" ")[2]
@@ -128,27 +125,91 @@ def _rows(table: str) -> list[tuple[str, str]]:
     return rows
 
 
-def command_line(arguments: argparse.Namespace, **instead: Any) -> str:
-    """The command with what was given to it, for a file's provenance; ``instead``: other values than those given."""
-    command: Command = arguments.command
-    words = ["gripmon", *command.prog.split()]
-    for name, option in command.arguments.items():
-        value = instead.get(name, getattr(arguments, name))
-        if name == "json" or value in (None, False, [], command.defaults[name]):
-            continue
-        for each in value if isinstance(value, list) else [value]:
-            words += [option] if option else []
-            if isinstance(each, tuple):
-                each = ("x" if isinstance(each[0], int) else ":").join(f"{part:g}" for part in each)
-            words += [] if each is True else [str(each)]
-    return shlex.join(words)
+class Arguments(argparse.Namespace):
+    """What was given to a command, and what commands do with it; a file or folder is named by its option."""
+
+    def command_line(self, **instead: Any) -> str:
+        """The command with what was given to it, for a file's provenance; ``instead``: values in place of those."""
+        command: Command = self.command
+        words = ["gripmon", *command.prog.split()]
+        for name, option in command.arguments.items():
+            value = instead.get(name, getattr(self, name))
+            if name == "json" or value in (None, False, [], command.defaults[name]):
+                continue
+            for each in value if isinstance(value, list) else [value]:
+                words += [option] if option else []
+                if isinstance(each, tuple):
+                    each = ("x" if isinstance(each[0], int) else ":").join(f"{part:g}" for part in each)
+                words += [] if each is True else [str(each)]
+        return shlex.join(words)
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """End the command with exit code 2 if one of these options was given."""
+        for name in names:
+            if getattr(self, name) not in (None, False):
+                raise InputError(f"{_option(name)}: {why}")
+
+    def network(self) -> dict[str, Any]:
+        """``--connect`` and ``--zenoh-config``, as the clients take them."""
+        if self.connect and self.zenoh_config:
+            raise InputError(f"{self.command.prog}: --connect has no effect beside --zenoh-config; one of them")
+        file = None if self.zenoh_config is None else str(self.zenoh_config)
+        return {"connect": self.connect or (DEFAULT_ENDPOINT,), "zenoh_config_file": file}
+
+    @contextmanager
+    def network_errors(self) -> Iterator[None]:
+        """Where there is no session, the error names the option: no key was written."""
+        from gripmon.io.wire import PublishError
+
+        try:
+            yield
+        except PublishError as error:
+            option = {"connect": "--connect", "zenoh_config": "--zenoh-config"}.get(error.key, error.key)
+            raise InputError(f"{self.command.prog}: {option}: {error.text}") from None
+
+    def check_outputs(self, *names: str) -> None:
+        """Refuse, before any work, files that can't be written, that are there already (without --force), or twice."""
+        written: dict[Path, str] = {}
+        for name in names:
+            path, option = getattr(self, name), _option(name)
+            if path is None:
+                continue
+            other = written.setdefault(path.resolve(), option)
+            if other != option:
+                raise InputError(f"{other} and {option}: both are {path}; different files")
+            make_directory(path.parent, option)
+            if path.is_dir():
+                raise InputError(f"{option} {path}: is a folder; a file")
+            if path.exists() and not getattr(self, "force", True):
+                raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
+            if name == "picture" and path.suffix.lower() not in _PICTURES:
+                raise InputError(f"{option} {path}: has no known ending; .png or .jpg")
+
+    def save(self, name: str, content: Any) -> None:
+        """Write a file, whole or not at all, if it is wanted: bytes, a calibration as YAML, a picture in the format
+        that the file's name ends in; or what a function gives that makes one of them.
+        """
+        path = getattr(self, name)
+        if path is None:
+            return
+        made = content() if callable(content) else content
+        with writing(path, _option(name)):
+            if isinstance(made, bytes):
+                from gripmon.model.atomic import write_atomically
+
+                write_atomically(path, made)
+            elif name == "picture":
+                import cv2
+
+                self.save(name, cv2.imencode(path.suffix, made)[1].tobytes())
+            else:
+                from gripmon.daemon.calibrations import write_document
+
+                write_document(made, path)
 
 
-def refuse_without(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """End the command with exit code 2 if one of these options was given."""
-    for name in names:
-        if getattr(arguments, name) not in (None, False):
-            raise InputError(f"--{name.replace('_', '-')}: {why}")
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def positive_number(text: str) -> float:
@@ -197,38 +258,27 @@ PAGE_PORT = {"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (an
 seed = whole_number(0, _LARGEST_SEED, f"isn't a seed; a whole number, 0 to {_LARGEST_SEED}")
 
 
+def two_numbers(text: str, between: str = ":") -> tuple[float, float] | None:
+    """Both of them; None for another text."""
+    try:
+        first, second = map(float, text.split(between))
+    except ValueError:
+        return None
+    return first, second
+
+
 def arm_noise(text: str) -> tuple[float, float]:
     """An argument M:RAD, standard deviations of an arm's poses."""
-    try:
-        position, rotation = (float(part) for part in text.split(":"))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
-    if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
-        raise argparse.ArgumentTypeError(f"{text} isn't an arm's noise; metres and radians, e.g. 0.0001:0.0002")
-    return position, rotation
+    sigmas = two_numbers(text)
+    if sigmas is None or not (0.0 <= sigmas[0] < 0.1 and 0.0 <= sigmas[1] < 0.5):
+        raise argparse.ArgumentTypeError(f"'{text}' isn't an arm's noise M:RAD; metres, radians, e.g. 0.0001:0.0002")
+    return sigmas
 
 
-def network_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """``--connect`` and ``--zenoh-config``, as the clients take them."""
-    if arguments.connect and arguments.zenoh_config:
-        raise InputError(f"{arguments.command.prog}: --connect has no effect beside --zenoh-config; one of them")
-    file = arguments.zenoh_config
-    return {
-        "connect": arguments.connect or (DEFAULT_ENDPOINT,),
-        "zenoh_config_file": None if file is None else str(file),
-    }
-
-
-@contextmanager
-def network_errors(arguments: argparse.Namespace) -> Iterator[None]:
-    """Where there is no session, the error names the option: no key was written."""
-    from gripmon.io.wire import PublishError
-
-    try:
-        yield
-    except PublishError as error:
-        option = {"connect": "--connect", "zenoh_config": "--zenoh-config"}.get(error.key, error.key)
-        raise InputError(f"{arguments.command.prog}: {option}: {error.text}") from None
+def note(lines: Iterable[str]) -> None:
+    """Tell a person on stderr, beside the results."""
+    for line in lines:
+        print(line, file=sys.stderr)
 
 
 def announcer(verb: str) -> Callable[[str], None]:
@@ -247,54 +297,21 @@ def make_directory(path: Path, option: str = "--out") -> Path:
         raise InputError(f"{option} {error.wrong}") from None
 
 
-def check_outputs(arguments: argparse.Namespace, *names: str) -> None:
-    """Refuse, before any work, files that can't be written; or are there already, of a command with ``--force``; or
-    are one and the same.
-    """
-    written: dict[Path, str] = {}
-    for name in names:
-        path, option = getattr(arguments, name), f"--{name.replace('_', '-')}"
-        if path is None:
-            continue
-        other = written.setdefault(path.resolve(), option)
-        if other != option:
-            raise InputError(f"{other} and {option}: both are {path}; different files")
-        make_directory(path.parent, option)
-        if path.is_dir():
-            raise InputError(f"{option} {path}: is a folder; a file")
-        if path.exists() and not getattr(arguments, "force", True):
-            raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
-        if name == "picture" and path.suffix.lower() not in _PICTURES:
-            raise InputError(f"{option} {path}: has no known ending; .png or .jpg")
-
-
-def check_file(path: Path, option: str = "--out") -> None:
+def check_file(path: Path) -> None:
     """Refuse, before any work, a file that can't be written; it is made but not changed."""
-    with writing(path, option):
+    with writing(path):
         path.open("ab").close()
 
 
-def write(data: bytes, path: Path, option: str = "--out") -> None:
-    """Write a file, whole or not at all."""
-    from gripmon.model.atomic import write_atomically
-
-    with writing(path, option):
-        write_atomically(path, data)
-
-
-def write_document(document: Any, path: Path, option: str = "--out") -> None:
-    """Write a calibration as YAML, whole or not at all."""
-    from gripmon.daemon.calibrations import write_document as write_yaml
-
-    with writing(path, option):
-        write_yaml(document, path)
-
-
-def write_picture(picture: Image, path: Path) -> None:
-    """Write it, whole or not at all, in the format that the file's name ends in."""
-    import cv2
-
-    write(cv2.imencode(path.suffix, picture)[1].tobytes(), path, "--picture")
+@contextmanager
+def input_errors(what: str) -> Iterator[None]:
+    """A ValueError is wrong usage, of ``what``; one that says so itself stays as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{what}: {error}") from None
 
 
 @contextmanager
@@ -306,17 +323,40 @@ def writing(path: Path, option: str = "--out") -> Iterator[None]:
         raise InputError(f"{option} {path}: can't be written ({error.strerror or error}); a file") from None
 
 
-def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[..., None]]:
+@contextmanager
+def progress_bar(total: int | None, unit: str) -> Iterator[Callable[..., None]]:
     """A context that gives a function to call once for each step, with the total if that is known then; it draws on
     stderr, and only for a person.
     """
-    return _Bar(lambda bar: bar.step, total=total, unit=unit) if sys.stderr.isatty() else nullcontext(lambda *_: None)
+    with _bar(total=total, unit=unit) as bar:
+
+        def step(total: int | None = None) -> None:
+            if bar is not None:
+                bar.total = total or bar.total
+                bar.update()
+
+        yield step
 
 
-def reading_bar() -> AbstractContextManager[Callable[[int, int], None]]:
+@contextmanager
+def reading_bar() -> Iterator[Callable[[int, int], None]]:
     """The same of bytes: the function takes those that are read and all."""
-    shown = {"unit": "B", "unit_scale": True, "desc": "reading", "leave": False}
-    return _Bar(lambda bar: bar.reached, **shown) if sys.stderr.isatty() else nullcontext(lambda _done, _total: None)
+    with _bar(unit="B", unit_scale=True, desc="reading", leave=False) as bar:
+
+        def reached(done: int, total: int) -> None:
+            if bar is not None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+        yield reached
+
+
+def _bar(**shown: Any) -> AbstractContextManager[Any]:
+    if not sys.stderr.isatty():
+        return nullcontext()
+    from tqdm import tqdm
+
+    return cast(AbstractContextManager[Any], tqdm(file=sys.stderr, dynamic_ncols=True, **shown))
 
 
 def messages_above_bar(logger: str) -> AbstractContextManager[object]:
@@ -327,27 +367,4 @@ def messages_above_bar(logger: str) -> AbstractContextManager[object]:
 
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    redirected: AbstractContextManager[object] = logging_redirect_tqdm([logging.getLogger(logger)])
-    return redirected
-
-
-class _Bar(AbstractContextManager[Callable[..., None]]):
-    def __init__(self, function: Callable[[_Bar], Callable[..., None]], **shown: Any):
-        from tqdm import tqdm
-
-        self._function = function
-        self._bar = tqdm(file=sys.stderr, dynamic_ncols=True, **shown)
-
-    def __enter__(self) -> Callable[..., None]:
-        return self._function(self)
-
-    def __exit__(self, *_exception: object) -> None:
-        self._bar.close()
-
-    def step(self, total: int | None = None) -> None:
-        self._bar.total = total or self._bar.total
-        self._bar.update()
-
-    def reached(self, done: int, total: int) -> None:
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
+    return cast(AbstractContextManager[object], logging_redirect_tqdm([logging.getLogger(logger)]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import shutil
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
+    Arguments,
     Command,
     check_file,
     make_directory,
@@ -30,14 +30,6 @@ if TYPE_CHECKING:
 
 _SHORTEST_S = 4.0
 
-_DESCRIPTION = """\
-Run the whole daemon on a simulated wrist camera: a cable pulls the camera aside (creep), a collision
-knocks it by 4.5 mm (bump), a hand covers the view (occlusion).  Transforms are published over Zenoh
-within this process and received back, everything is recorded, and at the end the corrected
-position of the tool centre point (TCP) is compared with the truth (mm).
-
-DIR gets demo-0001.rrd (the recording), estimates.jsonl (one JSON line a frame) and summary.json."""
-
 _OPTIONS = f"""
 --seconds S  length; its events are spread over it (s; default 20, at least {_SHORTEST_S:g})
 --out DIR    folder for the results (default: gripmon-demo-DATE-TIME here)
@@ -55,18 +47,23 @@ exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
 
 @Command(
-    "demo", "everything at work on a simulated camera", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "demo", "everything at work on a simulated camera", _OPTIONS, _EXAMPLES,
     seconds={"type": positive_number, "default": 20.0}, fps=positive_number, seed={"type": seed, "default": 1},
     view=VIEW,
 )  # fmt: skip
-def demo(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon demo``."""
+def demo(arguments: Arguments) -> int:
+    """Run the whole daemon on a simulated wrist camera: a cable pulls the camera aside (creep), a collision
+    knocks it by 4.5 mm (bump), a hand covers the view (occlusion).  Transforms are published over Zenoh
+    within this process and received back, everything is recorded, and at the end the corrected
+    position of the tool centre point (TCP) is compared with the truth (mm).
+
+    DIR gets demo-0001.rrd (the recording), estimates.jsonl (one JSON line a frame) and summary.json.
+    """
     if arguments.seconds < _SHORTEST_S:
         raise InputError(f"demo: --seconds {arguments.seconds:g} is too short for its events; at least {_SHORTEST_S:g}")
     from gripmon.daemon.simulated import Demo, demo_config
 
-    viewed = arguments.view is not None
-    config = demo_config(arguments.seconds, fps=arguments.fps, seed=arguments.seed, viewed=viewed)
+    config = demo_config(arguments.seconds, fps=arguments.fps, seed=arguments.seed, viewed=arguments.view is not None)
     demo = Demo(config)
     out = make_directory(arguments.out or Path(f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
     check_file(out / "estimates.jsonl")
@@ -76,12 +73,9 @@ def demo(arguments: argparse.Namespace) -> int:
     print(f"{length}; transforms on {where}; results in {out}", file=sys.stderr)
     with signals_exit() as stop, progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
         code, summary = demo.run(
-            out,
-            step=step,
-            on_network=lambda: messages.enter_context(messages_above_bar("gripmon")),
-            view=arguments.view,
-            stop=stop,
-        )
+            out, step=step, on_network=lambda: messages.enter_context(messages_above_bar("gripmon")),
+            view=arguments.view, stop=stop,
+        )  # fmt: skip
     if summary is None:
         print("demo: no frame was processed", file=sys.stderr)
     else:

@@ -20,6 +20,9 @@ _STYLES = {
     "gone": "bold red", "silent": "bold red", "several": "bold red", "unknown": "red", "starting": "yellow",
     "suspect": "yellow", "stopped": "dim", "valid": "green"
 }  # fmt: skip
+_AS_DATA = (
+    "monitor_id", "condition", "gone_since_ns", "state_age_s", "drift_m", "transforms_per_s", "transform_age_s", "state"
+)  # fmt: skip
 _MARKS = {"error": "!!", "warning": "!", "info": "i"}
 LEGEND = "open alerts: !! errors, ! warnings, i notes, with their number and the worst one's text"
 
@@ -112,18 +115,9 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
 
 def as_data(status: MonitorStatus) -> dict[str, Any]:
     """For ``--json``: what the table is made from."""
-    return {
-        "robot": status.name.robot,
-        "camera": status.name.camera,
-        "monitor_id": status.monitor_id,
-        "condition": status.condition.value,
-        "gone_since_ns": status.gone_since_ns,
-        "state_age_s": round(status.state_age_s, 3),
-        "drift_m": status.drift_m,
-        "transforms_per_s": status.transforms_per_s,
-        "transform_age_s": status.transform_age_s,
-        "state": status.state,
-    }
+    values = {"robot": status.name.robot, "camera": status.name.camera}
+    values |= {name: getattr(status, name) for name in _AS_DATA}
+    return values | {"state_age_s": round(status.state_age_s, 3)}
 
 
 def clock(stamp_ns: int) -> str:

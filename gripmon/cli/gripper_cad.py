@@ -6,31 +6,15 @@ import argparse
 
 from gripmon.cli.common import (
     REQUIRED,
+    Arguments,
     Command,
-    check_outputs,
-    command_line,
     jaw_opening,
     jaw_range,
     positive_number,
     progress_bar,
-    write,
-    write_picture,
+    two_numbers,
 )
 from gripmon.model.errors import InputError
-
-_DESCRIPTION = """\
-A gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one that holds
-both, or one URDF.  Meshes don't say their unit: --unit.  URDF and .cao are metres.
-
-The origin is put at the TCP, the middle of the four innermost fingertip corners: x across the jaws, z
-along --approach, an axis of the CAD frame.  --frame cad leaves the CAD's axes as they are.
-
-How the jaws move comes from the URDF's joint; of meshes, both fingers move by half of an opening in
---jaw-range.
-
-Convex fingers with flat faces hold for every view.  Of round, hollow or open ones the edges and
-outlines are those that one view shows: --camera with --reference, or with a rough --view.  Make such a
-file again when the camera moves by more than some degrees."""
 
 _OPTIONS = """
 FILE...                 .stl, .obj, .ply, .cao: one a finger, or both in one; or one .urdf
@@ -63,28 +47,35 @@ exit codes: 0 written; 2 wrong usage or files, one line says what would be right
 
 
 def _view(text: str) -> tuple[float, float]:
-    distance, colon, tilt = text.partition(":")
-    try:
-        values = float(distance), float(tilt)
-    except ValueError:
-        values = 0.0, 0.0
-    if not colon or not (0.0 < values[0] <= 2.0 and 0.0 <= values[1] <= 180.0):
+    values = two_numbers(text)
+    if values is None or not (0.0 < values[0] <= 2.0 and 0.0 <= values[1] <= 180.0):
         raise argparse.ArgumentTypeError(f"'{text}' isn't D:TILT; metres and degrees, e.g. 0.12:30")
     return values
 
 
 @Command(
-    "from-cad", "from STL, OBJ, PLY, URDF or .cao", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    out=REQUIRED, length=positive_number, jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view,
-    frame={"default": "tcp"},
+    "from-cad", "from STL, OBJ, PLY, URDF or .cao", _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
+    jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view, frame={"default": "tcp"},
 )  # fmt: skip
-def from_cad(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon gripper from-cad``."""
+def from_cad(arguments: Arguments) -> None:
+    """A gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one that holds
+    both, or one URDF.  Meshes don't say their unit: --unit.  URDF and .cao are metres.
+
+    The origin is put at the TCP, the middle of the four innermost fingertip corners: x across the jaws, z
+    along --approach, an axis of the CAD frame.  --frame cad leaves the CAD's axes as they are.
+
+    How the jaws move comes from the URDF's joint; of meshes, both fingers move by half of an opening in
+    --jaw-range.
+
+    Convex fingers with flat faces hold for every view.  Of round, hollow or open ones the edges and
+    outlines are those that one view shows: --camera with --reference, or with a rough --view.  Make such a
+    file again when the camera moves by more than some degrees.
+    """
     from gripmon.daemon.teaching.views import read_view
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.cad import gripper_from_cad
 
-    check_outputs(arguments, "out", "picture")
+    arguments.check_outputs("out", "picture")
     camera, cam_T_grip = read_view(arguments.camera, arguments.reference, arguments.view)
     if arguments.picture is not None and (camera is None or cam_T_grip is None):
         raise InputError("--picture: a picture is of a view; with --camera and --reference or --view")
@@ -92,21 +83,11 @@ def from_cad(arguments: argparse.Namespace) -> None:
     if missing:
         raise InputError(f"{missing[0]}: there is no such file; a mesh, URDF or .cao")
     made = gripper_from_cad(
-        arguments.file,
-        unit=arguments.unit,
-        name=arguments.name,
-        camera=camera,
-        cam_T_grip=cam_T_grip,
-        jaw_range_m=arguments.jaw_range,
-        jaw_opening_m=arguments.jaw_opening,
-        joint=arguments.joint,
-        frame=arguments.frame,
-        approach=arguments.approach,
-        length_m=arguments.length,
-        provenance=provenance_of(command_line(arguments), arguments.file),
-        progress=progress_bar,
-    )
-    write(made.text().encode(), arguments.out)
-    if arguments.picture is not None:
-        write_picture(made.picture(), arguments.picture)
+        arguments.file, unit=arguments.unit, name=arguments.name, camera=camera, cam_T_grip=cam_T_grip,
+        jaw_range_m=arguments.jaw_range, jaw_opening_m=arguments.jaw_opening, joint=arguments.joint,
+        frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
+        provenance=provenance_of(arguments.command_line(), arguments.file), progress=progress_bar,
+    )  # fmt: skip
+    arguments.save("out", made.text().encode())
+    arguments.save("picture", made.picture)
     print("\n".join([*made.summary(), f"written: {arguments.out}"]))

@@ -6,32 +6,10 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli.common import (
-    REQUIRED,
-    Command,
-    check_outputs,
-    command_line,
-    positive_number,
-    progress_bar,
-    write_document,
-    write_picture,
-)
+from gripmon.cli.common import REQUIRED, Arguments, Command, positive_number, progress_bar
 
 if TYPE_CHECKING:
     from gripmon.teach.from_images import GripperFromImages
-
-_DESCRIPTION = """\
-The outline of a gripper, its inner edges and its place, from ten to a hundred images of the wrist
-camera: the robot moves, so that the background changes, and the gripper stays.  No dimensions, no
-straight edges, no plate are needed; one length is: the distance of the fingertips from the camera, or
-the width of a finger.  Images at several jaw openings, in metres in a timestamps.csv beside them as
-gripmon replay takes it, tell how the fingers move, and the length, too.
-
-Ten images at least of each opening, in focus, each before another background, lit as in use.  Where
-the fingers' long edges meet in one point (their vanishing point) they are placed in space; else the
-outline is taken as flat, facing the camera.  What isn't known is said and in the reference's covariance.
-
-Written are the gripper file and, with --reference-out, the reference that belongs to it."""
 
 _OPTIONS = """
 IMAGE...                image file, or folder with images
@@ -77,11 +55,22 @@ def _length(text: str) -> tuple[float, float]:
 
 
 @Command(
-    "from-images", "from images before changing backgrounds", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    camera=REQUIRED, distance=_length, finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
+    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=_length,
+    finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
-def from_images(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon gripper from-images``."""
+def from_images(arguments: Arguments) -> None:
+    """The outline of a gripper, its inner edges and its place, from ten to a hundred images of the wrist
+    camera: the robot moves, so that the background changes, and the gripper stays.  No dimensions, no
+    straight edges, no plate are needed; one length is: the distance of the fingertips from the camera, or
+    the width of a finger.  Images at several jaw openings, in metres in a timestamps.csv beside them as
+    gripmon replay takes it, tell how the fingers move, and the length, too.
+
+    Ten images at least of each opening, in focus, each before another background, lit as in use.  Where
+    the fingers' long edges meet in one point (their vanishing point) they are placed in space; else the
+    outline is taken as flat, facing the camera.  What isn't known is said and in the reference's covariance.
+
+    Written are the gripper file and, with --reference-out, the reference that belongs to it.
+    """
     import cv2
 
     from gripmon.daemon.gripper_images import images_inputs
@@ -90,25 +79,21 @@ def from_images(arguments: argparse.Namespace) -> None:
     from gripmon.teach.from_images import gripper_from_images
     from gripmon.teach.hand_eye import gripper_values
 
-    check_outputs(arguments, "out", "reference_out", "picture")
+    arguments.check_outputs("out", "reference_out", "picture")
     cv2.setNumThreads(1)
     images = image_paths(arguments.image)
     given = images_inputs(images, arguments.camera, arguments.reference)
-    provenance = provenance_of(command_line(arguments), list(dict.fromkeys([*images, *given.files])))
+    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*images, *given.files])))
     found = gripper_from_images(
         images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
         finger_width_m=arguments.finger_width, reference=given.reference, name=arguments.name, provenance=provenance,
         progress=progress_bar,
     )  # fmt: skip
-    write_document(gripper_values(found.gripper.model), arguments.out)
-    written = [arguments.out]
-    if arguments.reference_out is not None:
-        write_document(found.document(provenance), arguments.reference_out, "--reference-out")
-        written.append(arguments.reference_out)
-    if arguments.picture is not None:
-        write_picture(found.picture(), arguments.picture)
-        written.append(arguments.picture)
-    values = {**found.values(), "written": [str(path) for path in written]}
+    arguments.save("out", gripper_values(found.gripper.model))
+    arguments.save("reference_out", lambda: found.document(provenance))
+    arguments.save("picture", found.picture)
+    outputs = arguments.out, arguments.reference_out, arguments.picture
+    values = {**found.values(), "written": [str(path) for path in outputs if path is not None]}
     print(json.dumps(values, indent=2) if arguments.json else "\n".join(_lines(found, values)))
 
 

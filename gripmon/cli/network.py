@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import logging
 import sys
 import time
 
-from gripmon.cli.common import (
-    NETWORK_OPTIONS,
-    REQUIRED,
-    Command,
-    network_errors,
-    network_of,
-    positive_number,
-    whole_number,
-)
+from gripmon.cli.common import NETWORK_OPTIONS, REQUIRED, Arguments, Command, positive_number, whole_number
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
 
 _MESSAGES = (
     "transform", "state", "alert", "reference", "clock", "jaw", "frame", "pulse", "spot", "command", "reply", "error",
 )  # fmt: skip
-
-_FEED = """\
-Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
-configuration says source: {kind: zenoh}.  For trying things out, and as an example of a driver:
-docs/howto/network_camera.md says what is on the wire."""
 
 _FEED_OPTIONS = f"""
 SOURCE             a folder of images, a video file, or a camera (0, /dev/…, URL)
@@ -50,26 +36,12 @@ _FEED_EXAMPLES = """\
 
 exit codes: 0 the images are at their end; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
 
-_ROUTER = """\
-Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
-
-FILE is a configuration of Zenoh's (json5 or yaml); zenohd, Zenoh's own router, takes the same one.
-Paths of certificates in it count from its folder. A router that is to connect to another one tries
-again for ever, and says so."""
-
 _ROUTER_EXAMPLES = """\
   gripmon certificates --out certificates              once: keys for everyone
   gripmon router configs/zenoh/router.json5            mutual TLS, and who may do what
   gripmon router configs/zenoh/local.json5             without security, on this machine alone
 
 exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""
-
-_SCHEMA = """\
-Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames
-and when they are null.
-
-Every message says its own schema and that one's major version: "schema": "gripmon.transform/1".  Within
-a major version fields and names may be added, and nothing else changes."""
 
 _SCHEMA_EXAMPLES = """\
   gripmon schema --list
@@ -82,19 +54,22 @@ _LOOK_EVERY_S = 1.0
 
 
 @Command(
-    "feed", "publish images over Zenoh, as a camera's driver does", _FEED, _FEED_OPTIONS, _FEED_EXAMPLES,
-    robot=REQUIRED, camera={"default": "wrist"}, format={"choices": ("raw", "jpeg", "png"), "default": "raw"},
+    "feed", "publish images over Zenoh, as a camera's driver does", _FEED_OPTIONS, _FEED_EXAMPLES, robot=REQUIRED,
+    camera={"default": "wrist"}, format={"choices": ("raw", "jpeg", "png"), "default": "raw"},
     quality={"type": whole_number(1, 100, "isn't a quality; a whole number, 1 to 100"), "default": 90},
     fps=positive_number,
 )  # fmt: skip
-def feed(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon feed``."""
+def feed(arguments: Arguments) -> int:
+    """Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
+    configuration says source: {kind: zenoh}.  For trying things out, and as an example of a driver:
+    docs/howto/network_camera.md says what is on the wire.
+    """
     from gripmon.io.publish.feeding import Feeder
     from gripmon.io.sources import SourceError, open_source, settings_for_text
     from gripmon.io.wire import Keys, Link, PublishSettings
     from gripmon.io.wire.session import check_key
 
-    joined = network_of(arguments)
+    joined = arguments.network()
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     try:
         settings = settings_for_text(arguments.source, arguments.fps)
@@ -102,7 +77,7 @@ def feed(arguments: argparse.Namespace) -> int:
     except SourceError as error:
         raise InputError(f"feed: {arguments.source}: {error}") from None
     try:
-        with network_errors(arguments):
+        with arguments.network_errors():
             own = Keys(arguments.robot, arguments.camera)["image"]
             key = own if arguments.key is None else check_key(arguments.key)
             if (file := joined["zenoh_config_file"]) is not None:
@@ -127,11 +102,16 @@ def feed(arguments: argparse.Namespace) -> int:
 
 
 @Command(
-    "router", "a Zenoh router between monitors and their readers", _ROUTER,
-    "FILE  Zenoh's configuration (json5, yaml)", _ROUTER_EXAMPLES,
+    "router", "a Zenoh router between monitors and their readers", "FILE  Zenoh's configuration (json5, yaml)",
+    _ROUTER_EXAMPLES,
 )  # fmt: skip
-def router(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon router``: say whom it misses, until a signal ends it."""
+def router(arguments: Arguments) -> None:
+    """Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
+
+    FILE is a configuration of Zenoh's (json5 or yaml); zenohd, Zenoh's own router, takes the same one.
+    Paths of certificates in it count from its folder. A router that is to connect to another one tries
+    again for ever, and says so.
+    """
     from gripmon.io.wire import Router, ZenohFileError
 
     with signals_exit():
@@ -163,11 +143,16 @@ _SCHEMA_OPTIONS = f"""
 
 
 @Command(
-    "schema", "print the JSON Schema of the messages", _SCHEMA, _SCHEMA_OPTIONS, _SCHEMA_EXAMPLES,
+    "schema", "print the JSON Schema of the messages", _SCHEMA_OPTIONS, _SCHEMA_EXAMPLES,
     message={"choices": _MESSAGES},
 )  # fmt: skip
-def schema(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon schema``."""
+def schema(arguments: Arguments) -> None:
+    """Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames
+    and when they are null.
+
+    Every message says its own schema and that one's major version: "schema": "gripmon.transform/1".  Within
+    a major version fields and names may be added, and nothing else changes.
+    """
     from gripmon.model.records import MESSAGES, json_schema, schema_name, summary
 
     if arguments.list and arguments.message:

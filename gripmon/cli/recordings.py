@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import threading
-from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
     REQUIRED,
+    Arguments,
     Command,
-    check_outputs,
     make_directory,
+    note,
     port,
     positive_number,
     progress_bar,
     reading_bar,
-    write,
 )
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
 
 if TYPE_CHECKING:
     from gripmon.analyse.api import CorrectedRun
-
-_REPORT = """\
-Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
-with it, what did it, whether it is still so, and which times are affected. The answer in one
-paragraph is printed; FILE.html shows it with plots, pictures and tables, in one file that needs no
-network. Recordings of several runs and robots go on one time axis."""
 
 _REPORT_OPTIONS = """
 RECORDING...     .rrd files, folders of them with all below, or estimates.jsonl
@@ -51,16 +42,6 @@ _REPORT_EXAMPLES = """\
 exit codes: 0 done, if only a part could be used, too (stderr says which); 2 wrong usage, no such file,
 or no recording; 3 nothing in them can be used; 130 interrupted"""
 
-_EXPORT = """\
-Write what recordings hold as Parquet, partitioned by robot, camera and day (UTC), so that months of
-a whole fleet can be asked by any engine:
-
-  DIR/frames/robot=arm1/camera=wrist/date=2026-03-14/RUN-0000.parquet
-
-and likewise alerts, states and commands; references by robot and camera.  Columns, units and one
-query each for DuckDB and Polars: docs/howto/export.md.  A file that is exported again replaces its rows;
-it may be done every hour, also while the monitor writes.  Images stay in the recording."""
-
 _EXPORT_OPTIONS = """
 RECORDING...  recordings (.rrd), folders of them with all below, or estimates.jsonl
 --out DIR     where the tables go; made if it is missing
@@ -72,18 +53,6 @@ _EXPORT_EXAMPLES = """\
 
 exit codes: 0 done, also where a part of a recording could not be used (one line each on stderr);
 2 wrong usage; 3 nothing in it could be used, or the folder could not be written"""
-
-_CORRECT = """\
-Estimate cam_T_grip for every frame of a recording once more, from all frames before and after it:
-for data that was recorded with a stale calibration.  A step stays a step, and is placed in the
-frame in which it happened.  FILE's suffix says what is written:
-
-  .jsonl    one line about the recordings and the change points, then one line a frame
-  .parquet  the same as a table, units in the columns' names
-  .rrd      a track of transforms that a viewer lays over the recording (open both); several runs
-            get a file each, FILE-1.rrd and on
-
-Covariances say what is left: also what frames claim and averaging can't take away."""
 
 _CORRECT_OPTIONS = """
 RECORDING...       recordings (.rrd), folders of them with all below, or estimates.jsonl
@@ -97,11 +66,6 @@ _CORRECT_EXAMPLES = """\
   gripmon correct estimates.jsonl --out corrected.jsonl --stamps shots.csv
 
 exit codes: 0 done; 2 wrong usage; 3 nothing measured in the recordings; 130 interrupted"""
-
-_VIEW = """\
-Show recordings in rerun's viewer: in a window where there is a display, else as a page for a browser
-on this machine, whose address is printed.  The files of one run appear as one recording.  It ends
-with Ctrl-C, or when the window is closed, and leaves nothing running."""
 
 _VIEW_OPTIONS = """
 RECORDING...  .rrd files, or folders of them with all below
@@ -126,45 +90,50 @@ _TO_STDOUT = Path("-")
 
 
 @Command(
-    "report", "what happened: when did the camera move, what is affected", _REPORT, _REPORT_OPTIONS, _REPORT_EXAMPLES,
+    "report", "what happened: when did the camera move, what is affected", _REPORT_OPTIONS, _REPORT_EXAMPLES,
     limit_mm=positive_number, limit_deg=positive_number,
 )  # fmt: skip
-def report(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon report``."""
+def report(arguments: Arguments) -> None:
+    """Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
+    with it, what did it, whether it is still so, and which times are affected. The answer in one
+    paragraph is printed; FILE.html shows it with plots, pictures and tables, in one file that needs no
+    network. Recordings of several runs and robots go on one time axis.
+    """
     data_path, to_stdout = arguments.json, arguments.json == _TO_STDOUT
     if arguments.out is None and data_path is None:
         arguments.out = Path("report.html")
-    check_outputs(arguments, "out", *(() if to_stdout else ("json",)))
+    arguments.check_outputs("out", *(() if to_stdout else ("json",)))
     from gripmon.analyse.api import report
 
-    mm, deg = arguments.limit_mm, arguments.limit_deg
+    limit_m = None if arguments.limit_mm is None else 1e-3 * arguments.limit_mm
+    limit_rad = None if arguments.limit_deg is None else math.radians(arguments.limit_deg)
     with reading_bar() as progress:
-        found = report(
-            arguments.recording,
-            limit_m=None if mm is None else 1e-3 * mm,
-            limit_rad=None if deg is None else math.radians(deg),
-            progress=progress,
-        )
-    _say_faults("report", found.faults)
+        found = report(arguments.recording, limit_m=limit_m, limit_rad=limit_rad, progress=progress)
+    note(f"report: {fault}" for fault in found.faults)
     if to_stdout:
         print(found.json().decode())
     elif data_path is not None:
-        write(found.json() + b"\n", data_path, "--json")
+        arguments.save("json", found.json() + b"\n")
     if arguments.out is not None:
         with progress_bar(len(found.analysed), "recording") as step:
             data = found.html(step)
-        write(data, arguments.out)
+        arguments.save("out", data)
     if not to_stdout:
         print(found.report.summary)
         print("\n".join(f"written: {path}" for path in (arguments.out, data_path) if path is not None))
 
 
-@Command(
-    "export", "write recordings as Parquet, by robot and day", _EXPORT, _EXPORT_OPTIONS, _EXPORT_EXAMPLES,
-    out=REQUIRED,
-)  # fmt: skip
-def export(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon export``."""
+@Command("export", "write recordings as Parquet, by robot and day", _EXPORT_OPTIONS, _EXPORT_EXAMPLES, out=REQUIRED)
+def export(arguments: Arguments) -> None:
+    """Write what recordings hold as Parquet, partitioned by robot, camera and day (UTC), so that months of
+    a whole fleet can be asked by any engine:
+
+      DIR/frames/robot=arm1/camera=wrist/date=2026-03-14/RUN-0000.parquet
+
+    and likewise alerts, states and commands; references by robot and camera.  Columns, units and one
+    query each for DuckDB and Polars: docs/howto/export.md.  A file that is exported again replaces its rows;
+    it may be done every hour, also while the monitor writes.  Images stay in the recording.
+    """
     from gripmon.record.export import export
     from gripmon.record.read import recording_files
 
@@ -172,39 +141,54 @@ def export(arguments: argparse.Namespace) -> None:
     out = make_directory(arguments.out)
     with reading_bar() as progress:
         done = export(arguments.recording, out, progress=progress)
-    _say_faults("export", done.faults)
+    note(f"export: {fault}" for fault in done.faults)
     rows = ", ".join(f"{table} {count}" for table, count in done.rows.items() if count)
     print(f"{out}: {rows or 'no rows yet'}, from {done.files} file{'s' * (done.files != 1)}")
 
 
 @Command(
-    "correct", "the best transform for every instant, knowing the whole recording", _CORRECT, _CORRECT_OPTIONS,
-    _CORRECT_EXAMPLES, out=REQUIRED,
+    "correct", "the best transform for every instant, knowing the whole recording", _CORRECT_OPTIONS, _CORRECT_EXAMPLES,
+    out=REQUIRED,
 )  # fmt: skip
-def correct(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon correct``."""
+def correct(arguments: Arguments) -> None:
+    """Estimate cam_T_grip for every frame of a recording once more, from all frames before and after it:
+    for data that was recorded with a stale calibration.  A step stays a step, and is placed in the
+    frame in which it happened.  FILE's suffix says what is written:
+
+      .jsonl    one line about the recordings and the change points, then one line a frame
+      .parquet  the same as a table, units in the columns' names
+      .rrd      a track of transforms that a viewer lays over the recording (open both); several runs
+                get a file each, FILE-1.rrd and on
+
+    Covariances say what is left: also what frames claim and averaging can't take away.
+    """
     if arguments.out.suffix.lower() == ".rrd" and arguments.stamps is not None:
         raise InputError("--stamps: a track has its frames' times; .jsonl or .parquet")
-    check_outputs(arguments, "out")
+    arguments.check_outputs("out")
     from gripmon.analyse.api import correct
 
     done = correct(arguments.recording, arguments.out, stamps=arguments.stamps, progress=progress_bar)
-    _say_faults("correct", done.faults)
+    note(f"correct: {fault}" for fault in done.faults)
     print("\n".join([*map(_corrected, done.runs), *(f"written: {path}" for path in done.written)]))
 
 
-@Command(
-    "view", "recordings in rerun's viewer, native or in a browser", _VIEW, _VIEW_OPTIONS, _VIEW_EXAMPLES,
-    port=port,
-)  # fmt: skip
-def view(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon view``."""
-    from gripmon.record.read import recording_files
+@Command("view", "recordings in rerun's viewer, native or in a browser", _VIEW_OPTIONS, _VIEW_EXAMPLES, port=port)
+def view(arguments: Arguments) -> int:
+    """Show recordings in rerun's viewer: in a window where there is a display, else as a page for a browser
+    on this machine, whose address is printed.  The files of one run appear as one recording.  It ends
+    with Ctrl-C, or when the window is closed, and leaves nothing running.
+    """
+    from gripmon.record.read import is_rrd, recording_files
     from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
 
     files = recording_files(arguments.recording)
     for path in files:
-        _check_recording(path)
+        try:
+            wrong = "" if is_rrd(path) else "isn't a recording; an .rrd file of gripmon's"
+        except OSError as error:
+            wrong = f"can't be read ({error.strerror})"
+        if wrong:
+            raise InputError(f"{path}: {wrong}")
     if arguments.port is not None and not is_free(arguments.port):
         raise InputError(f"--port {arguments.port}: is in use on 127.0.0.1; another port, or none for any")
     try:
@@ -219,22 +203,6 @@ def view(arguments: argparse.Namespace) -> int:
     except ViewerError as error:
         raise NoResultError(f"view: {error}") from None
     return EXIT_DONE
-
-
-def _check_recording(path: Path) -> None:
-    from gripmon.record.read import is_rrd
-
-    try:
-        wrong = "" if is_rrd(path) else "isn't a recording; an .rrd file of gripmon's"
-    except OSError as error:
-        wrong = f"can't be read ({error.strerror})"
-    if wrong:
-        raise InputError(f"{path}: {wrong}")
-
-
-def _say_faults(command: str, faults: Iterable[str]) -> None:
-    for fault in faults:
-        print(f"{command}: {fault}", file=sys.stderr)
 
 
 def _corrected(each: CorrectedRun) -> str:

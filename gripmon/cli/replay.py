@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from gripmon.cli.common import REQUIRED, Command, check_outputs, positive_number, progress_bar, writing
+from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number, progress_bar, writing
 from gripmon.model.errors import NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
-
-_DESCRIPTION = """\
-Run recorded frames through the monitor and write one JSON line for every input frame, in input
-order, refused ones included.  The same input gives the same bytes, except for latency_ns.
-
-A recording of gripmon's brings its own configuration, the state that the monitor began with and the
-commands that it got: without --config the same core decides again what it decided then, to the byte
-where every frame was recorded as PNG (image_format: png and an image rate of every frame), else
-closely.  With another --config one sees what that would have done; --recording then shows both, named
-recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end.
-
-With the configuration of a second camera (a section laser) INPUT is a folder or a video, its pulses
-are those of the table laser.pulses, and every pulse gets a line."""
 
 _OPTIONS = """
 INPUT...              a folder of images, taken in the order of their names, a video file, or a recording of ours: an
@@ -51,11 +37,22 @@ FILE.rrd from before stays then); 130 interrupted (what was done until then is i
 
 
 @Command(
-    "replay", "recorded images or a video through the monitor, JSON lines out", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    out=REQUIRED, fps=positive_number,
+    "replay", "recorded images or a video through the monitor, JSON lines out", _OPTIONS, _EXAMPLES, out=REQUIRED,
+    fps=positive_number,
 )  # fmt: skip
-def replay(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon replay``."""
+def replay(arguments: Arguments) -> int:
+    """Run recorded frames through the monitor and write one JSON line for every input frame, in input
+    order, refused ones included.  The same input gives the same bytes, except for latency_ns.
+
+    A recording of gripmon's brings its own configuration, the state that the monitor began with and the
+    commands that it got: without --config the same core decides again what it decided then, to the byte
+    where every frame was recorded as PNG (image_format: png and an image rate of every frame), else
+    closely.  With another --config one sees what that would have done; --recording then shows both, named
+    recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end.
+
+    With the configuration of a second camera (a section laser) INPUT is a folder or a video, its pulses
+    are those of the table laser.pulses, and every pulse gets a line.
+    """
     import cv2
 
     from gripmon.daemon.replaying import open_replay
@@ -64,29 +61,28 @@ def replay(arguments: argparse.Namespace) -> int:
     cv2.setNumThreads(1)
     with open_replay(arguments.input, arguments.config, arguments.fps, _say) as replayed:
         recording = replayed.recorded_in(arguments.recording)
-        check_outputs(arguments, "recording")
+        arguments.check_outputs("recording")
         with _output(arguments) as write, recording, progress_bar(replayed.length, "frame") as step:
             try:
                 for record in replayed.records(step):
                     write(to_json(record) + b"\n")
             finally:
-                for line in replayed.summary():
-                    _say(line)
+                _say(*replayed.summary())
         return EXIT_DONE if replayed.usable else EXIT_FAILED
 
 
-def _say(text: str) -> None:
-    print(f"replay: {text}", file=sys.stderr)
+def _say(*lines: str) -> None:
+    note(f"replay: {line}" for line in lines)
 
 
 @contextmanager
-def _output(arguments: argparse.Namespace) -> Iterator[Callable[[bytes], None]]:
+def _output(arguments: Arguments) -> Iterator[Callable[[bytes], None]]:
     """What writes a line; a fault ends the command with one line and exit code 3."""
     path: Path = arguments.out
     if path == Path("-"):
         file: Any = sys.stdout.buffer
     else:
-        check_outputs(arguments, "out")
+        arguments.check_outputs("out")
         with writing(path):
             file = path.open("wb")
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from gripmon.cli.common import Command, positive_number
+from gripmon.cli.common import Arguments, Command, positive_number
 from gripmon.model.stopping import signals_exit
 
 VIEW = {"nargs": "?", "const": "auto", "choices": ("auto", "web", "native", "server")}
@@ -12,19 +10,6 @@ VIEW_OPTION = """
 --view  watch it live in rerun's viewer, on this machine: native (a window), web (a page whose address is said),
         auto (native where there is a display), or server (only the stream that viewers connect to)
 """
-
-_DESCRIPTION = """\
-Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
-interrupted (Ctrl-C or SIGTERM).  A camera that is missing or goes away is tried again for ever, and
-the state on the network says so.
-
-The references, a proposal and open alerts survive a restart, also kill -9 and a power cut, in the file
-that state.file names: a live camera's in ~/.local/state/gripmon.  After a restart the monitor goes on
-from the last reference, checks in the picture that it still fits, and says so (alert restarted).
-
-A configuration with a section laser is that of a second camera, beside the robot: its calibration is
-tested with every pulse of a laser pointer on the arm, which the robot's program tells
-(docs/howto/laser.md, Watching)."""
 
 _OPTIONS = f"""
 CONFIG         configuration file (YAML)
@@ -57,22 +42,26 @@ monitor of this robot and camera is on the network; 130 Ctrl-C"""
 
 
 @Command(
-    "run", "the daemon: watch a camera, publish and record", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    duration=positive_number, view=VIEW,
+    "run", "the daemon: watch a camera, publish and record", _OPTIONS, _EXAMPLES, duration=positive_number, view=VIEW,
 )  # fmt: skip
-def run(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon run``."""
+def run(arguments: Arguments) -> int:
+    """Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
+    interrupted (Ctrl-C or SIGTERM).  A camera that is missing or goes away is tried again for ever, and
+    the state on the network says so.
+
+    The references, a proposal and open alerts survive a restart, also kill -9 and a power cut, in the file
+    that state.file names: a live camera's in ~/.local/state/gripmon.  After a restart the monitor goes on
+    from the last reference, checks in the picture that it still fits, and says so (alert restarted).
+
+    A configuration with a section laser is that of a second camera, beside the robot: its calibration is
+    tested with every pulse of a laser pointer on the arm, which the robot's program tells
+    (docs/howto/laser.md, Watching).
+    """
     with signals_exit() as stop:
         from gripmon.daemon.starting import run_file
 
         return run_file(
-            arguments.config,
-            out=arguments.out,
-            duration_s=arguments.duration,
-            verbose=arguments.verbose,
-            log_json=arguments.log_json,
-            fresh_state=arguments.fresh_state,
-            view=arguments.view,
-            take_over=arguments.take_over,
-            stop=stop,
-        )
+            arguments.config, out=arguments.out, duration_s=arguments.duration, verbose=arguments.verbose,
+            log_json=arguments.log_json, fresh_state=arguments.fresh_state, view=arguments.view,
+            take_over=arguments.take_over, stop=stop,
+        )  # fmt: skip

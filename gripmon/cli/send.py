@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import sys
 from typing import TYPE_CHECKING
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING
 from gripmon.cli.common import (
     NETWORK_OPTIONS,
     REQUIRED,
+    Arguments,
     Command,
+    input_errors,
     make_directory,
-    network_errors,
-    network_of,
     positive_number,
 )
 from gripmon.cli.fleet_table import printable
@@ -22,23 +21,6 @@ from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
     from gripmon.model.records import CommandReply, MonitorState, ReferenceRecord
-
-_DESCRIPTION = """\
-Tell a running monitor something, and print its answer.
-
-  recalibrate       measure the reference anew from what the camera sees
-  accept [ID]       take the proposed reference
-  reject [ID]       forget the proposed reference
-  undo [ID]         go back to the reference before, or to the one named: a new revision with that
-                    transform
-  reset             go back to the configured reference, likewise
-  acknowledge [ID]  take note of an open alert, or of all
-  state             print the references, a proposal and the open alerts
-  snapshot          write the newest frame's image, and what the monitor made of it, to --out,
-                    numbered, with a row in timestamps.csv: ready for replay and teach
-
-What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
-answer came, --request with that id asks for the same again, which is not carried out twice."""
 
 _NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state", "snapshot")
 _WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
@@ -66,17 +48,32 @@ exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
 
 
 @Command(
-    "send", "tell a running monitor something: undo, accept, state, …", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "send", "tell a running monitor something: undo, accept, state, …", _OPTIONS, _EXAMPLES,
     name={"choices": _NAMES, "metavar": "COMMAND"}, id={"default": ""}, robot=REQUIRED, monitor={"default": ""},
     timeout={"type": positive_number, "default": 5.0},
 )  # fmt: skip
-def send(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon send``."""
+def send(arguments: Arguments) -> int:
+    """Tell a running monitor something, and print its answer.
+
+      recalibrate       measure the reference anew from what the camera sees
+      accept [ID]       take the proposed reference
+      reject [ID]       forget the proposed reference
+      undo [ID]         go back to the reference before, or to the one named: a new revision with that
+                        transform
+      reset             go back to the configured reference, likewise
+      acknowledge [ID]  take note of an open alert, or of all
+      state             print the references, a proposal and the open alerts
+      snapshot          write the newest frame's image, and what the monitor made of it, to --out,
+                        numbered, with a row in timestamps.csv: ready for replay and teach
+
+    What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
+    answer came, --request with that id asks for the same again, which is not carried out twice.
+    """
     from gripmon.client import snapshots
 
     if wrong := _misuse(arguments):
         raise InputError(f"send: {wrong}")
-    network_of(arguments)
+    arguments.network()
     out = None if arguments.out is None else make_directory(arguments.out)
     if out is not None:
         snapshots.check_table(out)
@@ -95,7 +92,7 @@ def send(arguments: argparse.Namespace) -> int:
     return EXIT_DONE if reply.done else EXIT_FAILED
 
 
-def _misuse(arguments: argparse.Namespace) -> str:
+def _misuse(arguments: Arguments) -> str:
     """What can't go together, and what would be right."""
     name = arguments.name
     if arguments.id and name not in _WITH_ARGUMENT:
@@ -109,24 +106,21 @@ def _misuse(arguments: argparse.Namespace) -> str:
     return ""
 
 
-def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
+def _ask(arguments: Arguments) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
     from gripmon.client import Ambiguous, Client, NotCarriedOut
     from gripmon.model.records import CommandFault, CommandName
 
     timeout_s, monitor_id = arguments.timeout, arguments.monitor
     try:
-        with network_errors(arguments):
-            client = Client(arguments.robot, arguments.camera, **network_of(arguments))
-        with client:
-            if arguments.out is not None:
-                return client.snapshot(timeout_s, monitor_id=monitor_id)
-            name, request = CommandName(arguments.name), arguments.request
-            return client.send(name, arguments.id, timeout_s, request_id=request, monitor_id=monitor_id), None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"send: {error}") from None
+        with input_errors("send"):
+            with arguments.network_errors():
+                client = Client(arguments.robot, arguments.camera, **arguments.network())
+            with client:
+                if arguments.out is not None:
+                    return client.snapshot(timeout_s, monitor_id=monitor_id)
+                name, request = CommandName(arguments.name), arguments.request
+                return client.send(name, arguments.id, timeout_s, request_id=request, monitor_id=monitor_id), None
     except Ambiguous as error:
         option = {"camera": "--camera", "monitor_id": "--monitor ID"}[error.argument]
         raise InputError(f"send: {error} ({option})") from None

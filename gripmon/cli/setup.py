@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 from pathlib import Path
 
-from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Command, announcer, check_outputs, make_directory, write
+from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory
 from gripmon.model.errors import InputError
-
-_DESCRIPTION = """\
-Lead from a camera to a running monitor on a local web page: camera, printed target, images of it,
-lens, gripper, hand and eye, teaching, forecast, start.  Every step writes its file to the folder, the
-same that the command writes which it names; whoever opens the folder again goes on where it stopped."""
 
 _OPTIONS = f"""
 [DIR]            folder of the set-up; made if it is missing (default: this one)
@@ -31,11 +25,14 @@ exit codes: 0 done; 2 wrong usage or files; 3 a step gives nothing, and why; 130
 
 
 @Command(
-    "setup", "from a camera to a running monitor, on one page", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    dir={"default": Path()}, port=PAGE_PORT,
+    "setup", "from a camera to a running monitor, on one page", _OPTIONS, _EXAMPLES, dir={"default": Path()},
+    port=PAGE_PORT,
 )  # fmt: skip
-def setup(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon setup``."""
+def setup(arguments: Arguments) -> None:
+    """Lead from a camera to a running monitor on a local web page: camera, printed target, images of it,
+    lens, gripper, hand and eye, teaching, forecast, start.  Every step writes its file to the folder, the
+    same that the command writes which it names; whoever opens the folder again goes on where it stopped.
+    """
     from gripmon.daemon.setup import Project, SetupSite
     from gripmon.teach.page_server import serve
 
@@ -48,10 +45,6 @@ def setup(arguments: argparse.Namespace) -> None:
         with contextlib.closing(SetupSite(project)) as site:
             serve(site, arguments.port, announcer("set up"), open_browser=not arguments.no_browser)
 
-
-_TARGET = """\
-Write a calibration target as a page to print: PDF in true size, with a bar to hold a ruler against.
-What it has to be called in --target stands on the page."""
 
 _TARGET_OPTIONS = """
 [TARGET]      as for gripmon calibrate intrinsics --target (default: circles:12x10:0.008:0.004)
@@ -69,17 +62,19 @@ exit codes: 0 written; 2 wrong usage, or the target doesn't fit on the paper"""
 
 
 @Command(
-    "target", "a calibration target to print", _TARGET, _TARGET_OPTIONS, _TARGET_EXAMPLES,
+    "target", "a calibration target to print", _TARGET_OPTIONS, _TARGET_EXAMPLES,
     target={"default": "circles:12x10:0.008:0.004"}, pdf={"required": True}, paper={"default": "a4"},
 )  # fmt: skip
-def target(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon target``."""
+def target(arguments: Arguments) -> None:
+    """Write a calibration target as a page to print: PDF in true size, with a bar to hold a ruler against.
+    What it has to be called in --target stands on the page.
+    """
     from gripmon.calibrate.target_print import print_target
     from gripmon.model.targets import parse_target
 
     if arguments.pdf.suffix.lower() != ".pdf":
         raise InputError(f"--pdf {arguments.pdf}: is no PDF's name; FILE.pdf")
     made = print_target(parse_target(arguments.target), arguments.paper)
-    check_outputs(arguments, "pdf")
-    write(made.pdf, arguments.pdf, "--pdf")
+    arguments.check_outputs("pdf")
+    arguments.save("pdf", made.pdf)
     print(f"print at 100 %; the bar has to measure {made.bar_mm:g} mm\nwritten: {arguments.pdf}")

@@ -2,24 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-
-from gripmon.cli.common import Command, positive_number, progress_bar, seed
+from gripmon.cli.common import Arguments, Command, positive_number, progress_bar, seed
 from gripmon.model.errors import InputError
-
-_DESCRIPTION = """\
-Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
-reports it), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
-them; m, px), and config.yaml with gripper.yaml, so that gripmon replay works at once.  The same seed
-gives the same images.
-
-For the way from a new gripper to a running monitor without any hardware, all of one camera and gripper:
-plate        a calibration plate, tilted to all sides, for gripmon calibrate intrinsics
-standing     the gripper stands on the plate; rough.yaml has its corners as a person would put them
-work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
-robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
-spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)
-truth.json (of work: truth.jsonl) holds the truth beside the images; no step reads it."""
 
 _OPTIONS = """
 [SCENARIO]       a built-in name (see --list) or a YAML file
@@ -45,11 +29,23 @@ inputs for every step from a new gripper to a running monitor
 
 
 @Command(
-    "simulate", "write simulated images with exact truth", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    seed={"type": seed, "default": 0}, seconds=positive_number, fps=positive_number,
+    "simulate", "write simulated images with exact truth", _OPTIONS, _EXAMPLES, seed={"type": seed, "default": 0},
+    seconds=positive_number, fps=positive_number,
 )  # fmt: skip
-def simulate(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon simulate``."""
+def simulate(arguments: Arguments) -> None:
+    """Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
+    reports it), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
+    them; m, px), and config.yaml with gripper.yaml, so that gripmon replay works at once.  The same seed
+    gives the same images.
+
+    For the way from a new gripper to a running monitor without any hardware, all of one camera and gripper:
+    plate        a calibration plate, tilted to all sides, for gripmon calibrate intrinsics
+    standing     the gripper stands on the plate; rough.yaml has its corners as a person would put them
+    work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
+    robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
+    spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)
+    truth.json (of work: truth.jsonl) holds the truth beside the images; no step reads it.
+    """
     from gripmon.daemon.config import builtin_config, load_config
     from gripmon.daemon.simulated import next_step, simulate_images
     from gripmon.simulate import CALIBRATION_KINDS, SCENARIO_NAMES
@@ -64,12 +60,7 @@ def simulate(arguments: argparse.Namespace) -> None:
     unit = "image" if kind in CALIBRATION_KINDS else "frame"
     with progress_bar(None, unit) as step:
         made = simulate_images(
-            kind,
-            arguments.out,
-            config=config,
-            seed=arguments.seed,
-            duration_s=arguments.seconds,
-            fps=arguments.fps,
+            kind, arguments.out, config=config, seed=arguments.seed, duration_s=arguments.seconds, fps=arguments.fps,
             step=lambda _done, total: step(total),
-        )
+        )  # fmt: skip
     print(f"{made.frames} {unit}s in {made.folder}; next: {next_step(kind, made, config.gripper)}")

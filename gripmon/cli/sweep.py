@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import check_outputs, progress_bar, write
+from gripmon.cli.common import Arguments, progress_bar, two_numbers
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE
 
@@ -43,7 +42,7 @@ _BOUNDS = {
 }  # fmt: skip
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Arguments) -> int:
     """Try the mounts, print the table, draw the picture."""
     from gripmon.daemon.config import load_config
     from gripmon.daemon.forecast import rig_of
@@ -52,34 +51,25 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = load_config(arguments.config[0], check_source=False)
     ranges = {name: _range(name, getattr(arguments, name)) for name in _BOUNDS if getattr(arguments, name) is not None}
-    at_px = _numbers(arguments.at, ",")
+    at_px = two_numbers(arguments.at or "", ",")
     if at_px is None and arguments.at is not None:
         width_px, height_px = config.camera.width_px, config.camera.height_px
         right = f"two numbers inside {width_px} x {height_px} px, such as --at {width_px // 2},{height_px // 2}"
         raise InputError(f"--at {arguments.at}: isn't a point of the image; {right}")
-    travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", _numbers(arguments.jaw, ":")
+    travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", two_numbers(arguments.jaw or "")
     if travel_m is None and arguments.jaw is not None:
         raise InputError(f"--jaw {arguments.jaw}: isn't a range; MIN:MAX in metres, within {travel}")
-    check_outputs(arguments, "picture")
+    arguments.check_outputs("picture")
     grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
     with progress_bar(len(grid), "mount") as step:
         swept = sweep(config, grid, place_px, travel_m, step)
     print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(_as_text(swept)))
     if arguments.picture is not None:
         drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
-        write(encoded(drawn, arguments.picture.suffix), arguments.picture, "--picture")
+        arguments.save("picture", encoded(drawn, arguments.picture.suffix))
         if not arguments.json:
             print(f"picture    {arguments.picture}")
     return EXIT_DONE
-
-
-def _numbers(text: str | None, between: str) -> tuple[float, float] | None:
-    """Two numbers; None for another text."""
-    try:
-        first, second = (float(part) for part in (text or "").split(between))
-    except ValueError:
-        return None
-    return first, second
 
 
 def _range(name: str, text: str) -> tuple[float, ...]:

@@ -8,18 +8,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import (
-    PAGE_PORT,
-    PORT_OPTIONS,
-    Command,
-    announcer,
-    check_outputs,
-    command_line,
-    make_directory,
-    positive_number,
-    refuse_without,
-    write,
-)
+from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory, positive_number
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
@@ -29,22 +18,6 @@ if TYPE_CHECKING:
     from gripmon.teach.page_server import OutlineSession
     from gripmon.teach.session import TeachSession
     from gripmon.track.edges.taught import TaughtEdge
-
-_DESCRIPTION = """\
-Measure where each edge of the gripper really shows, in images taken at the reference calibration,
-and write it as a taught model.  Named in the configuration (`taught: taught.yaml`), it makes the
-monitor compare like with like: what bevels, rounded edges, shading and blur shift the edges by
-cancels.  The reference is by definition the gripper's pose in these images.
-
-With --page a person drags rough corners onto the fingertips, on a web page that only this machine
-can open, sees the edges snap and what accuracy to expect, and saves the taught model together with
-a configuration for gripmon check and gripmon run; no configuration is needed for that, only the
-camera's calibration and the gripper file.  Without --reference the pose comes from the corners,
-less exactly than from a plate (gripmon calibrate plane).  --corners does the same without a page.
-With neither --gripper nor --config the page writes rough.yaml, for gripmon calibrate plane --infer.
-
-Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
-in use, each before another background, some with the jaws opened otherwise."""
 
 _OPTIONS = """
 [IMAGE...]          image file at the reference calibration
@@ -104,14 +77,26 @@ def _key(text: str) -> str:
 
 
 @Command(
-    "teach", "learn how the gripper's edges look at the reference", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    {"corners by hand": (None, _BY_HAND)},
-    jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
-    jaw_source={"choices": ("fixed", "frames", "zenoh")},
-    port=PAGE_PORT,
+    "teach", "learn how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
+    {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
+    camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT,
 )  # fmt: skip
-def teach(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon teach``."""
+def teach(arguments: Arguments) -> None:
+    """Measure where each edge of the gripper really shows, in images taken at the reference calibration,
+    and write it as a taught model.  Named in the configuration (`taught: taught.yaml`), it makes the
+    monitor compare like with like: what bevels, rounded edges, shading and blur shift the edges by
+    cancels.  The reference is by definition the gripper's pose in these images.
+
+    With --page a person drags rough corners onto the fingertips, on a web page that only this machine
+    can open, sees the edges snap and what accuracy to expect, and saves the taught model together with
+    a configuration for gripmon check and gripmon run; no configuration is needed for that, only the
+    camera's calibration and the gripper file.  Without --reference the pose comes from the corners,
+    less exactly than from a plate (gripmon calibrate plane).  --corners does the same without a page.
+    With neither --gripper nor --config the page writes rough.yaml, for gripmon calibrate plane --infer.
+
+    Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
+    in use, each before another background, some with the jaws opened otherwise.
+    """
     if arguments.page or arguments.corners is not None or arguments.live is not None:
         _teach_by_hand(arguments)
         return
@@ -119,24 +104,23 @@ def teach(arguments: argparse.Namespace) -> None:
         raise InputError("teach: no image; image files, or --page --live DEVICE")
     if arguments.config is None:
         raise InputError("teach: --config is missing; a configuration, or --page with --camera and --gripper")
-    refuse_without(arguments, _NEED_CORNERS, "goes with --page or --corners")
+    arguments.refuse(_NEED_CORNERS, "goes with --page or --corners")
     from gripmon.daemon.config import load_config
     from gripmon.daemon.teaching import name_taught
     from gripmon.teach.api import teach
 
-    config, command = load_config(arguments.config, check_source=False, with_taught=False), command_line(arguments)
+    config, command = load_config(arguments.config, check_source=False, with_taught=False), arguments.command_line()
     out = arguments.out = arguments.out or config.taught_path or config.directory / "taught.yaml"
     if arguments.into_config and config.taught_path is not None and config.taught_path.resolve() != out.resolve():
         wrong = f"{config.path} names {config.taught_path} already; without it, or without --out"
         raise InputError(f"--into-config: {wrong}")
-    check_outputs(arguments, "out", "picture")
+    arguments.check_outputs("out", "picture")
     taught = teach(config, arguments.image, jaw_opening_m=arguments.jaw_opening, command=command)
-    write(taught.text().encode(), out)
+    arguments.save("out", taught.text().encode())
     if arguments.into_config:
         config = name_taught(config, out)
     print(_summary(config, taught.taught, out))
-    if arguments.picture is not None:
-        write(taught.picture(arguments.picture.suffix), arguments.picture, "--picture")
+    arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
 def _summary(config: Config, taught: Taught, out: Path) -> str:
@@ -163,7 +147,7 @@ def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
     return f"{name:<{width}}  {place}  {100.0 * edge.seen:5.0f} %  {edge.brighter:<5} {kind}"
 
 
-def _teach_by_hand(arguments: argparse.Namespace) -> None:
+def _teach_by_hand(arguments: Arguments) -> None:
     """Handle ``gripmon teach --page`` and ``--corners``."""
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
@@ -185,7 +169,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
         return
     files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
     inputs = read_inputs(
-        images, command=command_line(arguments), **files, live=arguments.live, source=arguments.source,
+        images, command=arguments.command_line(), **files, live=arguments.live, source=arguments.source,
         jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
         robot=arguments.robot, camera_name=arguments.camera_name,
     )  # fmt: skip
@@ -201,7 +185,7 @@ def _teach_by_hand(arguments: argparse.Namespace) -> None:
     _say(saved)
 
 
-def _misuse(arguments: argparse.Namespace) -> str:
+def _misuse(arguments: Arguments) -> str:
     """Which options contradict each other, and what would be right."""
     images, page, config, live = arguments.image, arguments.page, arguments.config, arguments.live
     if page and arguments.corners is not None:
@@ -234,7 +218,7 @@ def _say(saved: Saved) -> None:
     print("\n".join(lines), flush=True)
 
 
-def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> None:
+def _serve(arguments: Arguments, session: TeachSession | OutlineSession) -> None:
     """Until the person is done."""
     from gripmon.teach.page_server import TeachSite, serve
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import sys
 import time
@@ -10,26 +9,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import fleet_table
-from gripmon.cli.common import NETWORK_OPTIONS, Command, check_file, network_errors, network_of, positive_number
+from gripmon.cli.common import NETWORK_OPTIONS, Arguments, Command, check_file, positive_number
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.client import AlertLog, Fleet, MonitorStatus
-
-_DESCRIPTION = """\
-A live table of all monitors on the network, the worst first: those that are gone, silent or have no
-transform, then the suspect ones, then by the severest open alert and by drift. A monitor that
-vanished stays listed.
-
-The last column begins with the command to type where a new reference waits for an operator, then has
-the open alerts: !! is for errors, ! for warnings, i for notes, each with their number, so that
-"!!1 !1" is one error and one warning; after them the text of the worst one.
-
-On a terminal the table is drawn anew with every period. Elsewhere one line is printed whenever a
-monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
-
-With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
-when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once."""
 
 _OPTIONS = f"""
 {NETWORK_OPTIONS.format("a monitor's").strip()}
@@ -54,12 +38,25 @@ _ALERT_PERIOD_S = 0.2
 
 
 @Command(
-    "watch", "a live table of all monitors, or their alerts", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "watch", "a live table of all monitors, or their alerts", _OPTIONS, _EXAMPLES,
     period={"type": positive_number, "default": 1.0}, seconds=positive_number,
 )  # fmt: skip
-def watch(arguments: argparse.Namespace) -> None:
-    """Handle ``gripmon watch``."""
-    joined = network_of(arguments)
+def watch(arguments: Arguments) -> None:
+    """A live table of all monitors on the network, the worst first: those that are gone, silent or have no
+    transform, then the suspect ones, then by the severest open alert and by drift. A monitor that
+    vanished stays listed.
+
+    The last column begins with the command to type where a new reference waits for an operator, then has
+    the open alerts: !! is for errors, ! for warnings, i for notes, each with their number, so that
+    "!!1 !1" is one error and one warning; after them the text of the worst one.
+
+    On a terminal the table is drawn anew with every period. Elsewhere one line is printed whenever a
+    monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
+
+    With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
+    when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.
+    """
+    joined = arguments.network()
     if arguments.out and not arguments.alerts:
         raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
     if arguments.alerts and (arguments.once or arguments.transforms):
@@ -69,7 +66,7 @@ def watch(arguments: argparse.Namespace) -> None:
 
     log = _open_log(arguments) if arguments.alerts else None
     heard: dict[str, Any] = {} if log is None else {"on_alert": log.alert, "on_presence": log.presence}
-    with network_errors(arguments):
+    with arguments.network_errors():
         opened = Fleet(**joined, transforms=arguments.transforms, **heard)
     with opened as fleet:
         seconds = 3.0 if arguments.once and arguments.seconds is None else arguments.seconds
@@ -87,7 +84,7 @@ def watch(arguments: argparse.Namespace) -> None:
             _repeat(_Changes(fleet).show, arguments.period, end_s)
 
 
-def _open_log(arguments: argparse.Namespace) -> AlertLog:
+def _open_log(arguments: Arguments) -> AlertLog:
     from gripmon.client import AlertLog
 
     path = arguments.out
@@ -99,7 +96,7 @@ def _open_log(arguments: argparse.Namespace) -> AlertLog:
         raise InputError(f"--out {path}: can't be read ({error.strerror}); a file of your own") from None
 
 
-def _print_alerts(log: AlertLog, arguments: argparse.Namespace) -> None:
+def _print_alerts(log: AlertLog, arguments: Arguments) -> None:
     events, failure = log.write()
     for event in events:
         print(event.line.decode() if arguments.json else fleet_table.event_line(event), flush=True)
@@ -128,7 +125,7 @@ def _fault(fleet: Fleet) -> str:
     return "; ".join(filter(None, (fleet.fault(), unreadable)))
 
 
-def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> None:
+def _show_once(fleet: Fleet, arguments: Arguments) -> None:
     statuses = _sorted(fleet)
     if arguments.json:
         _print_json(fleet)

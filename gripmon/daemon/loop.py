@@ -63,7 +63,6 @@ class Daemon(Loop):
         )  # fmt: skip
         self._monitor = monitor
         self._publisher = publisher
-        self._recorder = recorder
         self._estimates = estimates
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)

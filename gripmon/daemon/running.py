@@ -28,7 +28,7 @@ from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import Alert
 from gripmon.model.stopping import StopRequest, signals_request
-from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
+from gripmon.record.write import Recorder
 
 _UNHURRIED_S = 10.0  # for the recording, when nobody asked for a stop
 _SHORTEST_CLOSE_S = 0.5
@@ -80,7 +80,7 @@ def run_second(
     pulsed: PulsedWatch,
     source: Source,
     publisher: SpotPublisher,
-    recorder: SpotRecorder,
+    recorder: Recorder,
     settings: DaemonSettings,
     *,
     robot: str,
@@ -124,7 +124,7 @@ class _Opened(NamedTuple):
 def _closing(
     source: Source,
     publisher: StatePublisher,
-    recorder: EventRecorder,
+    recorder: Recorder,
     settings: DaemonSettings,
     lines: Path | None,
     stop: StopRequest | None,
@@ -145,7 +145,7 @@ def _closing(
 
 
 def _faults(
-    jaw: JawFeed | None, recorder: EventRecorder, lines: EstimatesFile, keeper: StateKeeper | None
+    jaw: JawFeed | None, recorder: Recorder, lines: EstimatesFile, keeper: StateKeeper | None
 ) -> list[Callable[[], str | None]]:
     """Whom to ask what is wrong, in the order in which it is said."""
     faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]

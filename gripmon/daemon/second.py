@@ -37,7 +37,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import SpotRecorder
+from gripmon.record.write import Recorder
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
@@ -57,7 +57,7 @@ class SecondCamera(Loop):
         pulsed: PulsedWatch,
         source: Source,
         publisher: SpotPublisher,
-        recorder: SpotRecorder,
+        recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
         *,
@@ -81,7 +81,7 @@ class SecondCamera(Loop):
             robot=robot, camera=camera, commands=commands, snapshots=snapshots, reports=reports, notices=notices,
         )  # fmt: skip
         self._pulsed = pulsed
-        self._publisher, self._recorder, self._lines = publisher, recorder, lines
+        self._publisher, self._lines = publisher, lines
         self._table, self._feed = table, feed
         self._no_spot_s = no_spot_alert_after_s
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)

@@ -8,8 +8,9 @@ import gc
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -22,6 +23,7 @@ from gripmon.daemon.network import open_network, open_second_network, with_sourc
 from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
 from gripmon.daemon.running import run, run_second
 from gripmon.daemon.service import log_to_stderr
+from gripmon.io.sources import Source
 from gripmon.judge.statefile import StateFile, StateFileError
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
@@ -29,7 +31,7 @@ from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severit
 from gripmon.model.stopping import StopRequest
 from gripmon.monitor import warm_up
 from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
-from gripmon.record.write import ViewSettings, open_recorder, open_spot_recorder
+from gripmon.record.write import Recorder, ViewSettings, open_recorder
 
 _log = logging.getLogger(__name__)
 
@@ -126,21 +128,10 @@ def run_monitor(
         opened.callback(source.close)
         if compiled:
             _log.info("%s", compiled)
-        with _recording_errors(config, out):
-            recorder = open_recorder(
-                settings.recording,
-                robot=settings.robot,
-                camera_name=settings.camera_name,
-                camera=config.camera,
-                gripper=config.gripper,
-                reference=monitor.reference,
-                directory=out,
-                name=recording_name,
-                truth_tcp_m=truth_tcp_m,
-                patience_s=0.0 if source.live else RECORDING_PATIENCE_S,
-                configuration=to_recorded(config, state),
-                view=None if live is None else live.settings,
-            )
+        recorder = _open_recorder(
+            config, out, source, live, camera=config.camera, gripper=config.gripper, reference=monitor.reference,
+            name=recording_name, truth_tcp_m=truth_tcp_m, configuration=to_recorded(config, state),
+        )  # fmt: skip
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
@@ -184,17 +175,9 @@ def _run_second(
         opened.callback(network.publisher.close)
         source = open_configured(config, network.link)
         opened.callback(source.close)
-        with _recording_errors(config, out):
-            recorder = open_spot_recorder(
-                settings.recording,
-                robot=settings.robot,
-                camera_name=settings.camera_name,
-                calibration=config.calibration,
-                directory=out,
-                patience_s=0.0 if source.live else RECORDING_PATIENCE_S,
-                configuration=second_to_recorded(config),
-                view=None if live is None else live.settings,
-            )
+        recorder = _open_recorder(
+            config, out, source, live, laser=config.calibration, configuration=second_to_recorded(config)
+        )
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
@@ -239,11 +222,17 @@ def _notices(kept: StateFile | None) -> list[Alert]:
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
 
 
-@contextlib.contextmanager
-def _recording_errors(config: Config | SecondConfig, out: Path | None) -> Iterator[None]:
-    """A recording that can't be made as configured."""
+def _open_recorder(
+    config: Config | SecondConfig, out: Path | None, source: Source, live: LiveView | None, **recorded: Any
+) -> Recorder:
+    """Of either kind of camera; ``recorded`` as :func:`gripmon.record.write.open_recorder` takes it."""
+    settings, patience_s = config.settings, 0.0 if source.live else RECORDING_PATIENCE_S
+    view = None if live is None else live.settings
     try:
-        yield
+        return open_recorder(
+            settings.recording, robot=settings.robot, camera_name=settings.camera_name, directory=out,
+            patience_s=patience_s, view=view, **recorded,
+        )  # fmt: skip
     except OSError as error:
         if out is not None:
             raise InputError(f"{out}: can't be written ({error.strerror or error}); another folder") from None

@@ -42,7 +42,7 @@ from gripmon.model.records import (
     accepting,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import EventRecorder
+from gripmon.record.write import Recorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -67,7 +67,7 @@ class Loop(ABC):
         self,
         source: Source,
         publisher: StatePublisher,
-        recorder: EventRecorder,
+        recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
         *,
@@ -79,7 +79,7 @@ class Loop(ABC):
         notices: Sequence[Alert] = (),
     ) -> None:
         self._source = source
-        self._told, self._kept = publisher, recorder
+        self._told, self._recorder = publisher, recorder
         self._settings = settings
         self._robot, self._camera = robot, camera
         self._commands = commands
@@ -158,7 +158,7 @@ class Loop(ABC):
         """Wait for the source and handle what it gives; False if there is nothing more to do."""
         self._obey()
         self._between()
-        if not self._source.live and not self._kept.has_room:
+        if not self._source.live and not self._recorder.has_room:
             time.sleep(_ROOM_POLL_S)
             self._say_state(time.monotonic())
             return True
@@ -180,7 +180,7 @@ class Loop(ABC):
         else:
             self._handle(item)
         watch, now_s, stamp_ns = self._watch, time.monotonic(), time.time_ns()
-        alerts = watch.recording(self._kept.failure, now_s, stamp_ns)
+        alerts = watch.recording(self._recorder.failure, now_s, stamp_ns)
         alerts += watch.dropped(self._source.dropped, now_s, stamp_ns)
         alerts += watch.others(self._not_alone(), now_s, stamp_ns)
         for alert in alerts:
@@ -211,7 +211,7 @@ class Loop(ABC):
         text = said if answer is None else answer.text
         carried_out = answer is not None and answer.done
         told = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
-        self._deliver("command's recording", self._kept.command, told)
+        self._deliver("command's recording", self._recorder.command, told)
         answer = self._settle(answer)
         if answer and answer.done and command.name is CommandName.SNAPSHOT:
             self._deliver("answer", self._snapshots.answer, asked, answer, self._newest)
@@ -257,7 +257,7 @@ class Loop(ABC):
         )
         self._deliver("alert", self._told.alert, message)
         if not recorded:
-            self._deliver("alert's recording", self._kept.alert, message)
+            self._deliver("alert's recording", self._recorder.alert, message)
 
     def _not_alone(self) -> str:
         """What to say while other monitors have this name, else empty: nobody can tell then whose transform is right,
@@ -301,7 +301,7 @@ class Loop(ABC):
             self._service.status(line)
         self._said = self._state_record(verdict, message, now_s, alone=not several)
         self._deliver("state", self._told.state, self._said)
-        self._deliver("state's recording", self._kept.state, self._said)
+        self._deliver("state's recording", self._recorder.state, self._said)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
             self._keep_house()
@@ -323,8 +323,8 @@ class Loop(ABC):
             frames_per_s=watch.frames_per_s(now_s),
             uptime_s=now_s - self._start_s,
             camera_connected=self._source.connected,
-            recording_dropped=self._kept.dropped,
-            recording_images_dropped=self._kept.images_dropped,
+            recording_dropped=self._recorder.dropped,
+            recording_images_dropped=self._recorder.images_dropped,
             message=message,
             version=__version__,
             tcp_shift_m=watch.tcp_shift_m if alone else None,

@@ -1,4 +1,4 @@
-""""""
+"""The plane that laser spots lie on, from how they move as the end-effector is shifted; wrong spots are left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-""""""
+"""Laser spots with the arm's poses that they were seen at: tables of them, read and looked for in images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-""""""
+"""A laser's spot in an image: candidates, with their centres and how exact these are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-""""""
+"""Does a laser calibration still hold?  After every pulse a state, a verdict, and alerts."""
 
 from __future__ import annotations
 

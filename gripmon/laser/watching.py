@@ -1,4 +1,4 @@
-""""""
+"""A second camera's frames and a laser's pulses in, what became of each pulse out."""
 
 from __future__ import annotations
 

@@ -131,12 +131,13 @@ class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
 
 
-class EventRecorder(Protocol):
+class Recorder(Protocol):
     """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.
 
-    ``dropped`` are frames that are not in the recording, ``images_dropped`` images that others lack; ``failure`` says
-    why nothing is being written, None when all is well.  ``has_room``: nothing would be dropped now, or waiting would
-    not help; a source that can wait does until then.
+    A wrist camera's loop has frames to offer and references, a second camera's has spots.  ``dropped`` are frames that
+    are not in the recording, ``images_dropped`` images that others lack; ``failure`` says why nothing is being written,
+    None when all is well.  ``has_room``: nothing would be dropped now, or waiting would not help; a source that can
+    wait does until then.
     """
 
     @property
@@ -148,26 +149,17 @@ class EventRecorder(Protocol):
     @property
     def failure(self) -> str | None: ...
 
-    def alert(self, alert: AlertRecord) -> None: ...
-    def command(self, command: RecordedCommand) -> None: ...
-    def state(self, state: StateRecord) -> None: ...
-    def close(self, timeout_s: float = 2.0) -> None: ...
-
-
-class Recorder(EventRecorder, Protocol):
-    """The recording of a wrist camera."""
-
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
 
-    def reference(self, reference: ReferenceRecord) -> None: ...
-
-
-class SpotRecorder(EventRecorder, Protocol):
-    """The recording of a second camera."""
-
     def spot(self, record: SpotRecord, image: Image | None) -> None:
         """What became of a pulse, with the image in which its spot was looked for."""
+
+    def alert(self, alert: AlertRecord) -> None: ...
+    def reference(self, reference: ReferenceRecord) -> None: ...
+    def command(self, command: RecordedCommand) -> None: ...
+    def state(self, state: StateRecord) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> None: ...
 
 
 class NullRecorder:
@@ -220,28 +212,23 @@ def make_scene(
     name: str,
     robot: str,
     camera_name: str,
-    camera: Camera,
-    gripper: Gripper,
-    reference: ReferenceRecord,
+    camera: Camera | None,
+    gripper: Gripper | None,
+    reference: ReferenceRecord | None,
     has_truth: bool = False,
     configuration: RecordedConfiguration | None = None,
     view: ViewSettings | None = None,
+    laser: LaserCalibration | None = None,
 ) -> Scene:
-    """That of a wrist camera."""
+    """That of a wrist camera, or with a ``laser`` alone of a second camera."""
+    seen_by = camera if laser is None else laser
+    assert seen_by is not None, "a wrist camera, or a second camera's laser"
+    lens = seen_by.settings if isinstance(seen_by, Camera) else seen_by.camera
     return Scene(
-        name=name,
-        recording_id=f"{name}-{uuid.uuid4()}",
-        directory=directory,
-        settings=settings,
-        robot=robot,
-        camera=camera_name,
-        lens=camera.settings,
-        gripper=gripper.model,
-        reference=reference,
-        has_truth=has_truth,
-        configuration=configuration,
-        view=view,
-    )
+        name=name, recording_id=f"{name}-{uuid.uuid4()}", directory=directory, settings=settings, robot=robot,
+        camera=camera_name, lens=lens, gripper=None if gripper is None else gripper.model, reference=reference,
+        laser=laser, has_truth=has_truth, configuration=configuration, view=view,
+    )  # fmt: skip
 
 
 class ImageNote(msgspec.Struct, frozen=True, array_like=True):

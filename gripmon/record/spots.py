@@ -27,7 +27,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gripmon.laser.refinement import Refined
-from gripmon.laser.setup import LaserCalibration, laser_lines, setup_of, spots_on_plane
+from gripmon.laser.setup import LaserCalibration, LaserSetup, laser_lines, setup_of, spots_on_plane
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array, SpotRecord, to_json
@@ -150,15 +150,27 @@ def _band_px(record: SpotRecord) -> list[float]:
 
 def _log_cell(send: Sender, scene: Scene, calibration: LaserCalibration) -> None:
     setup = setup_of(calibration)
-    base_T_cam = invert(setup.cam_T_base)
-    turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
+    turn, centre = _log_camera(send, setup, scene.lens)
     send.static("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.TransformAxes3D(_AXIS_M))
     send.static("base/ee", rr.TransformAxes3D(0.5 * _AXIS_M))
+    send.static("base/camera", rr.TransformAxes3D(0.5 * _AXIS_M))
     middle = turn @ (setup.distance_m / setup.normal_cam[2] * np.array([0.0, 0.0, 1.0])) + centre
     corners = _plane_corners(turn @ setup.normal_cam, middle, _PLANE_SIDE_FRACTION * setup.distance_m)
     send.static("base/plane", _plane(corners, faded(Palette.GOOD, 90)))
-    send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn), rr.TransformAxes3D(0.5 * _AXIS_M))
-    send.static(IMAGE, _pinhole(scene.lens, setup.distance_m))
+
+
+def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> tuple[Array, Array]:
+    """Where it is in the base, rotation (3, 3) and position (3,), and its image."""
+    base_T_cam = invert(setup.cam_T_base)
+    turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
+    send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
+    pinhole = rr.Pinhole(
+        resolution=[lens.width_px, lens.height_px], focal_length=[lens.fx_px, lens.fy_px],
+        principal_point=[lens.cx_px, lens.cy_px], camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.3 * setup.distance_m,
+    )  # fmt: skip
+    send.static(IMAGE, pinhole)
+    return turn, centre
 
 
 def _log_styles(send: Sender) -> None:
@@ -211,19 +223,14 @@ def spot_blueprint(scene: Scene) -> rrb.Blueprint:
 def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
     """Everything in the base frame, the residuals in the camera's image.  OSError if the file can't be written."""
     path.open("wb").close()
-    setup, camera = refined.setup, refined.camera
-    base_T_cam = invert(setup.cam_T_base)
-    turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
+    recording = rr.RecordingStream("gripmon_laser")
+    recording.save(path)
+    setup, log = refined.setup, Sender(recording).static
+    turn, centre = _log_camera(Sender(recording), setup, refined.camera)
     spots = spots_on_plane(setup, base_T_ee)[0] @ turn.T + centre
     origins = laser_lines(setup, base_T_ee)[0] @ turn.T + centre
     seen = np.isfinite(spots).all(axis=1)
     colours = [_USED if used else _LEFT_OUT for used in refined.used]
-    recording = rr.RecordingStream("gripmon_laser")
-    recording.save(path)
-
-    def log(entity: str, archetype: rr.AsComponents) -> None:
-        recording.log(entity, archetype, static=True)
-
     log("base", rr.Transform3D(translation=[0.0, 0.0, 0.0]))
     log("base/axes", rr.Arrows3D(vectors=_AXIS_M * np.eye(3), colors=[(220, 40, 40), (60, 160, 60), (40, 90, 220)]))
     shown = [colours[k] for k in np.flatnonzero(seen)]
@@ -233,8 +240,6 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
     middle = np.median(spots[seen], axis=0)
     side = max(_PLANE_MARGIN * float(np.linalg.norm(spots[seen] - middle, axis=1).max()), _PLANE_LEAST_M)
     log("base/plane", _plane(_plane_corners(normal, middle, side), _PLANE))
-    log("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
-    log("base/camera/image", _pinhole(camera, setup.distance_m))
     log("base/camera/image/spots", rr.Points2D(uv_px, colors=colours, radii=2.0))
     lines = np.stack([uv_px, uv_px - refined.residuals_px], axis=1)[seen]
     log("base/camera/image/residuals", rr.LineStrips2D(lines, colors=_LEFT_OUT))
@@ -253,13 +258,3 @@ def _plane_corners(normal: Array, middle: Array, side: float) -> Array:
 
 def _plane(corners: Array, colour: Colour) -> rr.Mesh3D:
     return rr.Mesh3D(vertex_positions=corners, triangle_indices=[[0, 1, 2], [0, 2, 3]], albedo_factor=colour)
-
-
-def _pinhole(lens: LensSettings, distance_m: float) -> rr.Pinhole:
-    return rr.Pinhole(
-        resolution=[lens.width_px, lens.height_px],
-        focal_length=[lens.fx_px, lens.fy_px],
-        principal_point=[lens.cx_px, lens.cy_px],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=0.3 * distance_m,
-    )

@@ -7,7 +7,6 @@ import logging
 import math
 import threading
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +34,6 @@ from gripmon.model.records import (
 )
 from gripmon.record.process import Health, ImageRing, WorkerProcess
 from gripmon.record.recorder import (
-    EventRecorder,
     Events,
     FrameNote,
     ImageNote,
@@ -44,7 +42,6 @@ from gripmon.record.recorder import (
     Recorder,
     RecordingSettings,
     Scene,
-    SpotRecorder,
     Status,
     Trace,
     ViewSettings,
@@ -53,18 +50,15 @@ from gripmon.record.recorder import (
 )
 
 __all__ = [
-    "EventRecorder",
     "Notes",
     "NullRecorder",
     "ProcessRecorder",
     "Recorder",
     "RecordingSettings",
-    "SpotRecorder",
     "Trace",
     "ViewSettings",
     "make_scene",
     "open_recorder",
-    "open_spot_recorder",
 ]
 
 _log = logging.getLogger(__name__)
@@ -395,9 +389,10 @@ def open_recorder(
     *,
     robot: str,
     camera_name: str,
-    camera: Camera,
-    gripper: Gripper,
-    reference: ReferenceRecord,
+    camera: Camera | None = None,
+    gripper: Gripper | None = None,
+    reference: ReferenceRecord | None = None,
+    laser: LaserCalibration | None = None,
     directory: Path | None = None,
     name: str | None = None,
     truth_tcp_m: Truth | None = None,
@@ -407,60 +402,26 @@ def open_recorder(
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
 
-    ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  ``truth_tcp_m``,
-    which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
-    the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  ``patience_s`` is
-    for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a frame.  A camera
-    can't wait: 0.  ``configuration`` is written into every file.  With ``view`` viewers may connect and see what is
-    recorded as it comes, also where nothing is recorded.  Raises OSError when the directory can't be made.
+    A wrist camera has a ``camera``, a ``gripper`` and a ``reference``; a second camera a ``laser``, and every image of
+    it is recorded.  ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.
+    ``truth_tcp_m``, which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame;
+    its shift against the reference is drawn beside the estimated one.  It is called by another thread than the loop's.
+    ``patience_s`` is for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a
+    frame.  A camera can't wait: 0.  ``configuration`` is written into every file.  With ``view`` viewers may connect
+    and see what is recorded as it comes, also where nothing is recorded.  Raises OSError when the directory can't be
+    made.
     """
     if not settings.enabled and view is None:
         return NullRecorder()
-    where = _directory(settings, directory)
-    name = _name(robot, camera_name) if name is None else name
+    where = Path(settings.directory) if directory is None else directory
+    if settings.enabled:
+        where.mkdir(parents=True, exist_ok=True)
+    if name is None:
+        name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
+    if laser is not None:
+        settings = msgspec.structs.replace(settings, image_every=1)
     scene = make_scene(
-        settings, where, name, robot, camera_name, camera, gripper, reference, truth_tcp_m is not None, configuration,
-        view,
+        settings, str(where.resolve()), name, robot, camera_name, camera, gripper, reference, truth_tcp_m is not None,
+        configuration, view, laser,
     )  # fmt: skip
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
-
-
-def open_spot_recorder(
-    settings: RecordingSettings,
-    *,
-    robot: str,
-    camera_name: str,
-    calibration: LaserCalibration,
-    directory: Path | None = None,
-    patience_s: float = 0.0,
-    configuration: RecordedConfiguration | None = None,
-    view: ViewSettings | None = None,
-) -> SpotRecorder:
-    """The same for a second camera: every pulse with its image."""
-    if not settings.enabled and view is None:
-        return NullRecorder()
-    name = _name(robot, camera_name)
-    scene = Scene(
-        name=name,
-        recording_id=f"{name}-{uuid.uuid4()}",
-        directory=_directory(settings, directory),
-        settings=msgspec.structs.replace(settings, image_every=1),
-        robot=robot,
-        camera=camera_name,
-        lens=calibration.camera,
-        laser=calibration,
-        configuration=configuration,
-        view=view,
-    )
-    return ProcessRecorder(scene, None, patience_s)
-
-
-def _directory(settings: RecordingSettings, directory: Path | None) -> str:
-    folder = Path(settings.directory) if directory is None else directory
-    if settings.enabled:
-        folder.mkdir(parents=True, exist_ok=True)
-    return str(folder.resolve())
-
-
-def _name(robot: str, camera_name: str) -> str:
-    return f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"

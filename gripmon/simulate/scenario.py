@@ -17,6 +17,9 @@ Positive = Annotated[float, Meta(gt=0.0, le=0.5, description="(m)")]
 Angle = Annotated[float, Meta(ge=-180.0, le=180.0, description="(degrees)")]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0, description="share (0 to 1)")]
 Shift = tuple[Length, Length, Length]
+_NONE = (0.0, 0.0, 0.0)
+_BOX_M, _BAR_M = (0.026, 0.036, 0.04), (0.12, 0.01, 0.01)
+_LAMP = (0.4, -0.55, -0.75)
 
 
 class _Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -34,11 +37,7 @@ class MountMotion(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         tuple[Length, Length], Meta(description="shift of the TCP along camera x and y by turning about the pivot (m)")
     ] = (0.0, 0.0)
     roll_deg: Annotated[Angle, Meta(description="turn about the line from the pivot to the TCP (degrees)")] = 0.0
-    translation_m: Annotated[Shift, Meta(description="shift of the gripper in camera axes without turning (m)")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    translation_m: Annotated[Shift, Meta(description="shift of the gripper in camera axes without turning (m)")] = _NONE
 
 
 class Creep(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="creep"):
@@ -126,11 +125,7 @@ class GraspedObject(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=
     Its far side lies ``depth_m`` beyond the TCP (+z).  ``jaw`` of the scenario has to close on its width.
     """
 
-    size_m: Annotated[tuple[Positive, Positive, Positive], Meta(description="x across the jaws, y, z (m)")] = (
-        0.026,
-        0.036,
-        0.04,
-    )
+    size_m: Annotated[tuple[Positive, Positive, Positive], Meta(description="x across the jaws, y, z (m)")] = _BOX_M
     depth_m: Annotated[Length, Meta(description="z of its far side in the gripper frame (m)")] = 0.022
     side_m: Annotated[Length, Meta(description="y of its centre in the gripper frame (m)")] = 0.0
     distance_m: Annotated[Positive, Meta(description="how far away it lies before and after (m)")] = 0.15
@@ -152,19 +147,11 @@ class Prop(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ] = "box"
     size_m: Annotated[
         tuple[Positive, Positive, Positive], Meta(description="of a box: x across the jaws, y, z (m)")
-    ] = (
-        0.12,
-        0.01,
-        0.01,
-    )
+    ] = _BAR_M
     centre_m: Annotated[
         Shift, Meta(description="gripper frame: centre of a box, shift of the copies, place of the mirror (z) (m)")
     ] = (0.0, 0.0, 0.03)
-    turn_deg: Annotated[tuple[Angle, Angle, Angle], Meta(description="rotation vector of a box (degrees)")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    turn_deg: Annotated[tuple[Angle, Angle, Angle], Meta(description="rotation vector of a box (degrees)")] = _NONE
     look: ObjectLook = ObjectLook(pattern="plain")
     start_s: Time = 0.0
     end_s: Time = 1e7
@@ -241,11 +228,7 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ambient: Annotated[Fraction, Meta(description="share of the light without direction (0 to 1)")] = 0.35
     lamp_cam: Annotated[
         tuple[float, float, float], Meta(description="direction to the lamp, camera axes (no unit)")
-    ] = (
-        0.4,
-        -0.55,
-        -0.75,
-    )
+    ] = _LAMP
     texture: Annotated[
         Fraction, Meta(description="strength of the brushed texture and scratches (0 to 1; 0: even faces)")
     ] = 0.12

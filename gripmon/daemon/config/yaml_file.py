@@ -1,9 +1,8 @@
-"""YAML as people mean it: duplicate keys refused, ``1e-3`` is a number, ``on`` and ``12:30`` are text."""
+"""Files of ours in YAML, read as settings and written."""
 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,60 +10,10 @@ import msgspec
 import yaml
 
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
+from gripmon.model.yaml_text import Loader, YamlFault, parse_yaml
 
 _T = TypeVar("_T")
-_TAG = "tag:yaml.org,2002:"
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """Scalars by the core schema of YAML 1.2 instead of 1.1."""
-
-
-_Loader.yaml_implicit_resolvers = {}
-for _tag, _pattern, _first in (
-    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    ("null", r"~|null|Null|NULL|", "~nN"),
-    ("int", r"[-+]?[0-9]+", "-+0123456789"),
-    (
-        "float",
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        "-+.0123456789",
-    ),
-):
-    _Loader.add_implicit_resolver(
-        _TAG + _tag, re.compile(rf"^(?:{_pattern})$"), [*_first, ""] if _tag == "null" else list(_first)
-    )
-
-
-def _integer(_loader: _Loader, node: yaml.ScalarNode) -> int:
-    return int(node.value)  # 010 is ten, as in YAML 1.2
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: dict[Any, int] = {}
-    for key_node, _value in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        line = key_node.start_mark.line + 1
-        if not isinstance(key, str):
-            raise _DuplicateOrStrangeKeyError(
-                line, f"the key {key!r} is not text", "a name; quotes around it if it looks like a number"
-            )
-        if key in seen:
-            raise _DuplicateOrStrangeKeyError(
-                line, f"the key '{key}' is there twice, first in line {seen[key]}", "each key once"
-            )
-        seen[key] = line
-    return dict(loader.construct_pairs(node, deep=True))
-
-
-_Loader.add_constructor(_TAG + "int", _integer)
-_Loader.add_constructor(_TAG + "map", _mapping)
-
-
-class _DuplicateOrStrangeKeyError(Exception):
-    def __init__(self, line: int, wrong: str, right: str):
-        super().__init__(wrong)
-        self.line, self.wrong, self.right = line, wrong, right
+_LINES, _SEE = "`key: value` lines, indented with blanks", "`key: value` lines; see configs/demo.yaml"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -80,21 +29,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(path, "", f"can't be read ({error.strerror})", "a readable YAML file") from None
     try:
-        value = yaml.load(text, _Loader)
-    except _DuplicateOrStrangeKeyError as error:
-        raise ConfigError(path, f"line {error.line}", error.wrong, error.right) from None
-    except yaml.MarkedYAMLError as error:
-        line = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        problem = error.problem or error.context or "malformed"
-        raise ConfigError(path, line, f"not YAML: {problem}", "`key: value` lines, indented with blanks") from None
-    except RecursionError:
-        raise ConfigError(path, "", "is nested too deeply", "`key: value` lines; see configs/demo.yaml") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(path, "", f"not YAML: {error}", "`key: value` lines, indented with blanks") from None
+        value = parse_yaml(text)
+    except YamlFault as fault:
+        raise ConfigError(path, fault.where, fault.wrong, fault.right or (_LINES if fault.where else _SEE)) from None
     if value is None:
-        raise ConfigError(path, "", "is empty", "`key: value` lines; see configs/demo.yaml")
+        raise ConfigError(path, "", "is empty", _SEE)
     if not isinstance(value, dict):
-        raise ConfigError(path, "", f"holds {_kind(value)}", "`key: value` lines; see configs/demo.yaml")
+        raise ConfigError(path, "", f"holds {_kind(value)}", _SEE)
     return value
 
 
@@ -125,11 +66,11 @@ def _kind(value: object) -> str:
     return "a list" if isinstance(value, list) else f"a single value {value!r}"
 
 
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # as above
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     """Quotes just what the loader here would take for something else than text."""
 
 
-_Dumper.yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+_Dumper.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers
 
 
 def as_yaml(value: dict[str, Any]) -> str:

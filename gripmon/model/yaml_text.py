@@ -1,0 +1,76 @@
+"""YAML as people mean it: duplicate keys refused, ``1e-3`` is a number, ``on`` and ``12:30`` are text."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import yaml
+
+_TAG = "tag:yaml.org,2002:"
+
+
+class YamlFault(Exception):
+    """A text that can't be read: ``where`` (``line 3``, or empty) something is ``wrong``, and what would be ``right``
+    where that isn't the same for every file.
+    """
+
+    def __init__(self, where: str, wrong: str, right: str = "") -> None:
+        super().__init__(wrong)
+        self.where, self.wrong, self.right = where, wrong, right
+
+
+class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+    """Scalars by the core schema of YAML 1.2 instead of 1.1."""
+
+
+Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", r"~|null|Null|NULL|", "~nN"),
+    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+):
+    Loader.add_implicit_resolver(
+        _TAG + _tag, re.compile(rf"^(?:{_pattern})$"), [*_first, ""] if _tag == "null" else list(_first)
+    )
+
+
+def _integer(_loader: Loader, node: yaml.ScalarNode) -> int:
+    return int(node.value)  # 010 is ten, as in YAML 1.2
+
+
+def _mapping(loader: Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: dict[Any, int] = {}
+    for key_node, _value in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        line = key_node.start_mark.line + 1
+        if not isinstance(key, str):
+            right = "a name; quotes around it if it looks like a number"
+            raise YamlFault(f"line {line}", f"the key {key!r} is not text", right)
+        if key in seen:
+            wrong = f"the key '{key}' is there twice, first in line {seen[key]}"
+            raise YamlFault(f"line {line}", wrong, "each key once")
+        seen[key] = line
+    return dict(loader.construct_pairs(node, deep=True))
+
+
+Loader.add_constructor(_TAG + "int", _integer)
+Loader.add_constructor(_TAG + "map", _mapping)
+
+
+def parse_yaml(text: str) -> Any:
+    """What a document holds.  Raises :class:`YamlFault`."""
+    try:
+        return yaml.load(text, Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise YamlFault(line, f"not YAML: {error.problem or error.context or 'malformed'}") from None
+    except RecursionError:
+        raise YamlFault("", "is nested too deeply") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise YamlFault("", f"not YAML: {error}") from None
