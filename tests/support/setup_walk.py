@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -36,6 +36,9 @@ for (const [k, a] of seen.entries()) {
 if (wide > innerWidth) out.push(`wider than the window: ${wide}`);
 return out;
 """
+
+
+At = Callable[[str], object]
 
 
 class Walker(Visitor):
@@ -97,33 +100,21 @@ class Walker(Visitor):
         return out
 
 
-def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -> None:
-    """From the first step to a monitor that has seen all images; ``at`` hears the name of each step done."""
+def walk(visitor: Walker, user: new_user.NewUser, at: At) -> None:
+    """With a gripper that is inferred from the plate, to a monitor that has seen all images; ``at`` hears the name of
+    each step done.
+    """
     folder, rng = user.folder, np.random.default_rng(4)
     clicks = user.rough_px(rng, off_px=4.0)
-    visitor.fill(source=str(folder / "work"), robot="arm1")
-    visitor.press("step")
-    visitor.done("camera")
-    at("camera")
-    visitor.press("on")
-    visitor.press("step")
-    visitor.done("target")
-    at("target")
-    visitor.press("on")
+    _camera_and_target(visitor, folder / "work", at)
     visitor.fill(plate_source=str(folder / "plate"))
     _take_all(visitor, "12 taken")
     at("plate")
     visitor.press("on")
     visitor.fill(model="paper")
-    visitor.press("step")
-    visitor.done("intrinsics")
-    at("intrinsics")
-    visitor.press("on")
+    _do(visitor, "intrinsics", at)
     visitor.fill(jaw_range="0:0.06")
-    visitor.press("step")
-    visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "what becomes of the gripper")
-    at("gripper")
-    visitor.go("standing")
+    _do(visitor, "gripper", at)
     visitor.fill(standing_source=str(folder / "standing"))
     _take_all(visitor, "3 taken")
     at("standing")
@@ -131,10 +122,58 @@ def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -
     _by_hand(visitor, {name: (float(u), float(v)) for name, (u, v) in clicks.items()}, at, "corners")
     visitor.done("corners")
     visitor.press("on")
+    _do(visitor, "reference", at)
+    _work_to_the_end(visitor, at)
+
+
+def walk_with_a_model(
+    visitor: Walker,
+    work: Path,
+    camera: Path,
+    gripper: Mapping[str, str],
+    reference: Mapping[str, str],
+    at: At,
+    **teaching: object,
+) -> None:
+    """The same with a lens from a file and a gripper from CAD or images: nothing stands on the target.
+
+    ``gripper`` and ``reference``: what is said in these steps, of the latter nothing where it comes with the gripper;
+    ``teaching`` as for the last steps.
+    """
+    _camera_and_target(visitor, work, at)
+    visitor.go("intrinsics")
+    visitor.fill(intrinsics_by="a file")
+    visitor.fill(camera_file=str(camera))
+    _do(visitor, "intrinsics", at)
+    for name, value in gripper.items():
+        visitor.fill(**{name: value})
+    _do(visitor, "gripper", at)
+    if reference:
+        for name, value in reference.items():
+            visitor.fill(**{name: value})
+        visitor.press("step")
+        visitor.wait(lambda: visitor.progress("standing") == "skipped", "a reference of another kind")
+        visitor.press("on")
+        _do(visitor, "reference", at)
+    _work_to_the_end(visitor, at, **teaching)  # type: ignore[arg-type]
+
+
+def _camera_and_target(visitor: Walker, work: Path, at: At) -> None:
+    visitor.fill(source=str(work), robot="arm1")
+    _do(visitor, "camera", at)
+    _do(visitor, "target", at)
+
+
+def _do(visitor: Walker, step: str, at: At) -> None:
+    """A step, and on to the next one."""
     visitor.press("step")
-    visitor.done("reference")
-    at("reference")
+    visitor.done(step)
+    at(step)
     visitor.press("on")
+
+
+def _work_to_the_end(visitor: Walker, at: At, *, opening_mm: str = "", taught: bool = True) -> None:
+    """An image at work, teaching on it, forecast, and the monitor until the images end."""
     visitor.press("step")
     visitor.wait(lambda: "ready to be taken" in visitor.text("#status"), "the first image")
     visitor.press("take")
@@ -142,13 +181,10 @@ def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -
     at("teaching")
     visitor.press("stop")
     visitor.press("on")
-    _by_hand(visitor, {}, at, "teach")
+    _by_hand(visitor, {}, at, "teach", opening_mm=opening_mm, taught=taught)
     visitor.done("teach")
     visitor.press("on")
-    visitor.press("step")
-    visitor.done("check")
-    at("check")
-    visitor.press("on")
+    _do(visitor, "check", at)
     visitor.press("step")
     visitor.wait(lambda: visitor.script("return document.querySelector('#shown')?.naturalWidth > 0"), "the overlay")
     at("running")
@@ -162,7 +198,15 @@ def _take_all(visitor: Walker, words: str) -> None:
     visitor.wait(lambda: "no more images" in visitor.text("#status") and words in visitor.text("#status"), words)
 
 
-def _by_hand(visitor: Walker, corners: dict[str, tuple[float, float]], at: Callable[[str], object], name: str) -> None:
+def _by_hand(
+    visitor: Walker,
+    corners: dict[str, tuple[float, float]],
+    at: At,
+    name: str,
+    *,
+    opening_mm: str = "",
+    taught: bool = True,
+) -> None:
     """On the teaching page, and back."""
     visitor.press("step")
     visitor.on_page("#stage")
@@ -170,7 +214,13 @@ def _by_hand(visitor: Walker, corners: dict[str, tuple[float, float]], at: Calla
     visitor.settle()
     for corner, (u, v) in corners.items():
         visitor.drag(corner, u, v)
+    if opening_mm:
+        typed = "const i = document.querySelector('#opening'); i.value = arguments[0];"
+        visitor.script(f"{typed} i.dispatchEvent(new Event('change'))", opening_mm)
+        visitor.settle()
     at(name)
+    if not taught:
+        visitor.click("#save-taught")
     visitor.click("#save")
     visitor.wait(lambda: "next:" in visitor.text("#saved"), "the files")
     visitor.click("#done")

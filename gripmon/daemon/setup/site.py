@@ -236,6 +236,7 @@ class SetupSite:
     def _open(self, order: Do) -> dict[str, str]:
         """A teaching page; where it is."""
         self._named(order.step, "page")
+        self._keep(order.values)
         self._let_go()
         self._close_page()
         state = next(each for each in self._project.states() if each.name == order.step)

@@ -54,7 +54,8 @@ function tell() {
   else if (reply.refused) panel.status(`${reply.refused[0].toUpperCase()}${reply.refused.slice(1)}.`, missing > 0 ? "" : "warn");
   else {
     const measured = reply.corners.filter((corner) => corner.uv_px).length;
-    const found = `${measured} of ${reply.corners.length} corners measured; ${Math.round(100 * reply.share)} % of the edges agree.`;
+    const corners_ = reply.corners.length ? `${measured} of ${reply.corners.length} corners measured; ` : "";
+    const found = `${corners_}${Math.round(100 * reply.share)} % of the edges agree.`;
     panel.status(reply.reference ? found : `${found} ${reply.no_reference}`, reply.reference ? "good" : "warn");
   }
 }
