@@ -6,19 +6,25 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from support import new_user
+from support.loopback import wait_for_default_port
 from support.teach_page_browser import ROOT, Visitor, browser, page
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
 WIDTHS = (375, 1100, 1920)
+WIDE = 1150
+"""Of the pictures, px."""
 _CONTROLS = """
 const seen = [...document.querySelectorAll("button, input, select, a, label.check")]
   .filter((node) => node.checkVisibility({visibilityProperty: true}) && node.getBoundingClientRect().width > 0);
@@ -236,32 +242,51 @@ def _by_hand(
     visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page again")
 
 
-_SHOWN = {"plate": 1150, "corners": 1150, "check": 1150, "run": 1150}
+def _draw(driver: Any, folder: Path, go: Callable[[Walker, At], None], **names: str) -> None:
+    """Pictures of the page after these steps, by the names of their files."""
+    out = ROOT / "docs" / "tutorials"
+    wait_for_default_port()
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+
+        def at(step: str) -> None:
+            if step not in names:
+                return
+            visitor.sized(WIDE, 760)
+            time.sleep(0.5)
+            height = visitor.script("return document.documentElement.scrollHeight")
+            visitor.sized(WIDE, min(int(height), 1300))
+            time.sleep(0.5)
+            visitor.script("const f = document.querySelector('#folder'); if (f) f.textContent = '\\u200e/home/me/arm1'")
+            shown = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+            cv2.imwrite(str(out / f"{names[step]}.jpg"), shown, [cv2.IMWRITE_JPEG_QUALITY, 70])
+            visitor.sized(1400)
+
+        go(visitor, at)
 
 
 def main() -> None:
     """Draw the pictures."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    out, driver = ROOT / "docs" / "tutorials", browser()
+    sys.path.insert(0, str(ROOT / "tools"))  # of rounded fingers
+    from support.other_grippers import rounded_tips
+
+    driver = browser()
     with tempfile.TemporaryDirectory() as name:
-        user = new_user.make(Path(name))
-        with page(Path(name) / "arm1", command=("setup",)) as running:
-            visitor = Walker(driver, running.url)
+        folder = Path(name)
+        # Paths as somebody types them beside the project.
+        user = replace(new_user.make(folder), folder=Path(".."))
+        shown = {step: f"setup_{step}" for step in ("plate", "corners", "check", "run")}
+        _draw(driver, folder / "arm1", lambda visitor, at: walk(visitor, user, at), **shown)
+        (folder / "round").mkdir()
+        rounded_tips(folder / "round")
+        work, camera = Path("../round/work"), Path("../arm1/camera.yaml")
+        answers = {"gripper": "from images", "free_images": "../round/free", "distance": "0.115:0.002"}
 
-            def at(step: str) -> None:
-                if step not in _SHOWN:
-                    return
-                visitor.sized(_SHOWN[step], 760)
-                time.sleep(0.5)
-                height = visitor.script("return document.documentElement.scrollHeight")
-                visitor.sized(_SHOWN[step], min(int(height), 1300))
-                time.sleep(0.5)
-                visitor.script("const f = document.querySelector('#folder'); if (f) f.textContent = '/home/me/arm1'")
-                picture = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
-                cv2.imwrite(str(out / f"setup_{step}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
-                visitor.sized(1400)
+        def go(visitor: Walker, at: At) -> None:
+            walk_with_a_model(visitor, work, camera, answers, {}, at)
 
-            walk(visitor, user, at)
+        _draw(driver, folder / "arm2", go, gripper="setup_from_images", teach="setup_round")
     driver.quit()
 
 

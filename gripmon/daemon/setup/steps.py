@@ -238,7 +238,7 @@ STEPS = (
         "target (straight fingers), a file of the library or your own, from CAD, or from images before changing "
         "backgrounds.", "form", "Use it", (), ("gripper.yaml",), _gripper,
         (
-            Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_FILE)),
+            Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_IMAGES, FROM_CAD, FROM_FILE)),
             Field("gripper_file", "file", "", "a gripper file", (), ("gripper", (FROM_FILE,))),
             Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one a finger or one for both; or a URDF", (),
                   ("gripper", (FROM_CAD,))),
