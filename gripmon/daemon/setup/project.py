@@ -148,7 +148,7 @@ class Project:
         inferred = step.name == "gripper" and self.values["gripper"] == steps.INFERRED
         if inferred or step.name in ("camera", "target"):
             done = self._accepted.get(step.name) == self._said(step)
-            return "done" if done else "ready", "comes with hand and eye" if inferred else ""
+            return ("done", "comes with hand and eye" if inferred else "") if done else ("ready", "")
         if not needs_doing:
             by = "intrinsics_by" if step.name == "plate" else "reference_by"
             return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
