@@ -148,6 +148,14 @@ def test_the_page_works_in_a_browser_without_a_network(reported: tuple[Path, Rep
     browser.find_element(By.CSS_SELECTOR, "[data-plot]").click()
     shown = "return document.getElementById('drift-1-figure').layout.xaxis.autorange"
     wait.until(lambda b: b.execute_script(shown) is False)
+    # In other windows the plots are as high as before, not squeezed.
+    heights = "return [...document.querySelectorAll('.plot')].map((plot) => plot._fullLayout.height)"
+    widths, before = heights.replace("height", "width"), browser.execute_script(heights)
+    for width_px in (900, 600):
+        wide = browser.execute_script(widths)
+        browser.set_window_size(width_px, 900)
+        wait.until(lambda b, w=wide: all(now < then for now, then in zip(b.execute_script(widths), w, strict=True)))
+    assert browser.execute_script(heights) == before
     for button in browser.find_elements(By.CSS_SELECTOR, ".modebar-btn"):
         assert "cloud" not in (button.get_attribute("data-title") or "").lower()
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]

@@ -275,24 +275,49 @@ def test_steps_are_a_chain(tmp_path: Path):
 def test_grippers_from_cad_and_images_are_commands(tmp_path: Path):
     project = Project(tmp_path)
     (tmp_path / "camera.yaml").write_text("")
-    project.keep(
-        {"gripper": "from CAD", "gripper_file": "l.stl 'my r.stl'", "gripper_options": "--unit mm --view 0.12:30"}
-    )
-    project.keep({"jaw_range": "0:0.06"})
+    project.keep({"gripper": "from CAD", "cad_files": "l.stl 'my r.stl'", "cad_unit": "mm", "cad_view": "0.12:30"})
+    project.keep({"jaw_range": "0:0.06", "options": "--length 0.04"})
     words, written = (
         "gripmon gripper from-cad l.stl 'my r.stl' --jaw-range 0:0.06 --unit mm",
         "--out gripper.yaml --force",
     )
-    view = "--view 0.12:30 --camera camera.yaml --picture gripper.png"
+    view = "--view 0.12:30 --length 0.04 --camera camera.yaml --picture gripper.png"
     assert project.states()[4].command == f"{words} {view} {written}" and project.states()[4].progress == "ready"
-    project.keep({"gripper": "from images", "gripper_file": "free", "gripper_options": "--distance 0.12:0.003"})
+    project.keep({"gripper": "from images", "free_images": "free", "distance": "0.12:0.003", "options": ""})
     words = "gripmon gripper from-images free --camera camera.yaml --distance 0.12:0.003 --picture gripper.png"
     assert project.states()[4].command == f"{words} --reference-out hand_eye.yaml {written}"
-    project.keep({"gripper_options": "'"})
+    # Images of the camera itself are those of a later step, which then waits for no gripper.
+    project.keep({"free_images": "teaching"})
+    assert [project.states()[k].note for k in (4, 8)] == ["first: Gripper at work (teaching)", "0 images"]
+    assert project.states()[8].progress == "ready"
+    project.keep({"options": "'"})
     assert "words as on a command line" in project.states()[4].note
     project.keep({"gripper": "two_box_fingers", "reference_by": "with the gripper's images"})
     with pytest.raises(InputError, match="no images gave this gripper"):
         project.do("standing")
+
+
+def test_a_lens_from_a_file_needs_no_images_of_the_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    project, other = Project(tmp_path), "gripmon calibrate import given.yaml --out camera.yaml --force"
+    project.keep({"intrinsics_by": "a file", "camera_file": "given.yaml"})
+    assert [state.progress for state in project.states()][2:4] == ["skipped", "ready"]
+    (tmp_path / "given.yaml").write_text("camera_name: of another program\n")
+    assert project.states()[3].command == other
+    (tmp_path / "given.yaml").write_text("schema: gripmon.camera_calibration/1\n")
+    assert project.states()[3].command == "cp given.yaml camera.yaml"
+
+
+def test_an_inferred_gripper_is_a_step_that_is_said(tmp_path: Path):
+    """Its jaw range would be forgotten else."""
+    project = Project(tmp_path)
+    assert project.states()[4].progress == "ready"
+    project.keep({"jaw_range": "0:0.06", "jaw_opening": "0.05"})
+    project.do("gripper")
+    assert project.states()[4].progress == "done" and "--jaw-range 0:0.06" in project.states()[7].command
+    assert "--jaw-opening 0.05" in project.states()[7].command
+    project.keep({"jaw_range": "0:0.07"})
+    assert project.states()[4].progress == "ready"
 
 
 def test_what_the_ruler_says_scales_the_target(tmp_path: Path):

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import yaml
 from support import new_user
 from support.loopback import wait_for_default_port
-from support.setup_walk import Walker, walk
+from support.other_grippers import STEP, curved_meshes, rounded_tips
+from support.setup_walk import Walker, walk, walk_with_a_model
 from support.simulated import BOX_FINGERS
 from support.teach_page_browser import browser, page
 
 from gripmon.daemon.config import load_config
-from gripmon.model.geometry import perturbation_between
+from gripmon.model.geometry import from_record, invert, perturbation_between
+from gripmon.model.records import Array, FrameRecord, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +40,10 @@ def driver() -> Iterator[Any]:
 Walked = tuple[Path, dict[str, Any]]
 
 
-@pytest.fixture(scope="module")
-def walked(user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Walked:
-    """The project of a person who went the whole way, and what the page looked like after each step."""
+def gone(folder: Path, driver: Any, go: Callable[[Walker, Callable[[str], object]], None]) -> Walked:
+    """Somebody goes a whole way; the page after each step."""
     wait_for_default_port()
-    folder, seen = tmp_path_factory.mktemp("way") / "arm1", {}
+    seen: dict[str, Any] = {}
     with page(folder, command=("setup",)) as running:
         visitor = Walker(driver, running.url)
 
@@ -49,11 +51,18 @@ def walked(user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPat
             seen[step] = {"ugly": visitor.ugly(), "status": visitor.text("#status"), "said": visitor.text("#said")}
             seen[step] |= {"command": visitor.text("#command code"), "log": visitor.text("#log")}
 
-        walk(visitor, user, at)
+        go(visitor, at)
         assert visitor.complaints() == []
         visitor.click("#done")
         assert running.ended() == (0, "")
     return folder, seen
+
+
+@pytest.fixture(scope="module")
+def walked(user: new_user.NewUser, driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Walked:
+    """The project of a person who went the whole way."""
+    folder = tmp_path_factory.mktemp("way") / "arm1"
+    return gone(folder, driver, lambda visitor, at: walk(visitor, user, at))
 
 
 def test_from_nothing_to_a_running_monitor(user: new_user.NewUser, walked: Walked):
@@ -72,6 +81,69 @@ def test_from_nothing_to_a_running_monitor(user: new_user.NewUser, walked: Walke
     commands = {step: each["command"] for step, each in seen.items()}
     assert commands["intrinsics"].startswith("gripmon calibrate intrinsics plate --target circles:12x10:0.008:0.004")
     assert "--infer" in commands["reference"] and commands["run"] == "gripmon run config.yaml --out run"
+
+
+def held_against(truth: Array, folder: Path) -> tuple[float, float]:
+    """Share of ``valid`` frames before the knock and after it, none of which misleads: none is farther from the true
+    motion (frames, 4, 4) than it promises.
+    """
+    reference = load_config(folder / "config.yaml").cam_T_grip
+    true_T_made = invert(truth[0]) @ reference
+    lines = (folder / "run" / "estimates.jsonl").read_bytes().splitlines()
+    records = [msgspec.json.decode(line, type=FrameRecord) for line in lines]
+    assert len(records) == len(truth)
+    valid = []
+    for record, true in zip(records, truth, strict=True):
+        valid.append(record.verdict is Verdict.VALID)
+        if valid[-1]:
+            assert record.cam_T_grip is not None and record.protection is not None
+            error = perturbation_between(true @ true_T_made, from_record(record.cam_T_grip))
+            assert np.linalg.norm(error[:3]) < record.protection.position_m
+    return float(np.mean(valid[:STEP])), float(np.mean(valid[STEP:]))
+
+
+@pytest.mark.usefixtures("tools_importable")
+@pytest.mark.slow("some 60 s; the box's walk guards the page, test_gripper_from_images.py the model")
+def test_the_same_with_rounded_tips_from_images(walked: Walked, driver: Any, tmp_path: Path):
+    truth = rounded_tips(tmp_path)
+    answers = {"gripper": "from images", "free_images": str(tmp_path / "free"), "distance": "0.115:0.002"}
+    camera = walked[0] / "camera.yaml"
+    folder, seen = gone(
+        tmp_path / "arm1",
+        driver,
+        lambda visitor, at: walk_with_a_model(visitor, tmp_path / "work", camera, answers, {}, at),
+    )
+    assert {step: each["ugly"] for step, each in seen.items() if each["ugly"]} == {}
+    assert "the reference comes with it" in seen["gripper"]["said"]
+    assert seen["gripper"]["command"].startswith("gripmon gripper from-images")
+    assert "of 0 corners" not in seen["teach"]["status"] and "of the edges agree" in seen["teach"]["status"]
+    assert "FAIL" not in seen["check"]["said"] and "against the reference" in seen["run"]["log"]
+    before, after = held_against(truth, folder)
+    assert before > 0.5 and after > 0.0
+
+
+@pytest.mark.slow("some 60 s; the box's walk guards the page, test_gripper_cad_tracked.py the model")
+def test_the_same_with_a_gripper_from_cad_and_the_robots_own_calibration(walked: Walked, driver: Any, tmp_path: Path):
+    truth = curved_meshes(tmp_path)
+    meshes = f"{tmp_path / 'finger0.stl'} {tmp_path / 'finger1.stl'}"
+    gripper = {
+        "gripper": "from CAD", "cad_files": meshes, "cad_unit": "mm", "cad_view": "0.115:32", "jaw_range": "0:0.06",
+        "options": "--length 0.035",
+    }  # fmt: skip
+    reference = {"reference_by": "a file", "reference_file": str(tmp_path / "robot.yaml")}
+    # Curved outlines aren't taught; the page says so, and saves without.
+    folder, seen = gone(
+        tmp_path / "arm1",
+        driver,
+        lambda visitor, at: walk_with_a_model(
+            visitor, tmp_path / "work", walked[0] / "camera.yaml", gripper, reference, at, opening_mm="30", taught=False
+        ),
+    )
+    assert {step: each["ugly"] for step, each in seen.items() if each["ugly"]} == {}
+    assert "TCP at 0.4, 1.3, 115.0 mm" in seen["reference"]["said"]
+    assert "FAIL" not in seen["check"]["said"] and "stopped after 60 frames" in seen["run"]["log"]
+    before, after = held_against(truth, folder)
+    assert before > 0.9 and after > 0.5
 
 
 def test_nothing_overflows_or_overlaps_at_three_widths(walked: Walked):
@@ -173,7 +245,7 @@ def test_later_steps_refuse_in_one_line_and_keep_what_is_there(walked: Walked, d
         visitor.go("gripper")
         visitor.fill(jaw_range="wide")
         visitor.press("step")
-        visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "the gripper")
+        visitor.done("gripper")
         visitor.go("reference")
         visitor.press("step")
         visitor.refused("--jaw-range", "isn't a range")

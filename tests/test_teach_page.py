@@ -197,8 +197,14 @@ def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
         assert "4 of the 4 inner corners to go" in visitor.text("#status")
         assert "corners don't snap" in visitor.text("#status") and visitor.text("#save") == "Save corners"
         assert visitor.find("#save").get_attribute("disabled")
+        # One thing at a time: the inner corners, and then what belongs to one that was put.
+        handles = "return [...document.querySelectorAll('.handle:not([visibility])')].map((g) => g.dataset.corner)"
+        inner = [f"{side}_inner_{end}" for side in ("left", "right") for end in ("near", "far")]
+        assert sorted(visitor.script(handles)) == sorted(inner)
         u, v = rig.rough("L_in_near")["L_in_near"]
         visitor.drag("left_inner_near", u, v)
+        beside = [f"left_{which}_near" for which in ("outer", "end", "rise")]
+        assert sorted(visitor.script(handles)) == sorted([*inner, *beside])
         assert visitor.at("left_inner_near") == pytest.approx((u, v), abs=2.0)  # whole pixels of the screen
         assert "3 of the 4 inner corners to go" in visitor.text("#status")
         visitor.keys("z", control=True)

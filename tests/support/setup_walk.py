@@ -5,19 +5,26 @@ as a program, the pictures of docs/tutorials/setup.md: ``cd tests && python -m s
 from __future__ import annotations
 
 import os
+import re
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from support import new_user
+from support.loopback import wait_for_default_port
 from support.teach_page_browser import ROOT, Visitor, browser, page
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
 WIDTHS = (375, 1100, 1920)
+WIDE = 1150
+"""Of the pictures, px."""
 _CONTROLS = """
 const seen = [...document.querySelectorAll("button, input, select, a, label.check")]
   .filter((node) => node.checkVisibility({visibilityProperty: true}) && node.getBoundingClientRect().width > 0);
@@ -36,6 +43,9 @@ for (const [k, a] of seen.entries()) {
 if (wide > innerWidth) out.push(`wider than the window: ${wide}`);
 return out;
 """
+
+
+At = Callable[[str], object]
 
 
 class Walker(Visitor):
@@ -78,6 +88,10 @@ class Walker(Visitor):
         self.wait(lambda: self.script(bad) and all(word in self.text("#status") for word in words), " ".join(words))
         assert "\n" not in self.text("#status") and "Traceback" not in self.text("#status")
 
+    def select(self, corner: str) -> None:
+        """One of the corners in the list beside the image."""
+        self.click(f"#corners tr[data-corner={corner}]")
+
     def on_page(self, selector: str) -> None:
         self.wait(lambda: self.script("return Boolean(document.querySelector(arguments[0]))", selector), selector)
 
@@ -97,33 +111,21 @@ class Walker(Visitor):
         return out
 
 
-def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -> None:
-    """From the first step to a monitor that has seen all images; ``at`` hears the name of each step done."""
+def walk(visitor: Walker, user: new_user.NewUser, at: At) -> None:
+    """With a gripper that is inferred from the plate, to a monitor that has seen all images; ``at`` hears the name of
+    each step done.
+    """
     folder, rng = user.folder, np.random.default_rng(4)
     clicks = user.rough_px(rng, off_px=4.0)
-    visitor.fill(source=str(folder / "work"), robot="arm1")
-    visitor.press("step")
-    visitor.done("camera")
-    at("camera")
-    visitor.press("on")
-    visitor.press("step")
-    visitor.done("target")
-    at("target")
-    visitor.press("on")
+    _camera_and_target(visitor, folder / "work", at)
     visitor.fill(plate_source=str(folder / "plate"))
     _take_all(visitor, "12 taken")
     at("plate")
     visitor.press("on")
     visitor.fill(model="paper")
-    visitor.press("step")
-    visitor.done("intrinsics")
-    at("intrinsics")
-    visitor.press("on")
+    _do(visitor, "intrinsics", at)
     visitor.fill(jaw_range="0:0.06")
-    visitor.press("step")
-    visitor.wait(lambda: "it comes out of" in visitor.text("#said"), "what becomes of the gripper")
-    at("gripper")
-    visitor.go("standing")
+    _do(visitor, "gripper", at)
     visitor.fill(standing_source=str(folder / "standing"))
     _take_all(visitor, "3 taken")
     at("standing")
@@ -131,10 +133,58 @@ def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -
     _by_hand(visitor, {name: (float(u), float(v)) for name, (u, v) in clicks.items()}, at, "corners")
     visitor.done("corners")
     visitor.press("on")
+    _do(visitor, "reference", at)
+    _work_to_the_end(visitor, at)
+
+
+def walk_with_a_model(
+    visitor: Walker,
+    work: Path,
+    camera: Path,
+    gripper: Mapping[str, str],
+    reference: Mapping[str, str],
+    at: At,
+    **teaching: object,
+) -> None:
+    """The same with a lens from a file and a gripper from CAD or images: nothing stands on the target.
+
+    ``gripper`` and ``reference``: what is said in these steps, of the latter nothing where it comes with the gripper;
+    ``teaching`` as for the last steps.
+    """
+    _camera_and_target(visitor, work, at)
+    visitor.go("intrinsics")
+    visitor.fill(intrinsics_by="a file")
+    visitor.fill(camera_file=str(camera))
+    _do(visitor, "intrinsics", at)
+    for name, value in gripper.items():
+        visitor.fill(**{name: value})
+    _do(visitor, "gripper", at)
+    if reference:
+        for name, value in reference.items():
+            visitor.fill(**{name: value})
+        visitor.press("step")
+        visitor.wait(lambda: visitor.progress("standing") == "skipped", "a reference of another kind")
+        visitor.press("on")
+        _do(visitor, "reference", at)
+    _work_to_the_end(visitor, at, **teaching)  # type: ignore[arg-type]
+
+
+def _camera_and_target(visitor: Walker, work: Path, at: At) -> None:
+    visitor.fill(source=str(work), robot="arm1")
+    _do(visitor, "camera", at)
+    _do(visitor, "target", at)
+
+
+def _do(visitor: Walker, step: str, at: At) -> None:
+    """A step, and on to the next one."""
     visitor.press("step")
-    visitor.done("reference")
-    at("reference")
+    visitor.done(step)
+    at(step)
     visitor.press("on")
+
+
+def _work_to_the_end(visitor: Walker, at: At, *, opening_mm: str = "", taught: bool = True) -> None:
+    """An image at work, teaching on it, forecast, and the monitor until the images end."""
     visitor.press("step")
     visitor.wait(lambda: "ready to be taken" in visitor.text("#status"), "the first image")
     visitor.press("take")
@@ -142,13 +192,10 @@ def walk(visitor: Walker, user: new_user.NewUser, at: Callable[[str], object]) -
     at("teaching")
     visitor.press("stop")
     visitor.press("on")
-    _by_hand(visitor, {}, at, "teach")
+    _by_hand(visitor, {}, at, "teach", opening_mm=opening_mm, taught=taught)
     visitor.done("teach")
     visitor.press("on")
-    visitor.press("step")
-    visitor.done("check")
-    at("check")
-    visitor.press("on")
+    _do(visitor, "check", at)
     visitor.press("step")
     visitor.wait(lambda: visitor.script("return document.querySelector('#shown')?.naturalWidth > 0"), "the overlay")
     at("running")
@@ -162,15 +209,32 @@ def _take_all(visitor: Walker, words: str) -> None:
     visitor.wait(lambda: "no more images" in visitor.text("#status") and words in visitor.text("#status"), words)
 
 
-def _by_hand(visitor: Walker, corners: dict[str, tuple[float, float]], at: Callable[[str], object], name: str) -> None:
+def _by_hand(
+    visitor: Walker,
+    corners: dict[str, tuple[float, float]],
+    at: At,
+    name: str,
+    *,
+    opening_mm: str = "",
+    taught: bool = True,
+) -> None:
     """On the teaching page, and back."""
     visitor.press("step")
     visitor.on_page("#stage")
     visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page to begin")
     visitor.settle()
-    for corner, (u, v) in corners.items():
+    # Beside an inner corner, once that is put, its next one shows.
+    for corner, (u, v) in sorted(corners.items(), key=lambda each: ("_inner_" not in each[0], each[0])):
+        if "_inner_" not in corner:
+            visitor.select(re.sub("_(outer|end|rise)_", "_inner_", corner))
         visitor.drag(corner, u, v)
+    if opening_mm:
+        typed = "const i = document.querySelector('#opening'); i.value = arguments[0];"
+        visitor.script(f"{typed} i.dispatchEvent(new Event('change'))", opening_mm)
+        visitor.settle()
     at(name)
+    if not taught:
+        visitor.click("#save-taught")
     visitor.click("#save")
     visitor.wait(lambda: "next:" in visitor.text("#saved"), "the files")
     visitor.click("#done")
@@ -178,32 +242,51 @@ def _by_hand(visitor: Walker, corners: dict[str, tuple[float, float]], at: Calla
     visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page again")
 
 
-_SHOWN = {"plate": 1150, "corners": 1150, "check": 1150, "run": 1150}
+def _draw(driver: Any, folder: Path, go: Callable[[Walker, At], None], **names: str) -> None:
+    """Pictures of the page after these steps, by the names of their files."""
+    out = ROOT / "docs" / "tutorials"
+    wait_for_default_port()
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+
+        def at(step: str) -> None:
+            if step not in names:
+                return
+            visitor.sized(WIDE, 760)
+            time.sleep(0.5)
+            height = visitor.script("return document.documentElement.scrollHeight")
+            visitor.sized(WIDE, min(int(height), 1300))
+            time.sleep(0.5)
+            visitor.script("const f = document.querySelector('#folder'); if (f) f.textContent = '\\u200e/home/me/arm1'")
+            shown = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+            cv2.imwrite(str(out / f"{names[step]}.jpg"), shown, [cv2.IMWRITE_JPEG_QUALITY, 70])
+            visitor.sized(1400)
+
+        go(visitor, at)
 
 
 def main() -> None:
     """Draw the pictures."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    out, driver = ROOT / "docs" / "tutorials", browser()
+    sys.path.insert(0, str(ROOT / "tools"))  # of rounded fingers
+    from support.other_grippers import rounded_tips
+
+    driver = browser()
     with tempfile.TemporaryDirectory() as name:
-        user = new_user.make(Path(name))
-        with page(Path(name) / "arm1", command=("setup",)) as running:
-            visitor = Walker(driver, running.url)
+        folder = Path(name)
+        # Paths as somebody types them beside the project.
+        user = replace(new_user.make(folder), folder=Path(".."))
+        shown = {step: f"setup_{step}" for step in ("plate", "corners", "check", "run")}
+        _draw(driver, folder / "arm1", lambda visitor, at: walk(visitor, user, at), **shown)
+        (folder / "round").mkdir()
+        rounded_tips(folder / "round")
+        work, camera = Path("../round/work"), Path("../arm1/camera.yaml")
+        answers = {"gripper": "from images", "free_images": "../round/free", "distance": "0.115:0.002"}
 
-            def at(step: str) -> None:
-                if step not in _SHOWN:
-                    return
-                visitor.sized(_SHOWN[step], 760)
-                time.sleep(0.5)
-                height = visitor.script("return document.documentElement.scrollHeight")
-                visitor.sized(_SHOWN[step], min(int(height), 1300))
-                time.sleep(0.5)
-                visitor.script("const f = document.querySelector('#folder'); if (f) f.textContent = '/home/me/arm1'")
-                picture = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
-                cv2.imwrite(str(out / f"setup_{step}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
-                visitor.sized(1400)
+        def go(visitor: Walker, at: At) -> None:
+            walk_with_a_model(visitor, work, camera, answers, {}, at)
 
-            walk(visitor, user, at)
+        _draw(driver, folder / "arm2", go, gripper="setup_from_images", teach="setup_round")
     driver.quit()
 
 

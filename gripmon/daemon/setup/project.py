@@ -22,7 +22,7 @@ from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.daemon.setup import steps
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.robot_file import reference_text
-from gripmon.daemon.setup.steps import STEPS, Step, needed, target_in, written
+from gripmon.daemon.setup.steps import BY_NAME, STEPS, Step, needed, own_camera, target_in, written
 from gripmon.daemon.teaching.source import open_named
 from gripmon.io.sources import Source, Waiting
 from gripmon.io.wire.session import check_name
@@ -95,31 +95,25 @@ class Project:
 
     def do(self, name: str) -> list[Line]:
         """Carry a step out; what it said.  Raises :class:`InputError` and :class:`NoResultError`, one line."""
-        step = next(each for each in STEPS if each.name == name)
+        step = BY_NAME[name]
         state = self._state(step)
         if state.progress == "waits":
             raise InputError(state.note)
-        if name in ("camera", "target", "gripper", "standing", "reference"):
-            lines = {
-                "camera": self._camera, "target": self._target, "gripper": self._gripper,
-                "standing": self._reference_by, "reference": self._reference,
-            }[name]()  # fmt: skip
-            if lines is not None:
-                return lines
+        own = {
+            "camera": self._camera, "target": self._target, "intrinsics": self._lens, "gripper": self._gripper,
+            "standing": self._reference_by, "reference": self._reference, "check": self._check,
+        }.get(name)  # fmt: skip
+        lines = None if own is None else own()
+        if lines is not None:
+            return lines
         words = step.command(self.values)
-        if words is None:
-            return [Line("nothing to do")]
-        if name == "check":
-            return self._check(words)
-        if name == "intrinsics" and self.values["intrinsics_by"] == steps.FROM_FILE:
-            return self._camera_file(words)
-        return self._command(words)
+        return [Line("nothing to do")] if words is None else self._command(words)
 
     def do_here(self, name: str, note: Callable[[str], object]) -> list[Line]:
         """The same of a person at a terminal: images are taken by themselves, ``note`` hears what becomes of each."""
-        step = next((each for each in STEPS if each.name == name), None)
+        step = BY_NAME.get(name)
         if step is None:
-            names = ", ".join(each.name for each in STEPS)
+            names = ", ".join(BY_NAME)
             raise InputError(f"{name}: is no step; one of {names}", "step")
         if step.kind in ("page", "run"):
             raise InputError(f"{name}: has a command of its own; {self._state(step).command}", "step")
@@ -151,12 +145,13 @@ class Project:
         return StepState(name=step.name, progress=progress, note=note, command=command, files=present)
 
     def _progress(self, step: Step, files: tuple[str, ...], *, needs_doing: bool) -> tuple[Progress, str]:
-        if step.name in ("camera", "target"):
+        inferred = step.name == "gripper" and self.values["gripper"] == steps.INFERRED
+        if inferred or step.name in ("camera", "target"):
             done = self._accepted.get(step.name) == self._said(step)
-            return ("done", "") if done else ("ready", "")
+            return ("done", "comes with hand and eye" if inferred else "") if done else ("ready", "")
         if not needs_doing:
-            inferred = step.name == "gripper" and self._there("gripper.yaml")
-            return "done" if inferred else "skipped", self._why_skipped(step)
+            by = "intrinsics_by" if step.name == "plate" else "reference_by"
+            return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
         for name in needed(step, self.values):
             if not self._there(name):
                 return "waits", f"first: {self._maker(name)} ({name})"
@@ -174,11 +169,6 @@ class Project:
             if made_with != now:
                 return "stale", f"made with {made_with}, and the target is {now}: do this again"
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
-
-    def _why_skipped(self, step: Step) -> str:
-        if step.name == "gripper":
-            return "comes with hand and eye"
-        return f"reference: {self.values['reference_by']}"
 
     def _there(self, name: str) -> bool:
         path = self.folder / name
@@ -206,7 +196,7 @@ class Project:
         return "|".join(self.values[field.name] for field in step.fields)
 
     def _accept(self, name: str) -> None:
-        self._accepted[name] = self._said(next(step for step in STEPS if step.name == name))
+        self._accepted[name] = self._said(BY_NAME[name])
         self._write()
 
     def _write(self) -> None:
@@ -249,7 +239,7 @@ class Project:
         if self.values["have"] == steps.PRINT_IT:
             bar_mm = print_target(target, self.values["paper"]).bar_mm
             self.values["bar_mm"] = f"{bar_mm:g}"
-            lines = self._command(STEPS[1].command(self.values) or [])
+            lines = self._command(BY_NAME["target"].command(self.values) or [])
         else:
             self.values["bar_mm"] = ""
         lines.append(Line(f"the target is {name_of(target_in(self.values))}", "OK"))
@@ -257,9 +247,12 @@ class Project:
         return lines
 
     def _gripper(self) -> list[Line] | None:
-        words = STEPS[4].command(self.values)
+        words = BY_NAME["gripper"].command(self.values)
         if words is None:
+            self._accept("gripper")
             return [Line("it comes out of the step Hand and eye", "OK")]
+        if self.values["gripper"] == steps.FROM_IMAGES:
+            return self._gripper_from_images(words)
         if words[0] != "cp":
             return None
         path = Path(words[1])
@@ -268,6 +261,14 @@ class Project:
         gripper = read_gripper(path)
         write_atomically(self.folder / "gripper.yaml", path.read_bytes())
         return [Line(f"{gripper.name}: {len(gripper.corner_ids)} corners, {len(gripper.edge_ids)} edges", "OK")]
+
+    def _gripper_from_images(self, words: list[str]) -> list[Line]:
+        """Images on the target that are there already stay the reference."""
+        lines = self._command(words)
+        if self.values["reference_by"] == steps.ON_PLATE and not self._count("standing"):
+            self.keep({"reference_by": steps.BY_IMAGES})
+            lines.append(Line("the reference comes with it; another one in the step Gripper on the target", "OK"))
+        return lines
 
     def _reference_by(self) -> list[Line]:
         by = self.values["reference_by"]
@@ -285,22 +286,22 @@ class Project:
         write_atomically(self.folder / "hand_eye.yaml", text)
         return [Line(said, "OK")]
 
-    def _camera_file(self, words: list[str]) -> list[Line]:
-        """Of gripmon as it stands, of another program by import."""
+    def _lens(self) -> list[Line] | None:
+        if self.values["intrinsics_by"] != steps.FROM_FILE:
+            return None
         path = Path(self.values["camera_file"])
         if not self.values["camera_file"] or not path.is_file():
             raise InputError(
                 f"{self.values['camera_file'] or 'the file'}: there is no such file; a calibrated camera's"
             )
-        own = b"gripmon.camera_calibration/" in path.read_bytes()[:4096]
-        if not own:
-            return self._command(words)
+        if not own_camera(path):
+            return None
         camera = read_camera(path).camera
         write_atomically(self.folder / "camera.yaml", path.read_bytes())
         return [Line(f"{camera.width_px} x {camera.height_px} px", "OK")]
 
-    def _check(self, words: list[str]) -> list[Line]:
-        done = self._run([*words, "--json"])
+    def _check(self) -> list[Line]:
+        done = self._run(["gripmon", "check", "config.yaml", "--json"])
         try:
             found = msgspec.json.decode(done.stdout)["findings"]
         except (msgspec.DecodeError, KeyError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import threading
 from pathlib import Path
 from typing import Annotated, Literal
@@ -93,7 +92,6 @@ class SetupSite:
         self._capture: tuple[str, Capture] | None = None
         self._page: tuple[TeachSite, TeachSession | OutlineSession] | None = None
         self._monitor = MonitorProcess(project.folder)
-        self._more = _founders()
 
     def close(self) -> None:
         """Let go of the camera, and stop the monitor that was started here."""
@@ -163,10 +161,11 @@ class SetupSite:
             error=self._errors.get(step.name, ""),
         )  # fmt: skip
 
-    def _choices(self, field: steps.Field) -> tuple[str, ...]:
+    @staticmethod
+    def _choices(field: steps.Field) -> tuple[str, ...]:
         if field.name != "gripper":
             return field.choices
-        return (steps.INFERRED, *grippers(), steps.FROM_FILE, *self._more)
+        return (*field.choices, *grippers())
 
     def _do(self, order: Do) -> None:
         """Begin a step; the state says when it has ended, and how."""
@@ -236,6 +235,7 @@ class SetupSite:
     def _open(self, order: Do) -> dict[str, str]:
         """A teaching page; where it is."""
         self._named(order.step, "page")
+        self._keep(order.values)
         self._let_go()
         self._close_page()
         state = next(each for each in self._project.states() if each.name == order.step)
@@ -303,9 +303,3 @@ class SetupSite:
         page, self._page = self._page, None
         if page is not None:
             page[1].close()
-
-
-def _founders() -> tuple[str, ...]:
-    """Ways to a gripper file whose commands this installation has."""
-    ways = ((steps.FROM_CAD, "gripper_cad"), (steps.FROM_IMAGES, "gripper_images"))
-    return tuple(way for way, module in ways if importlib.util.find_spec(f"gripmon.cli.{module}") is not None)

@@ -96,9 +96,21 @@ def _target(values: Values) -> list[str]:
     return ["gripmon", "target", values["target"], "--paper", values["paper"], "--pdf", "target.pdf", "--force"]
 
 
+def _plate(values: Values) -> list[str] | None:
+    return None if values["intrinsics_by"] == FROM_FILE else _step_command("plate")(values)
+
+
+def own_camera(path: Path) -> bool:
+    """Whether this is a file of gripmon, which is used as it stands; those of other programs are imported."""
+    return path.is_file() and b"gripmon.camera_calibration/" in path.read_bytes()[:4096]
+
+
 def _intrinsics(values: Values) -> list[str]:
     if values["intrinsics_by"] == FROM_FILE:
-        return ["gripmon", "calibrate", "import", values["camera_file"], "--out", "camera.yaml", "--force"]
+        path = values["camera_file"]
+        if own_camera(Path(path)):
+            return ["cp", path, "camera.yaml"]
+        return ["gripmon", "calibrate", "import", path, "--out", "camera.yaml", "--force"]
     words = ["gripmon", "calibrate", "intrinsics", "plate", "--target", name_of(target_in(values))]
     return [*words, "--model", values["model"], "--out", "camera.yaml", "--picture", "camera.png", "--force"]
 
@@ -107,27 +119,42 @@ def _gripper(values: Values) -> list[str] | None:
     which = values["gripper"]
     if which == INFERRED:
         return None
-    if which in (FROM_CAD, FROM_IMAGES):
-        return ["gripmon", "gripper", *_founded(values), "--out", "gripper.yaml", "--force"]
+    if which == FROM_CAD:
+        return _from_cad(values)
+    if which == FROM_IMAGES:
+        return _from_images(values)
     path = values["gripper_file"] if which == FROM_FILE else str(grippers().get(which, which))
     return ["cp", path, "gripper.yaml"]
 
 
-def _founded(values: Values) -> list[str]:
-    """A model from CAD, or from images, from which a reference follows, too."""
-    try:
-        files, options = shlex.split(values["gripper_file"]), shlex.split(values["gripper_options"])
-    except ValueError as error:
-        raise InputError(f"gripper: {error}; words as on a command line") from None
+def _from_cad(values: Values) -> list[str]:
+    files = _words(values, "cad_files")
     if not files:
-        raise InputError("no file is named; a mesh, URDF or .cao for CAD, a folder for images")
-    picture, reference = ["--picture", "gripper.png"], ["--reference-out", "hand_eye.yaml"]
-    if values["gripper"] == FROM_IMAGES:
-        return ["from-images", *files, "--camera", "camera.yaml", *options, *picture, *reference]
-    jaws = ["--jaw-range", values["jaw_range"]] if values["jaw_range"] else []
+        raise InputError("no file is named; a mesh for each finger, or one for both, a URDF or a .cao")
+    words = [*_given(values, jaw_range="--jaw-range", cad_unit="--unit", cad_view="--view"), *_words(values, "options")]
     # Only with a view there is something to draw.
-    viewed = any(word.startswith(("--view", "--reference")) for word in options)
-    return ["from-cad", *files, *jaws, *options, *(["--camera", "camera.yaml", *picture] if viewed else [])]
+    viewed = any(word.startswith(("--view", "--reference")) for word in words)
+    words += ["--camera", "camera.yaml", "--picture", "gripper.png"] if viewed else []
+    return ["gripmon", "gripper", "from-cad", *files, *words, "--out", "gripper.yaml", "--force"]
+
+
+def _from_images(values: Values) -> list[str]:
+    """From which a reference follows, too."""
+    words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, distance="--distance")]
+    words += [*_words(values, "options"), "--picture", "gripper.png", "--reference-out", "hand_eye.yaml"]
+    return ["gripmon", "gripper", "from-images", *words, "--out", "gripper.yaml", "--force"]
+
+
+def _given(values: Values, **options: str) -> list[str]:
+    """Options by the fields that hold their values, less those that are empty."""
+    return [word for field, option in options.items() if values[field] for word in (option, values[field])]
+
+
+def _words(values: Values, field: str) -> list[str]:
+    try:
+        return shlex.split(values[field])
+    except ValueError as error:
+        raise InputError(f"{field}: {error}; words as on a command line") from None
 
 
 def _on_plate(values: Values) -> bool:
@@ -150,10 +177,10 @@ def _reference(values: Values) -> list[str] | None:
     words += ["--camera", "camera.yaml"]
     if values["gripper"] == INFERRED:
         words += ["--corners", "standing/rough.yaml", "--infer", "--gripper-out", "gripper.yaml"]
-        words += ["--jaw-range", values["jaw_range"]] if values["jaw_range"] else []
+        words += _given(values, jaw_range="--jaw-range")
     else:
         words += ["--corners", "standing/corners.yaml", "--gripper", "gripper.yaml"]
-        words += ["--jaw-opening", values["jaw_opening"]] if values["jaw_opening"] else []
+    words += _given(values, jaw_opening="--jaw-opening")
     return [*words, "--out", "hand_eye.yaml", "--picture", "hand_eye.png", "--force"]
 
 
@@ -189,8 +216,9 @@ STEPS = (
     ),
     Step(
         "plate", "Images of the target", "Ten to thirty images that fill the view, the target tilted by 20 to 45° to "
-        "all sides.  Images are taken by themselves when the camera stands still and the target is sharp.", "capture",
-        "Start", ("setup.yaml",), ("plate",), _step_command("plate"),
+        "all sides.  Images are taken by themselves when the camera stands still and the target is sharp.  Whoever has "
+        "the lens as a file needs none: say so in the next step.", "capture", "Start", ("setup.yaml",), ("plate",),
+        _plate,
         (Field("plate_source", "images from", "", _PLATE_SOURCE),),
     ),
     Step(
@@ -206,21 +234,33 @@ STEPS = (
         ), "camera.png",
     ),
     Step(
-        "gripper", "Gripper", "What the fingertips look like: a file of the library or your own, or inferred from "
-        "images of the gripper standing on the target.", "form", "Use it", (), ("gripper.yaml",), _gripper,
+        "gripper", "Gripper", "What the fingertips look like: inferred from images of the gripper standing on the "
+        "target (straight fingers), a file of the library or your own, from CAD, or from images before changing "
+        "backgrounds.", "form", "Use it", (), ("gripper.yaml",), _gripper,
         (
-            Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_FILE)),
-            Field("gripper_file", "file", "", "a gripper file; of CAD meshes, a URDF or .cao; of images their folder",
-                  (), ("gripper", (FROM_FILE, FROM_CAD, FROM_IMAGES))),
-            Field("gripper_options", "options", "", "of the command below, e.g. --unit mm --view 0.12:30, or "
-                  "--distance 0.12:0.003", (), ("gripper", (FROM_CAD, FROM_IMAGES))),
+            Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_IMAGES, FROM_CAD, FROM_FILE)),
+            Field("gripper_file", "file", "", "a gripper file", (), ("gripper", (FROM_FILE,))),
+            Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one a finger or one for both; or a URDF", (),
+                  ("gripper", (FROM_CAD,))),
+            Field("cad_unit", "unit of the meshes", "", "of URDF and .cao it is known", ("", "mm", "m", "cm", "in"),
+                  ("gripper", (FROM_CAD,))),
+            Field("cad_view", "view (m:°)", "", "of fingers that are round, hollow or open: how far the fingertips are "
+                  "from the camera, and its tilt against them, e.g. 0.12:30", (), ("gripper", (FROM_CAD,))),
+            Field("free_images", "images in", "teaching", "a folder with ten to a hundred images, each before another "
+                  "background; teaching: take thirty in the step Gripper at work first", (),
+                  ("gripper", (FROM_IMAGES,))),
+            Field("distance", "distance (m)", "", "of the fingertips from the camera, with its standard deviation, "
+                  "e.g. 0.12:0.003; empty: images at several jaw openings tell it", (), ("gripper", (FROM_IMAGES,))),
             Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
                   ("gripper", (INFERRED, FROM_CAD))),
+            Field("options", "more options", "", "of the command below, as written there", (),
+                  ("gripper", (FROM_CAD, FROM_IMAGES))),
         ), "gripper.png",
     ),
     Step(
-        "standing", "Gripper on the target", "The fingertips stand on the target, as flat as they can.  Three to ten "
-        "images, put down again for each; the jaws stay as they are.", "capture", "Start", ("camera.yaml",),
+        "standing", "Gripper on the target", "It gives hand and eye: the fingertips stand on the target, as flat as "
+        "they can.  Three to ten images, put down again for each; the jaws stay as they are.  Or choose another "
+        "reference.", "capture", "Start", ("camera.yaml",),
         ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
         (
             Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}",
@@ -237,12 +277,13 @@ STEPS = (
     Step(
         "reference", "Hand and eye", "Where the gripper is in the camera's frame, with its uncertainty.", "form",
         "Calibrate", ("camera.yaml", "standing", "standing/rough.yaml"), ("hand_eye.yaml", "gripper.yaml"), _reference,
-        (Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the gripper's "
-               "nominal"),), "hand_eye.png",
+        (Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the "
+               "gripper's nominal, or as far as the fingertips of an inferred one are apart"),), "hand_eye.png",
     ),
     Step(
         "teaching", "Gripper at work", "One to ten images as at work, each before another background, the fingers free "
-        "and lit as in use.", "capture", "Start", ("camera.yaml", "gripper.yaml"), ("teaching",),
+        "and lit as in use; thirty where the gripper's model comes from them.", "capture", "Start",
+        ("camera.yaml", "gripper.yaml"), ("teaching",),
         _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
     ),
     Step(
@@ -254,10 +295,14 @@ STEPS = (
         ("check.json",), lambda _values: ["gripmon", "check", "config.yaml"],
     ),
     Step(
-        "run", "Start", "The monitor itself, as it runs without this page.", "run", "Start the monitor",
+        "run", "Start", "The monitor itself.  It ends with this page; without the page start it by the "
+        "command below.  What happened meanwhile: gripmon report run.", "run", "Start the monitor",
         ("config.yaml",), ("run",), lambda _values: ["gripmon", "run", "config.yaml", "--out", "run"],
     ),
 )  # fmt: skip
+
+
+BY_NAME = {step.name: step for step in STEPS}
 
 
 def defaults() -> dict[str, str]:
@@ -270,7 +315,10 @@ def needed(step: Step, values: Values) -> tuple[str, ...]:
     names = step.needs
     if step.name == "intrinsics" and values["intrinsics_by"] == FROM_FILE:
         names = ()
+    own = values["gripper"] == FROM_IMAGES and values["free_images"] == "teaching"
     if step.name == "gripper" and values["gripper"] in (FROM_CAD, FROM_IMAGES):
+        names = ("camera.yaml", "teaching") if own else ("camera.yaml",)
+    if step.name == "teaching" and own:
         names = ("camera.yaml",)
     if step.name == "teach" and values["reference_by"] == BY_CORNERS:
         names = tuple(name for name in names if name != "hand_eye.yaml")

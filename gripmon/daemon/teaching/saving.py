@@ -141,7 +141,7 @@ class FileSaving:
         try:
             taught, _ = setup.taught(reference, images)
         except TeachingRefused as refused:
-            raise SavingRefused(f"no taught model: {refused}; or save without it") from None
+            raise SavingRefused(f"no taught model: {refused}; or save without it: on the page untick it") from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
         model = taught_model(
             taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files

@@ -12,6 +12,21 @@ const corners = new Corners();
 let state, stage, reply = null, chosen = null, selected = null, asking = false;
 let busy = false, again = false, ended = false, timer = null;
 
+// Without a gripper file: points on an edge beside the inner corners, for one of these at a time.
+const HELPERS = ["outer", "end", "rise"];
+const innerOf = (name) => HELPERS.reduce((to, helper) => to.replace(`_${helper}_`, "_inner_"), name);
+
+function alone() {
+  const has = (name) => corners.current.has(name);
+  return state.corners.filter((name) => name.includes("_inner_") && has(name) && !HELPERS.some((other) => has(name.replace("inner", other))));
+}
+
+function wanted(name) {
+  if (!state.corners_only || name.includes("_inner_")) return true;
+  const open = alone(), mine = selected && innerOf(selected);
+  return (open.includes(mine) ? mine : open[0]) === innerOf(name);
+}
+
 function shown(name) {
   const put = corners.current.get(name);
   const seen = reply?.corners.find((corner) => corner.name === name);
@@ -23,13 +38,13 @@ function shown(name) {
   if (found && seen.uv_px) return { name, at: seen.uv_px, state: put ? "measured" : "unplaced" };
   if (found) return { name, at: put?.at ?? seen.model_px, state: put ? "refused" : "idle" };
   if (put) return { name, at: put.at, state: "put" };
-  return { name, at: (corners.current.size && seen?.model_px) || state.places[name], state: "idle" };
+  return { name, at: wanted(name) ? (corners.current.size && seen?.model_px) || state.places[name] : null, state: "idle" };
 }
 
 function show() {
   const list = state.corners.map(shown);
   stage.update(list, reply, selected);
-  panel.corners(list, reply, selected, (name) => { select(name); stage.root.focus(); });
+  panel.corners(state.corners_only ? list.filter(({ at }) => at) : list, reply, selected, (name) => { select(name); stage.root.focus(); });
   panel.jaw(reply, opening() !== null, state);
   panel.expected(reply, state);
   $("#undo").disabled = !corners.canUndo;
@@ -41,11 +56,9 @@ function show() {
 
 function tell() {
   if (state.corners_only) {
-    const inner = state.corners.filter((name) => name.includes("_inner_")), has = (name) => corners.current.has(name);
-    const todo = inner.filter((name) => !has(name)).length;
-    const alone = inner.filter((name) => has(name) && !["outer", "end", "rise"].some((other) => has(name.replace("inner", other))));
-    const wants = todo ? `${todo} of the 4 inner corners to go` : alone.length ? `${alone.join(", ")} still ${alone.length > 1 ? "need" : "needs"} one` : "all are there";
-    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${wants}. Without a gripper file corners don't snap to edges.`, todo || alone.length ? "" : "good");
+    const todo = state.corners.filter((name) => name.includes("_inner_") && !corners.current.has(name)).length, open = alone();
+    const wants = todo ? `${todo} of the 4 inner corners to go` : open.length ? `${open.join(", ")} still ${open.length > 1 ? "need" : "needs"} one` : "all are there";
+    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${wants}. Without a gripper file corners don't snap to edges.`, todo || open.length ? "" : "good");
   }
   const missing = state.needed - corners.current.size;
   if (!corners.current.size && missing > 0) {
@@ -54,7 +67,8 @@ function tell() {
   else if (reply.refused) panel.status(`${reply.refused[0].toUpperCase()}${reply.refused.slice(1)}.`, missing > 0 ? "" : "warn");
   else {
     const measured = reply.corners.filter((corner) => corner.uv_px).length;
-    const found = `${measured} of ${reply.corners.length} corners measured; ${Math.round(100 * reply.share)} % of the edges agree.`;
+    const corners_ = reply.corners.length ? `${measured} of ${reply.corners.length} corners measured; ` : "";
+    const found = `${corners_}${Math.round(100 * reply.share)} % of the edges agree.`;
     panel.status(reply.reference ? found : `${found} ${reply.no_reference}`, reply.reference ? "good" : "warn");
   }
 }
@@ -106,7 +120,7 @@ function changed(later = 0) {
 function select(name) { selected = name; show(); }
 
 function step(by) {
-  const names = state.corners, at = names.indexOf(selected);
+  const names = state.corners.filter((name) => shown(name).at), at = names.indexOf(selected);
   select(names[(at < 0 ? (by > 0 ? 0 : names.length - 1) : at + by + names.length) % names.length]);
 }
 

@@ -55,6 +55,7 @@ export function pictures(list, live, chosen) {
 
 export function corners(list, reply, selected, choose) {
   const replies = new Map((reply?.corners ?? []).map((corner) => [corner.name, corner]));
+  $("#corners").parentElement.hidden = !list.length; // round tips have none
   $("#corners tbody").replaceChildren(...list.map(({ name, state, away }) => {
     const row = element("tr", "", { "data-corner": name });
     row.classList.toggle("selected", name === selected);
@@ -85,7 +86,7 @@ export function jaw(reply, given, state) {
   note.classList.toggle("warn", !given);
   if (given) note.textContent = "";
   else if (reply?.jaw_opening_m != null && !reply.refused) {
-    const seen = `${(1e3 * reply.jaw_opening_m).toFixed(2)} ± ${(1e3 * reply.jaw_sigma_m).toFixed(2)} mm`;
+    const seen = `${(1e3 * reply.jaw_opening_m).toFixed(2)} ± ${mm(reply.jaw_sigma_m)} mm`;
     note.textContent = `The image shows ${seen}, but it can hardly separate that from the distance: better use what the robot reports.`;
   } else note.textContent = "Better what the robot says than what the image shows.";
 }

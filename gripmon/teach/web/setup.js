@@ -26,7 +26,8 @@ function shape(tag, attributes, parent) {
 
 const step = () => state.steps.find((each) => each.state.name === chosen);
 const capture = () => (state.capturing === chosen ? state.capture : null);
-const said = () => Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value]));
+// Of this step, and what was typed before and not yet sent: whoever goes on at once has said it, too.
+const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value])) });
 
 function choose(name) {
   chosen = name;
@@ -84,7 +85,7 @@ function buttonsOf({ kind, button: name, state: { progress } }) {
   const skips = chosen === "standing" && said().reference_by !== "on the plate";
   if (kind === "form" || skips) return [button(skips ? "Use it" : name, () => post("do", { step: chosen, values: said() }), "main", "step")];
   if (kind === "page") {
-    return [button(name, async () => location.assign((await post("open", { step: chosen })).url), "main", "step")];
+    return [button(name, async () => location.assign((await post("open", { step: chosen, values: said() })).url), "main", "step")];
   }
   if (kind === "run") {
     return state.monitor.running ? [button("Stop", () => post("stop", {}), "ask", "stop")] : [button(name, () => post("start", {}), progress === "waits" ? "" : "main", "step")];
@@ -99,7 +100,8 @@ function buttonsOf({ kind, button: name, state: { progress } }) {
 }
 
 function showButtons() {
-  const next = state.steps[state.steps.findIndex((each) => each.state.name === chosen) + 1];
+  const later = state.steps.slice(state.steps.findIndex((each) => each.state.name === chosen) + 1);
+  const next = later.find((each) => each.state.progress !== "skipped");
   const nodes = buttonsOf(step());
   if (next && ["done", "skipped"].includes(step().state.progress)) {
     const on = element("button", `Next: ${next.title} →`, { type: "button", id: "do-on" });
