@@ -83,7 +83,7 @@ def test_a_row_of_the_configuration_says_unit_default_and_bounds():
     rows = configuration.page().splitlines()
     (row,) = [row for row in rows if row.startswith("| `monitor.policy.alert_limit_rad` |")]
     assert row.startswith("| `monitor.policy.alert_limit_rad` | number | rad | `0.035` | > 0")
-    assert sum(row.startswith("| `source.kind` |") for row in rows) == 5  # one table for each kind
+    assert sum(row.startswith("| `source.kind` |") for row in rows) == 7  # one table for each kind
 
 
 def test_what_the_explanations_name_exists():

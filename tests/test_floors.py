@@ -47,6 +47,10 @@ HEAVY = (
     "jinja2",
     "shtab",
     "trimesh",
+    "fsspec",
+    "mcap",
+    "av",
+    "ray",
 )
 
 

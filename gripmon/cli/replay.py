@@ -8,18 +8,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number, progress_bar, writing
+from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number, progress_bar, whole_number, writing
 from gripmon.model.errors import NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 _OPTIONS = """
 INPUT...              a folder of images, taken in the order of their names, a video file, or a recording of ours: an
-                      .rrd file, all files of one run, or a folder of them with all below; a timestamps.csv may lie
-                      beside images, with the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)
---config CONFIG       configuration (YAML), its source section is not used; left out for a recording: its own
+                      .rrd file, all files of one run, or a folder of them with all below; an .mcap file, a rosbag2
+                      folder or a LeRobot dataset; a timestamps.csv may lie beside images, with the columns
+                      file,stamp_ns[,jaw_opening_m] (Unix ns, m)
+--config CONFIG       configuration (YAML); of its source section camera and opening count for an .mcap, a rosbag2 and a
+                      LeRobot dataset, nothing for others; left out for a recording: its own
 --out FILE            JSON lines go here; - is standard output
 --recording FILE.rrd  also write a rerun recording (open it with: gripmon view FILE.rrd); of a recording it shows both
                       runs, recorded and replayed
+--camera NAME         which images: topic of an .mcap or rosbag2, feature of a LeRobot dataset (default: the only one)
+--episode N           which episode of a LeRobot dataset (default: the only one)
 --fps HZ              frames a second where the input has no time stamps (1/s)
 """
 
@@ -29,6 +33,7 @@ _EXAMPLES = """\
   gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl --recording story.rrd
 
   gripmon replay recordings/ --out again.jsonl                             all files of one run
+  gripmon replay set/ --episode 12 --config wrist.yaml --out 12.jsonl      of a LeRobot dataset
   gripmon replay pulses/images --config second.yaml --out spots.jsonl      a second camera's pulses
   gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
@@ -38,7 +43,7 @@ FILE.rrd from before stays then); 130 interrupted (what was done until then is i
 
 @Command(
     "replay", "recorded images or a video through the monitor, JSON lines out", _OPTIONS, _EXAMPLES, out=REQUIRED,
-    fps=positive_number,
+    fps=positive_number, episode=whole_number(0, 10**9, "isn't an episode; its number, from 0"),
 )  # fmt: skip
 def replay(arguments: Arguments) -> int:
     """Run recorded frames through the monitor and write one JSON line for every input frame, in input
@@ -59,7 +64,9 @@ def replay(arguments: Arguments) -> int:
     from gripmon.model.records import to_json
 
     cv2.setNumThreads(1)
-    with open_replay(arguments.input, arguments.config, arguments.fps, _say) as replayed:
+    with open_replay(
+        arguments.input, arguments.config, arguments.fps, _say, camera=arguments.camera, episode=arguments.episode
+    ) as replayed:
         recording = replayed.recorded_in(arguments.recording)
         arguments.check_outputs("recording")
         with _output(arguments) as write, recording, progress_bar(replayed.length, "frame") as step:

@@ -12,6 +12,7 @@ from pathlib import Path
 from gripmon import monitor
 from gripmon.daemon.config import Config, ConfigError, SecondConfig
 from gripmon.io.sources import (
+    EpisodeSettings,
     FolderSettings,
     FullScale,
     OpenedSource,
@@ -60,7 +61,8 @@ class Monitor(monitor.Monitor):
 
 
 def open_source(source: str | Path | SourceSettings | Config, fps: float | None = None) -> OpenedSource:
-    """Frames to iterate over: of a folder of images or a video file, of a source's settings, or a configuration's own.
+    """Frames to iterate over: of a folder of images, a video file, an MCAP file, a rosbag2 or a LeRobot dataset of
+    one episode, of a source's settings, or a configuration's own.
 
     ``fps``: frames a second where a folder or a video has no time stamps (1/s).  It is a context manager, too.  Raises
     :class:`SourceError`: nothing there, or nothing that can be read.
@@ -91,7 +93,7 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
 
     Raises :class:`ConfigError` for frames that don't fit the camera, and :class:`NoResultError` if none can be read.
     """
-    if not isinstance(config.settings.source, FolderSettings | VideoSettings):
+    if not isinstance(config.settings.source, FolderSettings | VideoSettings | EpisodeSettings):
         return None
     source = open_configured(config)
     try:

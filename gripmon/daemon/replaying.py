@@ -14,13 +14,25 @@ from typing import NamedTuple
 
 import msgspec
 
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.verify import NEGLIGIBLE_PX, compare_cameras
 from gripmon.daemon.api import Monitor, open_source
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_pulses, load_second
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.recorded_run import RecordedRun, one_recording
-from gripmon.io.sources import Source, SourceError, settings_for_path
+from gripmon.io.sources import (
+    BagSettings,
+    EpisodeSettings,
+    FolderSettings,
+    LeRobotSettings,
+    Source,
+    SourceError,
+    settings_for_path,
+)
 from gripmon.io.sources import open_source as start
 from gripmon.io.sources.files import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.records import (
     Command,
@@ -238,9 +250,13 @@ def open_replay(
     config_path: Path | None,
     fps: float | None = None,
     warn: Callable[[str], None] = _log.warning,
+    *,
+    camera: str | None = None,
+    episode: int | None = None,
 ) -> Iterator[FrameReplay | PulseReplay]:
-    """A folder of images, a video, or recordings of one run, to be replayed with a configuration (None: the recorded
-    one); ``fps`` as for :func:`gripmon.open_source`.  ``warn`` gets a line for each thing that is odd.
+    """A folder of images, a video, an episode, or recordings of one run, to be replayed with a configuration (None: the
+    recorded one); ``fps`` as for :func:`gripmon.open_source`.  ``camera`` and ``episode`` say which of several is meant
+    (None: as the configuration's source says).  ``warn`` gets a line for each thing that is odd.
 
     Raises :class:`InputError` and :class:`NoResultError`.
     """
@@ -256,7 +272,7 @@ def open_replay(
                 right = "one folder of images, or one video"
                 raise InputError(f"{first}: no input for a second camera's configuration; {right}")
             second = load_pulses(second)
-            source = _open_input(first, fps)
+            source = _open_input(first, fps, None, camera, episode)
             opened.callback(source.close)
             yield PulseReplay(source, second)
             return
@@ -265,7 +281,7 @@ def open_replay(
         config = given if run is None else run.config
         if config is None:
             raise InputError(f"{first} isn't a recording, which alone brings its own configuration; name one", "config")
-        source = _open_input(first, fps) if run is None else run.source
+        source = _open_input(first, fps, config, camera, episode, warn) if run is None else run.source
         opened.callback(source.close)
         for note in [] if run is None else run.notes:
             warn(note)
@@ -287,6 +303,8 @@ def _refuse_empty_folders(paths: Sequence[Path]) -> None:
     for path in paths:
         if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():
             continue
+        if not isinstance(settings_for_path(path), FolderSettings):
+            continue
         try:
             images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir())
         except OSError as error:
@@ -296,10 +314,57 @@ def _refuse_empty_folders(paths: Sequence[Path]) -> None:
             raise InputError(f"{path}: no recordings and no images in it; {right}")
 
 
-def _open_input(path: Path, fps: float | None) -> Source:
+def _open_input(
+    path: Path,
+    fps: float | None,
+    config: Config | None,
+    camera: str | None,
+    episode: int | None,
+    warn: Callable[[str], None] = _log.warning,
+) -> Source:
     if not path.exists():
-        raise InputError(f"{path}: there is no such file or folder; a folder of images, a video or an .rrd")
+        right = "a folder of images, a video, an .mcap, a rosbag2, a LeRobot dataset or an .rrd"
+        raise InputError(f"{path}: there is no such file or folder; {right}")
+    settings = settings_for_path(path, fps)
+    if isinstance(settings, EpisodeSettings):
+        settings = as_configured(settings, config, camera, episode)
+    elif camera is not None or episode is not None:
+        raise InputError(f"--{'camera' if camera else 'episode'}: {path} has one camera and one episode; leave it out")
     try:
-        return start(settings_for_path(path, fps))
+        source = start(settings)
     except SourceError as error:
         raise InputError(f"{path}: {error}") from None
+    lens = getattr(source, "camera", None)
+    if config is not None and lens is not None and (off := lens_fault(lens, config)) is not None:
+        warn(off)
+    return source
+
+
+def as_configured(
+    settings: EpisodeSettings, config: Config | None, camera: str | None, episode: int | None
+) -> EpisodeSettings:
+    """The settings of an episode that was named, with the camera and the opening that a configuration's source of that
+    kind says; ``camera`` and ``episode`` replace them.
+    """
+    given = None if config is None else config.settings.source
+    if isinstance(settings, BagSettings):
+        if episode is not None:
+            raise InputError(f"--episode: {settings.path} is one episode; leave it out")
+        known = given if isinstance(given, BagSettings) else settings
+        return BagSettings(path=settings.path, camera=camera or known.camera, opening=known.opening)
+    known_set = given if isinstance(given, LeRobotSettings) else settings
+    number = known_set.episode if episode is None else episode
+    chosen = camera or known_set.camera
+    return LeRobotSettings(path=settings.path, camera=chosen, episode=number, opening=known_set.opening)
+
+
+def lens_fault(lens: LensSettings, config: Config) -> str | None:
+    """How the camera calibration that frames bring differs from the configuration's, in words; None: it doesn't."""
+    try:
+        off = compare_cameras(GivenCamera(config.settings.camera, (), None), GivenCamera(lens, (), None))
+    except CalibrationError as error:
+        return f"the frames bring a camera calibration of another kind ({error}); the configuration's is used"
+    if off.largest_px <= NEGLIGIBLE_PX:
+        return None
+    far = f"up to {off.largest_px:.3g} px from the configuration's"
+    return f"the frames bring a camera calibration that is {far}, which is used"

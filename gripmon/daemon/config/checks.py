@@ -19,6 +19,7 @@ from gripmon.io.metrics import package_fault
 from gripmon.io.ros2.names import RosNameError, network_of, subscription_key
 from gripmon.io.ros2.node import JOINT_STATE, Ros2Missing, typestore
 from gripmon.io.sources import (
+    EpisodeSettings,
     FolderSettings,
     LiveSettings,
     NetworkSettings,
@@ -232,6 +233,9 @@ def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
     if isinstance(source, VideoSettings) and not (directory / source.path).is_file():
         wrong = f"there is no file {directory / source.path}"
         return Fault("source.path", wrong, "a video file, relative to this file")
+    if isinstance(source, EpisodeSettings) and "://" not in source.path and not (directory / source.path).exists():
+        wrong = f"there is no file or folder {directory / source.path}"
+        return Fault("source.path", wrong, "recorded messages or a LeRobot dataset, relative to this file")
     if isinstance(source, LiveSettings):
         try:
             backend_number(source)
@@ -246,6 +250,8 @@ def _without_jaw(source: SourceSettings) -> str | None:
         return "a camera"
     if isinstance(source, VideoSettings):
         return "a video"
+    if isinstance(source, EpisodeSettings) and source.opening is None:
+        return "a source without opening (joints, scale, offset_m)"
     if isinstance(source, NetworkSettings) and source.format.startswith("ros2_"):
         return "an image of ROS 2"
     return None

@@ -11,7 +11,7 @@ from gripmon.daemon.config.checks import network_fault, source_fault
 from gripmon.daemon.config.settings import SecondSettings
 from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
-from gripmon.io.sources import FolderSettings, SimulatedSettings, VideoSettings
+from gripmon.io.sources import EpisodeSettings, FolderSettings, SimulatedSettings, VideoSettings
 from gripmon.laser.judgement import SpotWatchSettings
 from gripmon.laser.matching import PulseSettings, ReportedPulse, read_pulses
 from gripmon.laser.setup import LaserCalibration
@@ -114,7 +114,7 @@ def _fault_between(settings: SecondSettings) -> Fault | None:
     source, pulses = settings.source, settings.laser.pulses
     if isinstance(source, SimulatedSettings):
         return Fault("source.kind", "is simulator, which shows a gripper and no laser", "folder, video, live or zenoh")
-    recorded = isinstance(source, FolderSettings | VideoSettings)
+    recorded = isinstance(source, FolderSettings | VideoSettings | EpisodeSettings)
     if recorded and pulses is None:
         return Fault("laser.pulses", "is missing", "a table of the recorded pulses: stamp_ns, until_ns, base_T_ee")
     if not recorded and pulses is not None:

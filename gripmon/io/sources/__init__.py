@@ -1,4 +1,5 @@
-"""Where frames come from: a folder of images, a video file, a live camera, one on the network, a simulated one.
+"""Where frames come from: a folder of images, a video file, an episode of recorded messages or of a LeRobot dataset, a
+live camera, one on the network, a simulated one.
 
 All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
 """
@@ -9,20 +10,28 @@ from pathlib import Path
 
 import msgspec
 
+from gripmon.io.sources.bags import BagSettings, BagSource, is_rosbag2
 from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
 from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
+from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
 from gripmon.io.sources.live import LiveCamera, LiveSettings, NewestFrame
 from gripmon.io.sources.network import NetworkCamera, NetworkSettings, network_key
 from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link
 
-SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings | NetworkSettings
+EpisodeSettings = BagSettings | LeRobotSettings
+SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | EpisodeSettings | LiveSettings | NetworkSettings
 
 __all__ = [
     "READ_TIMEOUT_S",
+    "BagSettings",
+    "BagSource",
+    "EpisodeSettings",
     "FolderSettings",
     "FolderSource",
     "FullScale",
+    "LeRobotSettings",
+    "LeRobotSource",
     "LiveCamera",
     "LiveSettings",
     "NetworkCamera",
@@ -75,6 +84,10 @@ def open_source(
             return FolderSource(settings, relative_to)
         case VideoSettings():
             return VideoSource(settings, relative_to)
+        case BagSettings():
+            return BagSource(settings, str(relative_to))
+        case LeRobotSettings():
+            return LeRobotSource(settings, str(relative_to))
         case LiveSettings():
             return LiveCamera(settings)
         case NetworkSettings():
@@ -85,10 +98,14 @@ def open_source(
             return NetworkCamera(settings, link, keys["image"], size_px)
 
 
-def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings:
-    """Settings for a recorded input that a person named: a folder of images, else a video file; ``fps`` (1/s) counts
-    where the input has no time stamps.
+def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings | EpisodeSettings:
+    """Settings for a recorded input that a person named: a folder of images, a LeRobot dataset, a rosbag2 folder, an
+    MCAP file, else a video file; ``fps`` (1/s) counts where the input has no time stamps.
     """
+    if path.suffix.lower() == ".mcap" or (path.is_dir() and is_rosbag2(str(path))):
+        return BagSettings(path=str(path))
+    if path.is_dir() and is_lerobot(str(path)):
+        return LeRobotSettings(path=str(path))
     settings = FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))
     return settings if fps is None else msgspec.structs.replace(settings, fps=fps)
 

@@ -1,0 +1,340 @@
+"""Recorded messages: an MCAP file, or a folder of rosbag2, with images, joint states and camera calibrations.
+
+CDR is decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema that the file itself holds; JSON
+as Foxglove writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from gripmon.calibrate.formats import InterchangeError, read_ros
+from gripmon.io.ros2.node import JointOpening, Ros2Missing, typestore
+from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.payload import PayloadError, raw_image
+from gripmon.io.sources.stored import (
+    VideoDecoder,
+    decoded_file,
+    file_system,
+    joined,
+    needed,
+    opened,
+    openings_at,
+    short,
+    there,
+)
+from gripmon.model.camera import LensSettings
+from gripmon.model.records import Array, Frame, FrameNote, Image
+
+_IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
+_CAMERAS = ("CameraInfo", "CameraCalibration")
+_JOINTS = ("JointState",)
+
+
+class BagSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="bag"):
+    """An MCAP file or a rosbag2 folder: frames with their stamps, and openings from joint states."""
+
+    path: Annotated[str, msgspec.Meta(min_length=1, description="the .mcap file or the folder with metadata.yaml")]
+    camera: (
+        Annotated[str, msgspec.Meta(min_length=1, description="topic of the images; absent: the only one")] | None
+    ) = None
+    opening: JointOpening | None = None
+
+
+class _Message(NamedTuple):
+    topic: str
+    kind: str
+    """The type's last part: CompressedImage of sensor_msgs and of foxglove alike."""
+    log_ns: int
+    decode: Callable[[], Any]
+
+
+class _CutShort(Exception):
+    """The file ends, or is damaged, before its end; ``str()`` says what."""
+
+
+class _Mcap:
+    """An MCAP file, whole or cut short: without its summary it is read from its beginning as far as it goes."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._reader = needed("mcap.reader")
+        with opened(path) as stream:
+            try:
+                summary = self._reader.SeekingReader(stream).get_summary()
+            except Exception:  # noqa: BLE001  a dozen types, by what is damaged
+                summary = None
+        self.whole = summary is not None and summary.statistics is not None
+        if self.whole:
+            self.types = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
+            return
+        self.types = {}
+        try:
+            for schema, channel, _ in self._records(None):
+                self.types.setdefault(channel.topic, "" if schema is None else schema.name)
+        except _CutShort as error:
+            if not self.types:
+                raise SourceError(f"path: {path} can't be read ({error}); a whole .mcap file") from None
+
+    def messages(self, topics: list[str]) -> Iterator[_Message]:
+        """In order of their log times, of a file that is cut short as they stand."""
+        for schema, channel, message in self._records(topics):
+            data, encoding = message.data, channel.message_encoding
+            kind = _kind(schema.name)
+            yield _Message(channel.topic, kind, message.log_time, functools.partial(_decode, data, encoding, schema))
+        if not self.whole:
+            raise _CutShort("it has no summary")
+
+    def _records(self, topics: list[str] | None) -> Iterator[Any]:
+        with opened(self._path) as stream:
+            reader = (self._reader.SeekingReader if self.whole else self._reader.NonSeekingReader)(stream, True)
+            found = reader.iter_messages(topics=topics, log_time_order=self.whole)
+            while True:
+                try:
+                    record = next(found, None)
+                except Exception as error:  # noqa: BLE001  as above
+                    raise _CutShort(short(error)) from None
+                if record is None:
+                    return
+                yield record
+
+
+def _kind(type_name: str) -> str:
+    return type_name.replace(".", "/").rpartition("/")[2]
+
+
+def _decode(data: bytes, encoding: str, schema: Any) -> Any:
+    """A message by its fields, as attributes.  ValueError for an encoding that isn't read."""
+    if encoding == "cdr":
+        return _from_cdr(data, schema.name, schema.data.decode(errors="replace"))
+    if encoding == "protobuf":
+        decoder = needed("mcap_protobuf.decoder").DecoderFactory().decoder_for(encoding, schema)
+        return decoder(data)
+    if encoding == "json":
+        return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+    raise ValueError(f"a message in {encoding}; cdr, protobuf or json")
+
+
+def _from_cdr(data: bytes, type_name: str, definition: str = "") -> Any:
+    store = typestore()
+    if type_name not in store.types:
+        from rosbags.typesys import get_types_from_msg
+
+        store.register(get_types_from_msg(definition, type_name))
+    return store.deserialize_cdr(data, type_name)
+
+
+class _Rosbag2:
+    """A folder of rosbag2 with SQLite or MCAP files, on this machine."""
+
+    whole = True
+
+    def __init__(self, path: str) -> None:
+        from pathlib import Path
+
+        from rosbags.rosbag2 import Reader
+
+        system, inside = file_system(path)
+        if "file" not in (system.protocol if isinstance(system.protocol, tuple) else (system.protocol,)):
+            raise SourceError(f"path: {path}: rosbag2 is read on this machine only; .mcap files, or a copy")
+        self._path, self._reader = Path(inside), Reader
+        try:
+            with Reader(self._path) as reader:
+                self.types = {connection.topic: connection.msgtype for connection in reader.connections}
+        except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
+            raise SourceError(f"path: {path} can't be read ({short(error)}); a whole rosbag2") from None
+
+    def messages(self, topics: list[str]) -> Iterator[_Message]:
+        """In order of their log times."""
+        try:
+            with self._reader(self._path) as reader:
+                wanted = [connection for connection in reader.connections if connection.topic in topics]
+                for connection, log_ns, data in reader.messages(connections=wanted):
+                    name = connection.msgtype
+                    yield _Message(connection.topic, _kind(name), log_ns, functools.partial(_from_cdr, data, name))
+        except Exception as error:  # noqa: BLE001  as above
+            raise _CutShort(short(error)) from None
+
+
+def open_messages(path: str) -> _Mcap | _Rosbag2:
+    """The messages of a file or folder.  Raises :class:`SourceError`."""
+    try:
+        typestore()
+    except Ros2Missing as error:
+        raise SourceError(f"path: {error}") from None
+    return _Mcap(path) if path.lower().endswith(".mcap") else _Rosbag2(path)
+
+
+def is_rosbag2(path: str) -> bool:
+    """Whether a folder is one."""
+    return there(joined(path, "metadata.yaml"))
+
+
+def image_topics(types: dict[str, str]) -> list[str]:
+    """Topics with images, by name."""
+    return sorted(topic for topic, name in types.items() if _kind(name) in _IMAGES)
+
+
+class BagSource:
+    """Every image of a topic, in order of log time, with the stamp of its own header (the log's where that is empty),
+    and the opening at that time.  Where the file is cut short the last frame has no image, and says so.
+
+    ``camera``: the calibration that comes with the images, None where there is none.  Raises :class:`SourceError` for
+    what can't be read, and for a topic or joints that aren't there, with the names of those that are.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, settings: BagSettings, relative_to: str = "") -> None:
+        self._path = settings.path if "://" in settings.path else joined(relative_to, settings.path)
+        self._bag = open_messages(self._path)
+        self._topic = self._chosen(settings.camera)
+        self._opening = settings.opening
+        self._stamps_ns, self._openings_m = self._joints()
+        self.camera = self._camera()
+        self._decoder: VideoDecoder | None = None
+        self._seq, self._last_stamp_ns, self._open = 0, -1, True
+        self._frames = self._read()
+
+    def read(self) -> Frame | None:
+        return next(self._frames, None) if self._open else None
+
+    def close(self) -> None:
+        self._open = False
+
+    def _chosen(self, wanted: str | None) -> str:
+        topics = image_topics(self._bag.types)
+        if wanted in topics:
+            return str(wanted)
+        there = ", ".join(topics) or "none"
+        if wanted is not None:
+            raise SourceError(f"camera: {self._path} has no images on {wanted}; one of its topics with images: {there}")
+        if len(topics) != 1:
+            raise SourceError(f"camera: {self._path} has several topics with images, or none; one of: {there}")
+        return topics[0]
+
+    def _joints(self) -> tuple[np.ndarray, Array]:
+        """Stamps (n,) and openings (n,) of all reports, in order of time."""
+        if self._opening is None:
+            return np.empty(0, np.int64), np.empty(0)
+        topics = [topic for topic, name in self._bag.types.items() if _kind(name) in _JOINTS]
+        reports: list[tuple[int, float]] = []
+        names: set[str] = set()
+        try:
+            for message in self._bag.messages(topics) if topics else ():
+                found = message.decode()
+                names.update(found.name)
+                opening_m = self._opening.opening_m(dict(zip(found.name, map(float, found.position), strict=False)))
+                if opening_m is not None:
+                    reports.append((_stamp_ns(found) or message.log_ns, opening_m))
+        except _CutShort:
+            pass  # the images end there, too, and say so
+        except ValueError as error:
+            raise SourceError(f"opening: {self._path}: {error}") from None
+        if not reports:
+            there = ", ".join(sorted(names)) or "none"
+            wanted = ", ".join(self._opening.joints)
+            raise SourceError(f"opening.joints: {self._path} has no joint state of {wanted}; of its joints: {there}")
+        reports.sort()
+        return np.array([stamp for stamp, _ in reports], np.int64), np.array([opening for _, opening in reports])
+
+    def _camera(self) -> LensSettings | None:
+        topics = [topic for topic, name in self._bag.types.items() if _kind(name) in _CAMERAS]
+        parent = self._topic
+        near: list[str] = []
+        while parent and not near:
+            parent = parent.rpartition("/")[0]
+            near = [topic for topic in topics if topic.startswith(f"{parent}/")]
+        if len(near or topics) != 1:
+            return None
+        try:
+            message = next(self._bag.messages(near or topics), None)
+            return None if message is None else lens_of(message.decode(), rectified="rect" in self._topic)
+        except (_CutShort, ValueError) as error:
+            raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {error}") from None
+
+    def _read(self) -> Iterator[Frame]:
+        try:
+            for message in self._bag.messages([self._topic]):
+                yield self._frame(message)
+        except _CutShort as error:
+            fault = f"{self._path} is cut short or damaged after {self._seq} frames ({error})"
+            yield Frame(self._seq, max(self._last_stamp_ns, 0), None, None, self._topic, fault)
+
+    def _frame(self, message: _Message) -> Frame:
+        stamp_ns, opening_m = message.log_ns, None
+        try:
+            found = message.decode()
+            stamp_ns = _stamp_ns(found) or stamp_ns
+            image, fault = self._image(found, message.kind)
+        except Exception as error:  # noqa: BLE001  whatever a damaged message does, the others are sound
+            image, fault = None, f"the message can't be decoded ({short(error)})"
+        if stamp_ns <= self._last_stamp_ns:
+            image, fault = None, "its time stamp does not rise"
+        if len(self._stamps_ns):
+            opening_m = openings_at(self._stamps_ns, self._openings_m, stamp_ns)
+        self._last_stamp_ns = max(stamp_ns, self._last_stamp_ns)
+        self._seq += 1
+        return Frame(self._seq - 1, self._last_stamp_ns, image, opening_m, self._topic, fault)
+
+    def _image(self, message: Any, kind: str) -> tuple[Image | None, str | None]:
+        data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+        if kind == "CompressedImage":
+            return decoded_file(data)
+        if kind == "CompressedVideo":
+            self._decoder = self._decoder or VideoDecoder(message.format)
+            return self._decoder.decode(data)
+        size = int(message.width), int(message.height)
+        note = FrameNote(width=size[0], height=size[1], encoding=message.encoding, step=int(message.step))
+        if getattr(message, "is_bigendian", 0) and message.encoding.endswith("16"):
+            data = np.frombuffer(data, ">u2").astype("<u2").tobytes()
+        try:
+            return raw_image(data, note, size), None
+        except PayloadError as error:
+            return None, str(error)
+
+
+def _stamp_ns(message: Any) -> int:
+    """Of the message's own header; 0 where it has none or leaves it empty."""
+    stamp = getattr(getattr(message, "header", message), "stamp", None) or getattr(message, "timestamp", None)
+    if stamp is None:
+        return 0
+    # As ROS names them, Foxglove's JSON, and Protobuf.
+    seconds = max(getattr(stamp, name, 0) for name in ("sec", "seconds"))
+    return int(seconds) * 1_000_000_000 + int(max(getattr(stamp, name, 0) for name in ("nanosec", "nsec", "nanos")))
+
+
+def lens_of(message: Any, *, rectified: bool = False) -> LensSettings | None:
+    """The camera of a CameraInfo or CameraCalibration; None for one that was never calibrated (its K is 0).
+
+    ``rectified``: of images that ROS has rectified, P's pinhole without distortion.  ValueError for a lens that no
+    monitor can use.
+    """
+    k, d, p = (np.array(getattr(message, a, getattr(message, a.upper(), ()))).astype(float) for a in "kdp")
+    if k.size != 9 or not k.any():
+        return None
+    if rectified and p.size == 12 and p.any():
+        k, d = p.reshape(3, 4)[:, :3].ravel(), np.empty(0)
+    content = {
+        "image_width": int(message.width),
+        "image_height": int(message.height),
+        "distortion_model": message.distortion_model or "plumb_bob",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": k.tolist()},
+        "distortion_coefficients": {"rows": 1, "cols": d.size, "data": d.tolist()},
+    }
+    if rectified or not d.size:
+        content["distortion_model"] = "plumb_bob"
+    try:
+        return read_ros(json.dumps(content).encode(), "camera_info")
+    except InterchangeError as error:
+        raise ValueError(str(error)) from None

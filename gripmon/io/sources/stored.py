@@ -1,0 +1,133 @@
+"""Files of recorded episodes, on this machine or in an object store: what the sources and the search for them share."""
+
+from __future__ import annotations
+
+import importlib
+import posixpath
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.io.sources.base import SourceError
+from gripmon.model.records import Array, Image
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+LONGEST_STEP_S = 0.1
+"""Between reports of an opening farther apart the jaw stood still, and moved only so long before the later one: as on
+the network (:data:`gripmon.io.publish.inputs.LONGEST_STEP_S`), since robots may report only while the jaws move.
+"""
+EXTRA = "pip install -e '.[datasets]' in gripmon's checkout"
+
+
+def file_system(path: str) -> tuple[AbstractFileSystem, str]:
+    """What reads a path or URL (``s3://bucket/…``), and the path as that takes it.  Credentials are those that the
+    store's own library finds.  Raises :class:`SourceError` without the libraries.
+    """
+    try:
+        import fsspec
+
+        system, inside = fsspec.core.url_to_fs(path)
+    except ImportError as error:
+        raise SourceError(f"path: {path} needs the package {error.name or error}; {EXTRA}") from None
+    except ValueError as error:
+        raise SourceError(f"path: {path}: {error}; a folder, or a URL such as s3://bucket/folder") from None
+    return system, inside
+
+
+def opened(path: str) -> IO[bytes]:
+    """A file to read and to seek in.  Raises :class:`SourceError`."""
+    try:
+        if "://" not in path:
+            return Path(path).open("rb")
+        system, inside = file_system(path)
+        found: IO[bytes] = system.open(inside, "rb")
+        return found
+    except SourceError:
+        raise
+    except FileNotFoundError:
+        raise SourceError(f"path: there is no file {path}") from None
+    except Exception as error:  # noqa: BLE001  each store has its own
+        raise SourceError(f"path: {path} can't be read ({short(error)})") from None
+
+
+def there(path: str) -> bool:
+    """Whether a file or folder is; False for what can't be asked, too."""
+    if "://" not in path:
+        return Path(path).exists()
+    try:
+        system, inside = file_system(path)
+        return bool(system.exists(inside))
+    except Exception:  # noqa: BLE001  each store has its own; whoever opens it is told
+        return False
+
+
+def joined(root: str, *parts: str) -> str:
+    """A path below a path or URL."""
+    return posixpath.join(root, *parts)
+
+
+def needed(package: str) -> Any:
+    """A package of the extra ``datasets``.  Raises :class:`SourceError` where it isn't installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise SourceError(f"path: needs the package {error.name}; {EXTRA}") from None
+
+
+def short(error: BaseException) -> str:
+    """An error of another library in one line."""
+    return f"{' '.join(str(error).split()) or type(error).__name__:.200}"
+
+
+def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int) -> float:
+    """The opening (m) at a time, of reports (n,) in order of time: linear between two, but see
+    :data:`LONGEST_STEP_S`; beyond the first and the last one nothing is made up: as they say.
+    """
+    after = int(np.searchsorted(stamps_ns, wanted_ns))
+    if after in (0, len(stamps_ns)):
+        return float(openings_m[min(after, len(stamps_ns) - 1)])
+    step_ns = min(int(stamps_ns[after] - stamps_ns[after - 1]), round(1e9 * LONGEST_STEP_S))
+    share = min(int(stamps_ns[after] - wanted_ns) / step_ns, 1.0)
+    return float(openings_m[after] + share * (openings_m[after - 1] - openings_m[after]))
+
+
+def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
+    """The image in a JPEG's or PNG's bytes, its brightness alone (that is all that is measured); or why there is
+    none.
+    """
+    import cv2
+
+    try:
+        image: Image | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        image = None
+    return image, None if image is not None else "truncated, damaged or not an image"
+
+
+class VideoDecoder:
+    """Pictures out of packets of an elementary stream, in grey levels; one thread, so that nothing else waits."""
+
+    CODECS: ClassVar = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "av1"}
+
+    def __init__(self, format_name: str) -> None:
+        """``format_name``: as foxglove.CompressedVideo has it.  Raises ValueError for another one."""
+        codec = self.CODECS.get(format_name.lower())
+        if codec is None:
+            raise ValueError(f"a video of format {format_name!r}; one of {', '.join(self.CODECS)}")
+        av = needed("av")
+        self._context, self._packet, self._error = av.CodecContext.create(codec, "r"), av.Packet, av.error.FFmpegError
+        self._context.thread_count = 1
+
+    def decode(self, data: bytes) -> tuple[Image | None, str | None]:
+        """The picture of one packet, or why there is none."""
+        try:
+            frames = self._context.decode(self._packet(data))
+        except self._error as error:
+            return None, f"the video frame can't be decoded ({short(error)})"
+        if not frames:
+            return None, "the video frame can't be decoded (none before the first key frame)"
+        return frames[-1].to_ndarray(format="gray"), None

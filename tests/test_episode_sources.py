@@ -1,0 +1,233 @@
+"""Episodes out of MCAP, rosbag2 and LeRobot files: images, stamps, openings and cameras as they were written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.episode_files import NS, WRIST, Shots, write_foxglove, write_lerobot, write_mcap, write_rosbag2
+
+import gripmon
+from gripmon.io.ros2.node import JointOpening
+from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, open_source, settings_for_path
+from gripmon.io.sources.bags import BagSource
+from gripmon.model.camera import BrownConradyLens
+from gripmon.model.records import Frame
+
+LENS = BrownConradyLens(
+    width_px=64,
+    height_px=48,
+    fx_px=80.0,
+    fy_px=81.0,
+    cx_px=31.0,
+    cy_px=24.0,
+    coefficients=(-0.1, 0.02, 0.001, 0.0, 0.0),
+)
+FINGERS = JointOpening(joints=("left", "right"))
+GRIPPER = JointOpening(joints=("gripper",), scale=0.08)
+BEGIN_NS = 1_790_000_000 * NS
+
+
+def shots(count: int = 12, fps: float = 20.0, first: int = 0) -> Shots:
+    """Grey images, each with its number in the brightness of its halves; jaws that open."""
+    images = [np.full((48, 64), 40, np.uint8) for _ in range(count)]
+    for i, image in enumerate(images):
+        image[:, 32:] = 60 + 5 * (first + i)
+    stamps = [BEGIN_NS + round(i * NS / fps) for i in range(count)]
+    return Shots(images, stamps, [0.01 + 0.002 * i for i in range(count)], LENS)
+
+
+def frames_of(settings) -> list[Frame]:
+    source = open_source(settings)
+    return [frame for frame in iter(source.read, None) if isinstance(frame, Frame)]
+
+
+def assert_as_written(frames: list[Frame], written: Shots, *, openings: bool = True, lossy_dn: float = 0.0) -> None:
+    assert [frame.fault for frame in frames] == [None] * len(written.images)
+    assert [frame.seq for frame in frames] == list(range(len(written.images)))
+    for frame, image in zip(frames, written.images, strict=True):
+        assert np.abs(frame.image.astype(float) - image).mean() <= lossy_dn
+    if openings:
+        np.testing.assert_allclose([frame.jaw_opening_m for frame in frames], written.openings_m, atol=1e-8)
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("write", [write_mcap, write_rosbag2])
+def test_messages_of_ros(tmp_path: Path, write, raw: bool):
+    """The stamp is the header's, not the log's, which is 3 ms later; the opening is the sum of both fingers'."""
+    path = tmp_path / ("a.mcap" if write is write_mcap else "bag")
+    written = shots()
+    write(path, written, raw=raw)
+    assert settings_for_path(path) == BagSettings(path=str(path))
+    source = BagSource(BagSettings(path=str(path), opening=FINGERS))
+    frames = list(iter(source.read, None))
+    assert_as_written(frames, written)
+    assert [frame.stamp_ns for frame in frames] == written.stamps_ns
+    assert source.camera == LENS
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_messages_of_foxglove(tmp_path: Path, video: bool):
+    written = shots()
+    write_foxglove(tmp_path / "a.mcap", written, video=video)
+    source = BagSource(BagSettings(path=str(tmp_path / "a.mcap")))
+    frames = list(iter(source.read, None))
+    assert_as_written(frames, written, openings=False, lossy_dn=2.0 if video else 0.0)
+    assert [frame.stamp_ns for frame in frames] == written.stamps_ns
+    assert source.camera == LENS
+
+
+def test_openings_between_reports_are_linear_and_stand_still_in_pauses(tmp_path: Path):
+    from gripmon.io.sources.stored import openings_at
+
+    stamps, openings = np.array([0, NS // 20, NS]), np.array([0.01, 0.02, 0.03])
+    assert openings_at(stamps, openings, NS // 40) == pytest.approx(0.015)
+    assert openings_at(stamps, openings, NS // 2) == 0.02
+    assert openings_at(stamps, openings, NS - NS // 20) == pytest.approx(0.025)
+    assert openings_at(stamps, openings, -5) == 0.01 and openings_at(stamps, openings, 2 * NS) == 0.03
+
+
+def test_camera_that_was_never_calibrated_is_none(tmp_path: Path):
+    write_mcap(tmp_path / "a.mcap", shots(2), calibrated=False)
+    assert BagSource(BagSettings(path=str(tmp_path / "a.mcap"))).camera is None
+
+
+def test_cut_mcap_gives_what_is_there_and_says_so(tmp_path: Path):
+    rng = np.random.default_rng(1)
+    written = shots(40)
+    noisy = Shots([rng.integers(0, 255, (48, 64), np.uint8) for _ in range(40)], written.stamps_ns, written.openings_m)
+    write_mcap(tmp_path / "a.mcap", noisy)
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(data[: len(data) // 2])
+    frames = frames_of(BagSettings(path=str(tmp_path / "a.mcap"), opening=FINGERS))
+    assert 3 < len(frames) < 30
+    assert frames[-1].image is None and f"cut short or damaged after {len(frames) - 1} frames" in frames[-1].fault
+    for frame, image in zip(frames[:-1], noisy.images, strict=False):
+        assert np.array_equal(frame.image, image)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"camera": "/front"}, "camera: .* has no images on /front; one of its topics with images: /wrist/image"),
+        ({"opening": JointOpening(joints=("jaw",))}, "opening.joints: .* jaw; of its joints: elbow, left, right"),
+    ],
+)
+def test_what_is_missing_in_messages_is_named(tmp_path: Path, settings: dict, words: str):
+    write_mcap(tmp_path / "a.mcap", shots(2))
+    with pytest.raises(SourceError, match=words):
+        open_source(BagSettings(path=str(tmp_path / "a.mcap"), **settings))
+
+
+def test_file_that_is_no_mcap(tmp_path: Path):
+    (tmp_path / "a.mcap").write_bytes(b"nothing of the kind")
+    with pytest.raises(SourceError, match=r"a.mcap can't be read .*; a whole .mcap file"):
+        open_source(BagSettings(path=str(tmp_path / "a.mcap")))
+
+
+@pytest.mark.parametrize(("version", "codec"), [("v3.0", "libsvtav1"), ("v2.1", "libsvtav1"), ("v3.0", "libx264")])
+def test_episodes_of_lerobot(tmp_path: Path, version: str, codec: str):
+    """Each episode's own frames out of a video that holds several, AV1 too."""
+    episodes = [shots(7, 10.0, 0), shots(9, 10.0, 7), shots(8, 10.0, 16)]
+    write_lerobot(tmp_path / "set", episodes, fps=10, version=version, per_file=2, codec=codec)
+    assert settings_for_path(tmp_path / "set") == LeRobotSettings(path=str(tmp_path / "set"))
+    for number, written in enumerate(episodes):
+        frames = frames_of(LeRobotSettings(path=str(tmp_path / "set"), episode=number, opening=GRIPPER))
+        assert_as_written(frames, written, lossy_dn=1.5)
+        np.testing.assert_allclose([1e-9 * frame.stamp_ns for frame in frames], np.arange(len(frames)) / 10, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({}, r"episode: .* has 2; one of: 0, 1"),
+        ({"episode": 2}, r"episode: .* has no episode 2; one of: 0, 1"),
+        ({"episode": 0, "camera": "front"}, f"camera: .* has no camera front; one of: {WRIST}"),
+        ({"episode": 0, "opening": FINGERS}, r"opening.joints: .* has no left, right; of its .*: elbow, gripper"),
+    ],
+)
+def test_what_is_missing_in_lerobot_is_named(tmp_path: Path, settings: dict, words: str):
+    write_lerobot(tmp_path / "set", [shots(3), shots(3)], fps=10)
+    with pytest.raises(SourceError, match=words):
+        open_source(LeRobotSettings(path=str(tmp_path / "set"), **settings))
+
+
+def test_cut_video_of_lerobot_is_frames_that_say_so(tmp_path: Path):
+    rng = np.random.default_rng(2)
+    written = shots(20, 10.0)
+    noisy = Shots([rng.integers(0, 255, (48, 64), np.uint8) for _ in range(20)], written.stamps_ns, written.openings_m)
+    write_lerobot(tmp_path / "set", [noisy], fps=10)
+    (video,) = (tmp_path / "set").rglob("*.mp4")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    frames = frames_of(LeRobotSettings(path=str(tmp_path / "set")))
+    assert len(frames) == 20
+    assert frames[0].image is not None and frames[-1].image is None
+    assert "truncated?" in frames[-1].fault or "has no frame at" in frames[-1].fault
+    video.write_bytes(b"")
+    assert all(frame.image is None and frame.fault for frame in frames_of(LeRobotSettings(path=str(tmp_path / "set"))))
+
+
+def test_format_of_tomorrow_is_refused(tmp_path: Path):
+    write_lerobot(tmp_path / "set", [shots(2)], fps=10)
+    info = tmp_path / "set" / "meta" / "info.json"
+    info.write_text(info.read_text().replace("v3.0", "v4.0"))
+    with pytest.raises(SourceError, match=r"format v4\.0; v2\.0, v2\.1 or v3\.0"):
+        open_source(LeRobotSettings(path=str(tmp_path / "set")))
+
+
+def test_from_a_store_of_objects(tmp_path: Path):
+    """By URL, here into fsspec's own store in memory."""
+    import fsspec
+
+    write_lerobot(tmp_path / "set", [shots(4, 10.0)], fps=10)
+    write_mcap(tmp_path / "a.mcap", shots(4))
+    memory = fsspec.filesystem("memory")
+    memory.put(str(tmp_path / "set"), "/episodes/set", recursive=True)
+    memory.put(str(tmp_path / "a.mcap"), "/episodes/a.mcap")
+    assert_as_written(frames_of(LeRobotSettings(path="memory://episodes/set", opening=GRIPPER)), shots(4), lossy_dn=1.5)
+    assert_as_written(frames_of(BagSettings(path="memory://episodes/a.mcap", opening=FINGERS)), shots(4))
+
+
+def test_replay_takes_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """The opening comes by the configuration's source, its camera is held against the one in the file."""
+    from gripmon.cli import main
+
+    made = gripmon.simulate_images("demo", tmp_path / "images", duration_s=0.5, fps=10.0)
+    folder = list(gripmon.open_source(made.folder))
+    lens = BrownConradyLens(
+        width_px=768,
+        height_px=576,
+        fx_px=962.0,
+        fy_px=962.0,
+        cx_px=383.5,
+        cy_px=287.5,
+        coefficients=(-0.17, 0, 0, 0),
+    )
+    written = Shots(
+        [f.image if f.image.ndim == 2 else f.image[:, :, 0] for f in folder],
+        [f.stamp_ns for f in folder], [f.jaw_opening_m for f in folder], lens,
+    )  # fmt: skip
+    write_mcap(tmp_path / "a.mcap", written)
+    text = (made.folder / "config.yaml").read_text().partition("source:\n  kind")[0]
+    config = made.folder / "mcap.yaml"
+    config.write_text(text + "source:\n  kind: bag\n  path: x\n  opening: {joints: [left, right]}\n")
+    outs = []
+    for name, given in (("folder", made.folder), ("mcap", tmp_path / "a.mcap")):
+        out = tmp_path / f"{name}.jsonl"
+        assert main(["replay", str(given), "--config", str(config), "--out", str(out)]) == 0
+        lines = [msgspec.json.decode(line) for line in out.read_bytes().splitlines()]
+        outs.append([{k: v for k, v in line.items() if k not in ("latency_ns", "name")} for line in lines])
+    assert outs[0] == outs[1]
+    assert "camera calibration that is up to" in capfd.readouterr().err
+
+
+def test_replay_names_options_that_do_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    from gripmon.cli import main
+    from gripmon.daemon.config import builtin_config
+
+    write_mcap(tmp_path / "a.mcap", shots(2))
+    demo = str(builtin_config("demo.yaml"))
+    assert main(["replay", str(tmp_path / "a.mcap"), "--config", demo, "--out", "-", "--episode", "1"]) == 2
+    assert "a.mcap is one episode; leave it out" in capfd.readouterr().err
