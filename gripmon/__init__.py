@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gripmon.client import Client, Fleet, TransformClient
     from gripmon.daemon.api import Monitor, open_source
     from gripmon.daemon.config import Config, load_config
+    from gripmon.daemon.dataset import measure_dataset
     from gripmon.daemon.forecast import Forecast, forecast
     from gripmon.daemon.replaying import replay
     from gripmon.daemon.simulated import simulate_images
@@ -61,6 +62,7 @@ _WHERE = {
     "gripper_from_cad": "teach.cad",
     "gripper_from_images": "teach.from_images",
     "load_config": "daemon.config",
+    "measure_dataset": "daemon.dataset",
     "open_source": "daemon.api",
     "replay": "daemon.replaying",
     "report": "analyse.api",
@@ -92,6 +94,7 @@ __all__ = [
     "gripper_from_cad",
     "gripper_from_images",
     "load_config",
+    "measure_dataset",
     "open_source",
     "replay",
     "report",

@@ -275,3 +275,23 @@ def as_json(figure: go.Figure) -> str:
     """For a script element: nothing in it ends that."""
     text: Any = figure.to_json()
     return str(text).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def mountings_figure(names: Sequence[str], shift_m: np.ndarray, mountings: np.ndarray) -> go.Figure:
+    """The TCP of each stretch of a dataset against the first one's, along the camera's axes, a colour a mounting."""
+    figure = _figure(0.05, 1 / 3, 1 / 3, 1 / 3)
+    for number in np.unique(mountings).tolist():
+        mine = np.flatnonzero(mountings == number)
+        marker = {"color": ROBOTS[number % len(ROBOTS)], "size": 5}
+        for row in range(3):
+            figure.add_scatter(
+                x=mine, y=_MM * shift_m[mine, row], mode="markers", marker=marker, name=f"mounting {number}",
+                legendgroup=str(number), showlegend=row == 0, text=[_plain(names[k]) for k in mine.tolist()],
+                hovertemplate="%{text}<br>%{y:.3f} mm<extra></extra>", row=row + 1, col=1,
+            )  # fmt: skip
+    figure = _styled(figure, 460)
+    figure.update_xaxes(type="linear", hoverformat=None)
+    figure.update_xaxes(title_text="stretches in the episodes' order", row=3, col=1)
+    for row, axis in enumerate("xyz", 1):
+        figure.update_yaxes(title_text=f"{axis} (mm)", row=row, col=1)
+    return figure

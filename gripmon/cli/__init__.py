@@ -18,6 +18,7 @@ from gripmon.cli import (
     calibrate_verify,
     certificates,
     check,
+    dataset,
     demo,
     gripper_cad,
     gripper_images,
@@ -37,7 +38,8 @@ from gripmon.model.stopping import EXIT_INTERRUPTED
 
 _COMMANDS = (
     demo.demo, run.run, watch.watch, send.send, network.router, network.schema, network.feed, replay.replay,
-    recordings.view, recordings.report, recordings.export, recordings.correct, simulate.simulate, check.check,
+    recordings.view, recordings.report, recordings.export, recordings.correct, dataset.dataset,
+    simulate.simulate, check.check,
 )  # fmt: skip
 _METHODS = (
     calibrate_intrinsics.intrinsics, calibrate_plane.plane, calibrate_arm.laser, calibrate_arm.robot_world,

@@ -7,6 +7,7 @@ the order is matters little.  ``tools/test --durations 100`` shows what has beco
 from __future__ import annotations
 
 LONGEST = (
+    "test_dataset",
     "test_sequential",
     "test_view",
     "test_cli",

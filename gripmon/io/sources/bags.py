@@ -187,8 +187,9 @@ class BagSource:
     """Every image of a topic, in order of log time, with the stamp of its own header (the log's where that is empty),
     and the opening at that time.  Where the file is cut short the last frame has no image, and says so.
 
-    ``camera``: the calibration that comes with the images, None where there is none.  Raises :class:`SourceError` for
-    what can't be read, and for a topic or joints that aren't there, with the names of those that are.
+    ``topic``: that of the images.  ``camera``: the calibration that comes with them, None where there is none.  Raises
+    :class:`SourceError` for what can't be read, and for a topic or joints that aren't there, with the names of those
+    that are.
     """
 
     live = False
@@ -198,7 +199,7 @@ class BagSource:
     def __init__(self, settings: BagSettings, relative_to: str = "") -> None:
         self._path = settings.path if "://" in settings.path else joined(relative_to, settings.path)
         self._bag = open_messages(self._path)
-        self._topic = self._chosen(settings.camera)
+        self.topic = self._chosen(settings.camera)
         self._opening = settings.opening
         self._stamps_ns, self._openings_m = self._joints()
         self.camera = self._camera()
@@ -250,7 +251,7 @@ class BagSource:
 
     def _camera(self) -> LensSettings | None:
         topics = [topic for topic, name in self._bag.types.items() if _kind(name) in _CAMERAS]
-        parent = self._topic
+        parent = self.topic
         near: list[str] = []
         while parent and not near:
             parent = parent.rpartition("/")[0]
@@ -259,17 +260,17 @@ class BagSource:
             return None
         try:
             message = next(self._bag.messages(near or topics), None)
-            return None if message is None else lens_of(message.decode(), rectified="rect" in self._topic)
+            return None if message is None else lens_of(message.decode(), rectified="rect" in self.topic)
         except (_CutShort, ValueError) as error:
             raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {error}") from None
 
     def _read(self) -> Iterator[Frame]:
         try:
-            for message in self._bag.messages([self._topic]):
+            for message in self._bag.messages([self.topic]):
                 yield self._frame(message)
         except _CutShort as error:
             fault = f"{self._path} is cut short or damaged after {self._seq} frames ({error})"
-            yield Frame(self._seq, max(self._last_stamp_ns, 0), None, None, self._topic, fault)
+            yield Frame(self._seq, max(self._last_stamp_ns, 0), None, None, self.topic, fault)
 
     def _frame(self, message: _Message) -> Frame:
         stamp_ns, opening_m = message.log_ns, None
@@ -285,7 +286,7 @@ class BagSource:
             opening_m = openings_at(self._stamps_ns, self._openings_m, stamp_ns)
         self._last_stamp_ns = max(stamp_ns, self._last_stamp_ns)
         self._seq += 1
-        return Frame(self._seq - 1, self._last_stamp_ns, image, opening_m, self._topic, fault)
+        return Frame(self._seq - 1, self._last_stamp_ns, image, opening_m, self.topic, fault)
 
     def _image(self, message: Any, kind: str) -> tuple[Image | None, str | None]:
         data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)

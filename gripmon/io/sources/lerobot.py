@@ -190,6 +190,7 @@ class LeRobotSource:
         half_s = 0.5 * float(np.median(np.diff(self._time_s))) if len(self) > 1 else 0.5 / self._dataset.info["fps"]
         row, fault = 0, None
         frames = _video_frames(path, begin_s - half_s)
+        grey = needed("av.video.reformatter").VideoReformatter()
         while row < len(self):
             try:
                 at_s, frame = next(frames, (np.inf, None))
@@ -199,7 +200,7 @@ class LeRobotSource:
                 yield None, fault or f"its video has no frame at {begin_s + self._time_s[row]:.3f} s"
                 row += 1
             if row < len(self) and frame is not None and abs(begin_s + self._time_s[row] - at_s) <= half_s:
-                yield frame.to_ndarray(format="gray"), None
+                yield grey.reformat(frame, format="gray").to_ndarray(), None
                 row += 1
 
 

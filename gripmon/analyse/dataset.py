@@ -1,0 +1,318 @@
+"""What was measured of a dataset: a journal that survives a kill, the table made of it, and the report."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+from urllib.parse import quote
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from msgspec import Meta
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gripmon import __version__
+from gripmon.analyse.stretches import Stretch, mountings_of
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
+from gripmon.model.records import Verdict
+
+TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
+_GROUP_ROWS, _FILE_ROWS = 1000, 50_000
+"""Rows in memory at once (with their pictures some 20 MB), and in a file."""
+
+
+class Measured(msgspec.Struct, frozen=True):
+    """What an episode gave by one camera: its stretches, or ``fault``: why there are none."""
+
+    episode: str
+    camera: str
+    key: str
+    version: str
+    frames: int = 0
+    own_reference: Annotated[bool, Meta(description="it was calibrated anew from the episode's own images")] = False
+    lens: Annotated[str, Meta(description="file or configuration: whose camera calibration")] = "configuration"
+    stretches: tuple[Stretch, ...] = ()
+    fault: str | None = None
+    pictures: Annotated[tuple[bytes, ...], Meta(description="JPEGs of the first stretch and the last")] = ()
+
+
+class _Head(msgspec.Struct, frozen=True):
+    journal: str
+    fingerprint: str
+
+
+class _Entry(msgspec.Struct, frozen=True):
+    key: str
+    version: str
+
+
+class Journal:
+    """A file with a line for each episode that was measured; a line that was cut by a kill doesn't count.
+
+    Raises :class:`InputError` where another process writes it, or it holds what another configuration gave.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str) -> None:
+        path = folder / _JOURNAL
+        self._file = path.open("a+b")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.close()
+            raise InputError(f"{folder}: another gripmon dataset writes there; wait for it", "out") from None
+        self._places: dict[str, tuple[int, str]] = {}
+        end = 0
+        self._file.seek(0)
+        for line in self._file:
+            if not line.endswith(b"\n"):
+                break
+            if end == 0:
+                self._check(line, fingerprint, folder)
+            else:
+                entry = msgspec.json.decode(line, type=_Entry)
+                self._places[entry.key] = end, entry.version
+            end += len(line)
+        self._file.truncate(end)
+        if end == 0:
+            self._append(_Head("gripmon.dataset/1", fingerprint))
+
+    def _check(self, line: bytes, fingerprint: str, folder: Path) -> None:
+        if msgspec.json.decode(line, type=_Head).fingerprint != fingerprint:
+            self._file.close()
+            wrong = "holds what another configuration, or another version of gripmon, measured"
+            raise InputError(f"{folder}: {wrong}; another folder, or delete this one", "out")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._file.close()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._places
+
+    def keep(self, versions: dict[str, str]) -> None:
+        """Forget episodes whose files have changed since."""
+        self._places = {key: place for key, place in self._places.items() if versions.get(key) == place[1]}
+
+    def add(self, measured: Measured) -> None:
+        """One more; it is kept when this returns, also if the process is killed."""
+        self._places[measured.key] = self._append(measured), measured.version
+
+    def read(self, key: str) -> Measured:
+        """What was kept of an episode."""
+        self._file.seek(self._places[key][0])
+        return msgspec.json.decode(self._file.readline(), type=Measured)
+
+    def _append(self, entry: msgspec.Struct) -> int:
+        self._file.seek(0, os.SEEK_END)
+        begin = self._file.tell()
+        self._file.write(msgspec.json.encode(entry) + b"\n")
+        self._file.flush()
+        return begin
+
+
+class Line(msgspec.Struct, frozen=True):
+    """What the report takes of a row of the table: one stretch of an episode, or an episode that failed."""
+
+    key: str
+    episode: str
+    camera: str
+    number: int
+    stretch: Stretch | None
+    fault: str | None
+
+
+@dataclass(frozen=True)
+class Written:
+    """The files, and what is in them: ``lines`` with their ``mountings`` (-1: none), by camera."""
+
+    table: Path
+    report: Path
+    lines: tuple[Line, ...]
+    mountings: NDArray[np.int64]
+
+    @property
+    def failed(self) -> int:
+        """Episodes without any transform."""
+        usable = {line.key for line in self.lines if line.stretch is not None and line.stretch.cam_T_grip is not None}
+        return len({line.key for line in self.lines} - usable)
+
+
+def write_dataset(
+    journal: Journal,
+    keys: Sequence[str],
+    out: Path,
+    name: str,
+    level: float,
+    tolerance_m: float,
+    tolerance_rad: float,
+) -> Written:
+    """The table and the report of the episodes ``keys``, in that order; the files before are replaced."""
+    lines = tuple(line for key in keys for line in _lines(journal.read(key)))
+    mountings = _mountings(lines, level, tolerance_m, tolerance_rad)
+    fresh = out / f".{TABLE}"
+    shutil.rmtree(fresh, ignore_errors=True)
+    by_place = {(line.key, line.number): int(number) for line, number in zip(lines, mountings, strict=True)}
+    _write_table(journal, keys, by_place, fresh)
+    shutil.rmtree(out / TABLE, ignore_errors=True)
+    fresh.rename(out / TABLE)
+    written = Written(out / TABLE, out / REPORT, lines, mountings)
+    from gripmon.analyse.dataset_page import page
+
+    write_atomically(out / REPORT, page(written, journal, name))
+    return written
+
+
+def _lines(measured: Measured) -> list[Line]:
+    plain = measured.key, measured.episode, measured.camera
+    if measured.fault is not None:
+        return [Line(*plain, 0, None, measured.fault)]
+    return [Line(*plain, number, stretch, None) for number, stretch in enumerate(measured.stretches)]
+
+
+def matrices(cam_T_grip: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
+    """(n, 4, 4) of translations and quaternions x, y, z, w (n, 7)."""
+    values = np.reshape(np.array(cam_T_grip, float), (-1, 7))
+    out = np.tile(np.eye(4), (len(values), 1, 1))
+    if len(values):
+        out[:, :3, :3], out[:, :3, 3] = Rotation.from_quat(values[:, 3:]).as_matrix(), values[:, :3]
+    return out
+
+
+def _mountings(lines: Sequence[Line], level: float, tolerance_m: float, tolerance_rad: float) -> NDArray[np.int64]:
+    """Of each line's camera; -1 where no transform is valid: what may be wrong says nothing of a mounting."""
+    out = np.full(len(lines), -1, np.int64)
+    by_camera: dict[str, list[int]] = {}
+    for place, line in enumerate(lines):
+        if line.stretch is not None and line.stretch.verdict == Verdict.VALID.value:
+            by_camera.setdefault(line.camera, []).append(place)
+    for places in by_camera.values():
+        stretches = [lines[place].stretch for place in places]
+        poses = matrices([one.cam_T_grip for one in stretches if one is not None and one.cam_T_grip is not None])
+        covariance = np.reshape([one.covariance for one in stretches if one is not None], (-1, 6, 6)).astype(float)
+        out[places] = mountings_of(poses, covariance, level, tolerance_m, tolerance_rad)
+    return out
+
+
+def _field(name: str, kind: pa.DataType, text: str) -> pa.Field:
+    return pa.field(name, kind, metadata={"description": text})
+
+
+_F, _I, _S = pa.float64(), pa.int64(), pa.string()
+_POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
+SCHEMA = pa.schema(
+    [
+        _field("episode", _S, "path below the dataset; of LeRobot with # and its number"),
+        _field("stretch", pa.int32(), "0, 1, … in order of time; each motion begins another"),
+        _field("verdict", _S, "valid: use the transform; suspect, unknown: don't"),
+        _field("mounting", pa.int32(), "what has the same number (and camera) shares a mounting; null: not known"),
+        _field("start_ns", _I, "first frame's stamp (ns; of LeRobot from the episode's beginning)"),
+        _field("end_ns", _I, "last frame's stamp (ns)"),
+        _field("frames", pa.int32(), "in the stretch"),
+        _field("measured_share", _F, "of its frames with a transform of their own, 0 to 1"),
+        _field("valid_share", _F, "of its frames whose transform was valid, 0 to 1"),
+        *(_field(f"cam_T_grip_{name}", _F, "maps gripper to camera coordinates; null: not measured") for name in _POSE),
+        _field("covariance", pa.list_(_F), "6 x 6 by rows, position (m) then rotation (rad), camera axes"),
+        _field("protection_m", _F, "bound on the position error in each frame of the stretch; null: none"),
+        _field("protection_rad", _F, "bound on the rotation error"),
+        _field("integrity_risk", _F, "probability a frame that the error exceeds a bound"),
+        _field("moved", pa.bool_(), "the camera moved within this episode, at once or slowly"),
+        _field("crept_m", _F, "from the stretch's first half to its second, on average; null: not beyond chance"),
+        _field("motion_ns", _I, "when the camera moved, before this stretch; null: it is the first"),
+        _field("motion_earliest_ns", _I, "it had not moved by then, in 95 of 100 cases"),
+        _field("motion_latest_ns", _I, "it had moved by then"),
+        _field("motion_m", _F, "how far the TCP moved"),
+        _field("motion_x_m", _F, "along the camera's x"),
+        _field("motion_y_m", _F, "along the camera's y"),
+        _field("motion_z_m", _F, "along the camera's z"),
+        _field("motion_rad", _F, "its turn"),
+        _field("motion_p_value", _F, "probability of as large a difference by chance"),
+        _field("motion_cause", _S, "most probable cause by the alerts; unknown: none is probable enough"),
+        _field("own_reference", pa.bool_(), "calibrated anew from this episode; false: against the configuration's"),
+        _field("lens", _S, "whose camera calibration: file or configuration"),
+        _field("reason", _S, "why there is no transform, or why frames weren't valid"),
+        _field("picture", pa.binary(), "JPEG with what was measured; null: none"),
+    ],
+    metadata={"gripmon.schema": "gripmon.dataset/1", "gripmon.version": __version__},
+)
+
+
+def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "episode": measured.episode, "stretch": number, "verdict": Verdict.UNKNOWN.value, "frames": measured.frames,
+        "own_reference": measured.own_reference, "lens": measured.lens, "reason": measured.fault, "moved": None,
+    }  # fmt: skip
+    if stretch is None:
+        return row
+    count = max(stretch.frames, 1)
+    pictures = {0: 0, len(measured.stretches) - 1: len(measured.pictures) - 1}
+    shown = pictures.get(number, -1)
+    row |= {
+        "verdict": stretch.verdict, "mounting": mounting if mounting >= 0 else None, "start_ns": stretch.start_ns,
+        "end_ns": stretch.end_ns, "frames": stretch.frames, "measured_share": stretch.measured / count,
+        "valid_share": stretch.valid / count, "covariance": stretch.covariance, "crept_m": stretch.crept_m,
+        "protection_m": stretch.protection_m, "protection_rad": stretch.protection_rad,
+        "integrity_risk": stretch.integrity_risk, "reason": stretch.reasons or None, "moved": moved(measured.stretches),
+        "picture": measured.pictures[shown] if 0 <= shown < len(measured.pictures) else None,
+    }  # fmt: skip
+    if stretch.cam_T_grip is not None:
+        row |= {f"cam_T_grip_{name}": value for name, value in zip(_POSE, stretch.cam_T_grip, strict=True)}
+    if (motion := stretch.motion) is not None:
+        row |= {
+            "motion_ns": motion.stamp_ns, "motion_earliest_ns": motion.earliest_ns,
+            "motion_latest_ns": motion.latest_ns, "motion_m": motion.size_m, "motion_rad": motion.rotation_rad,
+            "motion_p_value": motion.p_value, "motion_cause": motion.cause,
+        }  # fmt: skip
+        row |= {f"motion_{axis}_m": value for axis, value in zip("xyz", motion.shift_m, strict=True)}
+    return row
+
+
+def moved(stretches: Sequence[Stretch]) -> bool:
+    """Whether the camera moved within an episode."""
+    return len(stretches) > 1 or any(stretch.crept_m is not None for stretch in stretches)
+
+
+def _rows(journal: Journal, keys: Sequence[str], places: dict[tuple[str, int], int]) -> Iterator[tuple[str, Any]]:
+    for key in keys:
+        measured = journal.read(key)
+        for number, stretch in enumerate(measured.stretches or (None,)):
+            yield measured.camera, _row(measured, number, stretch, places[key, number])
+
+
+def _write_table(journal: Journal, keys: Sequence[str], places: dict[tuple[str, int], int], folder: Path) -> None:
+    """``camera=NAME/part-N.parquet``, in the layout of Hive; a file's rows are in the order of ``keys``."""
+    waiting: dict[str, list[dict[str, Any]]] = {}
+    files: dict[str, tuple[pq.ParquetWriter, int, int]] = {}
+
+    def put(camera: str) -> None:
+        rows = waiting.pop(camera)
+        writer, number, count = files.get(camera, (None, -1, _FILE_ROWS))
+        if count >= _FILE_ROWS:
+            if writer is not None:
+                writer.close()
+            number, count = number + 1, 0
+            where = folder / f"camera={quote(camera, safe='')}"
+            where.mkdir(parents=True, exist_ok=True)
+            writer = pq.ParquetWriter(where / f"part-{number:05d}.parquet", SCHEMA, compression="zstd")
+        writer.write_table(pa.Table.from_pylist(rows, SCHEMA))
+        files[camera] = writer, number, count + len(rows)
+
+    for camera, row in _rows(journal, keys, places):
+        waiting.setdefault(camera, []).append(row)
+        if len(waiting[camera]) >= _GROUP_ROWS:
+            put(camera)
+    for camera in list(waiting):
+        put(camera)
+    for writer, _, _ in files.values():
+        writer.close()

@@ -1,0 +1,87 @@
+"""``gripmon dataset``: the extrinsics of every episode and wrist camera of a dataset."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+
+from gripmon.cli.common import REQUIRED, Command, positive_number, progress_bar, whole_number
+from gripmon.model.errors import InputError
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
+
+_DESCRIPTION = """\
+Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
+its covariance and protection level, whether the camera moved within it (when, how far, why), which
+episodes share one mounting, and which share of the frames is usable.  DATASET is a folder or a URL
+(s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
+and is only read.  Below DIR:
+
+  stretches/camera=NAME/part-00000.parquet   a row for each stretch without a motion, failures too
+  report.html                                mountings over time, what failed, the worst episodes
+  journal.jsonl                              what was measured: called again, only the rest is"""
+
+_OPTIONS = """
+DATASET          folder or URL; below it every episode that is found
+--config CONFIG  configuration (YAML) with gripper, camera and a rough reference; of its source section the opening
+--out DIR        where the results go; made if it is missing
+--camera NAME... a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one there is)
+--own-lens       the configuration's camera calibration, also where a file brings one
+--engine NAME    local (processes of this machine, the default) or ray (a Ray cluster)
+--workers N      processes of --engine local (default: as many as there are cores)
+--address HOST   of the Ray cluster, as ray.init takes it (default: the one that Ray finds, or this machine)
+--level P        probability that chance parts any stretch from its mounting (default 0.01)
+--tolerance-mm MM    transforms as near as this, and --tolerance-deg, share a mounting whatever they claim (mm)
+--tolerance-deg DEG  likewise of the turn (degrees)
+"""
+
+_EXAMPLES = """\
+  gripmon dataset set/ --config wrist.yaml --out extrinsics --camera observation.images.wrist
+  gripmon dataset s3://lab/episodes --config wrist.yaml --out extrinsics --camera /wrist/image_raw/compressed
+  gripmon dataset set/ --config wrist.yaml --out extrinsics --engine ray --address auto
+
+exit codes: 0 done, failures are rows with a reason; 2 wrong usage or configuration; 3 no episode gave a
+transform; 130 interrupted (called again it goes on)"""
+
+
+def _probability(text: str) -> float:
+    value = positive_number(text)
+    if value >= 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is no small probability; below 1")
+    return value
+
+
+@Command(
+    "dataset", "the extrinsics of every episode of a dataset", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    config=REQUIRED, out=REQUIRED, engine={"choices": ("local", "ray")},
+    workers=whole_number(1, 4096, "isn't a number of processes; 1 or more"),
+    level=_probability, tolerance_mm=positive_number, tolerance_deg=positive_number, dataset=str, address=str,
+)  # fmt: skip
+def dataset(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon dataset``."""
+    from gripmon.daemon.dataset import measure_dataset
+
+    if (arguments.tolerance_mm is None) != (arguments.tolerance_deg is None):
+        raise InputError("--tolerance-mm and --tolerance-deg belong together; both, or neither")
+    with progress_bar(None, "episode") as step:
+        found = measure_dataset(
+            arguments.dataset,
+            arguments.out,
+            arguments.config,
+            cameras=arguments.camera or (),
+            lens="config" if arguments.own_lens else "file",
+            engine=arguments.engine or "local",
+            workers=arguments.workers,
+            address=arguments.address,
+            level=arguments.level or 0.01,
+            tolerance_m=1e-3 * (arguments.tolerance_mm or 0.0),
+            tolerance_rad=math.radians(arguments.tolerance_deg or 0.0),
+            step=step,
+        )
+    good = found.episodes - found.failed
+    print(
+        f"dataset: {found.episodes} episodes, {found.measured} measured now, {found.failed} without a transform; "
+        f"{found.written.table}, {found.written.report}",
+        file=sys.stderr,
+    )
+    return EXIT_DONE if good else EXIT_FAILED

@@ -1,0 +1,125 @@
+"""Where episodes are measured: in processes of this machine, or on a Ray cluster.  Both keep few in flight, so that
+memory doesn't grow with the dataset, and give an answer for each, also for one that kills its worker.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from gripmon.analyse.dataset import Measured
+from gripmon.daemon.config import Config
+from gripmon.daemon.dataset.measuring import failed, measure
+from gripmon.io.sources.episodes import Episode
+from gripmon.model.errors import InputError
+
+AHEAD = 2
+"""Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
+DIED = "the process that measured it died, also when it was alone (out of memory, or a decoder that crashed)"
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_RAY_TRIES = 3
+
+_given: tuple[Config, str] | None = None
+
+
+def _begin(config: Config, lens: str) -> None:
+    """In a worker: what all its episodes need."""
+    global _given
+    import cv2
+
+    cv2.setNumThreads(1)
+    _given = config, lens
+
+
+def _work(episode: Episode) -> Measured:
+    assert _given is not None, "a worker begins with _begin"
+    config, lens = _given
+    return measure(config, episode, lens)
+
+
+def local(
+    config: Config,
+    episodes: Sequence[Episode],
+    lens: str,
+    workers: int,
+    work: Callable[[Episode], Measured] = _work,
+) -> Iterator[Measured]:
+    """In ``workers`` processes.  Where one dies, what was in flight is measured again, one by one: the one that kills
+    its worker alone, too, is given up.
+    """
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    waiting, suspects = deque(episodes), deque[Episode]()
+    while waiting or suspects:
+        alone = bool(suspects)
+        queue, count = (suspects, 1) if alone else (waiting, workers)
+        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (config, lens)) as pool:
+            flying: dict[Future[Measured], Episode] = {}
+            try:
+                while queue or flying:
+                    while queue and len(flying) < (1 if alone else AHEAD * count):
+                        episode = queue.popleft()
+                        try:
+                            flying[pool.submit(work, episode)] = episode
+                        except BrokenProcessPool:
+                            queue.appendleft(episode)
+                            raise
+                    for done in wait(flying, return_when=FIRST_COMPLETED).done:
+                        measured = done.result()
+                        flying.pop(done)
+                        yield measured
+            except BrokenProcessPool:
+                finished = [future for future in flying if future.done() and future.exception() is None]
+                yield from (future.result() for future in finished)
+                left = [episode for future, episode in flying.items() if future not in finished]
+                if alone:
+                    yield from (failed(config, episode, DIED) for episode in left)
+                else:
+                    suspects.extend(left)
+            except GeneratorExit:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
+
+def ray_cluster(config: Config, episodes: Sequence[Episode], lens: str, address: str | None) -> Iterator[Measured]:
+    """On the Ray cluster at ``address``, the one that Ray finds, or one of this machine alone.  Ray tries an episode
+    again whose worker died; one that kills three is given up.
+
+    Raises :class:`InputError` without Ray, or where no cluster answers.
+    """
+    try:
+        import ray
+    except ImportError:
+        raise InputError("needs Ray; pip install -e '.[ray]' in gripmon's checkout", "engine") from None
+    if not ray.is_initialized():
+        try:
+            ray.init(address=address, log_to_driver=False, configure_logging=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            text = " ".join(str(error).split())
+            raise InputError(f"no Ray cluster at {address or 'this machine'} ({text:.200})", "address") from None
+    environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
+    task: Any = ray.remote(num_cpus=1, max_retries=_RAY_TRIES - 1, runtime_env=environment)(_on_ray)
+    shared = ray.put((config, lens))
+    waiting, flying = deque(episodes), dict[Any, Episode]()
+    resources: Any = ray.cluster_resources
+    while waiting or flying:
+        most = AHEAD * max(int(resources().get("CPU", 1)), 1)
+        while waiting and len(flying) < most:
+            episode = waiting.popleft()
+            flying[task.remote(shared, episode)] = episode
+        for done in ray.wait(list(flying), num_returns=1)[0]:
+            episode = flying.pop(done)
+            try:
+                yield ray.get(done)
+            except ray.exceptions.RayError:
+                yield failed(config, episode, DIED)
+
+
+def _on_ray(given: tuple[Config, str], episode: Episode) -> Measured:
+    _begin(*given)
+    return _work(episode)

@@ -1,0 +1,167 @@
+"""One episode through the monitor: its stretches, or why there are none.  Workers run this, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from gripmon.analyse.dataset import Measured
+from gripmon.analyse.stretches import stretches_of
+from gripmon.daemon.api import Monitor
+from gripmon.daemon.config import Config
+from gripmon.daemon.config.checks import view_fault
+from gripmon.io.sources import FolderSettings, Source, SourceError, VideoSettings, open_source
+from gripmon.io.sources.episodes import Episode
+from gripmon.judge.references import CommandRefused
+from gripmon.model.camera import make_camera
+from gripmon.model.errors import in_short
+from gripmon.model.records import (
+    Alert,
+    Command,
+    CommandName,
+    Frame,
+    FrameRecord,
+    Image,
+    MeasurementTrace,
+    ReferenceRecord,
+    Verdict,
+)
+from gripmon.record.table import FrameTable, TableBuilder
+
+PICTURE_WIDTH_PX = 320
+"""Of the thumbnails: some 8 kB each (the fingertips can be told at a glance, 390,000 take 3 GB)."""
+_JPEG_QUALITY = 75
+
+Pictured = tuple[Image, MeasurementTrace]
+
+
+def measure(config: Config, episode: Episode, lens: str = "file") -> Measured:
+    """An episode's stretches, whatever is wrong with it: then ``fault`` says so.
+
+    The episode's reference is its own: the monitor gets the command to recalibrate with its first measured frame, and
+    begins again from there; where it isn't recalibrated, the configuration's reference stays.  ``lens``: "file" for the
+    camera calibration that comes with the frames, where one does, "config" for the configuration's in any case.
+    """
+    try:
+        return _measured(config, episode, lens)
+    except SourceError as error:
+        return failed(config, episode, str(error))
+    except Exception as error:  # noqa: BLE001  one bad episode must not end the others
+        return failed(config, episode, in_short(error))
+
+
+def failed(config: Config, episode: Episode, fault: str) -> Measured:
+    """The answer for an episode that gives nothing."""
+    return Measured(episode.name, _camera(config, episode), episode.key, episode.version, fault=fault)
+
+
+def _camera(config: Config, episode: Episode, source: Source | None = None) -> str:
+    """Topic or feature; of plain images and videos the configuration's name."""
+    if isinstance(episode.source, FolderSettings | VideoSettings):
+        return config.settings.camera_name
+    return str(getattr(source, "topic", None) or episode.source.camera or "unknown")
+
+
+def _measured(config: Config, episode: Episode, lens: str) -> Measured:
+    source = open_source(episode.source)
+    camera, from_file = _camera(config, episode, source), getattr(source, "camera", None)
+    if lens == "file" and from_file is not None:
+        settings = msgspec.structs.replace(config.settings, camera=from_file)
+        config = dataclasses.replace(config, settings=settings, camera=make_camera(from_file))
+        if (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
+            raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
+    run = _Run(config)
+    renewed = run.until_renewed(_frames(source))
+    if renewed is not None:
+        source.close()
+        run = _Run(dataclasses.replace(config, reference=renewed))
+        for frame in _frames(open_source(episode.source)):
+            run.process(frame)
+    table = run.table()
+    plain = Measured(
+        episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=renewed is not None,
+        lens="file" if lens == "file" and from_file is not None else "configuration",
+    )  # fmt: skip
+    try:
+        stretches = tuple(stretches_of(table, run.alerts, run.reasons))
+    except ValueError as error:
+        why = Counter(reason for reason in run.reasons if reason).most_common(1)
+        return msgspec.structs.replace(plain, fault=f"{error}{f' ({why[0][1]} times: {why[0][0]})' if why else ''}")
+    return msgspec.structs.replace(plain, stretches=stretches, pictures=run.pictures(len(stretches)))
+
+
+def _frames(source: Source) -> Iterator[Frame]:
+    try:
+        while isinstance(frame := source.read(), Frame):
+            yield frame
+    finally:
+        source.close()
+
+
+class _Run:
+    """A monitor's way through an episode, in memory that grows by a table's row a frame."""
+
+    def __init__(self, config: Config) -> None:
+        self._monitor, self._builder = Monitor(config), TableBuilder()
+        self.alerts: list[tuple[int, Alert]] = []
+        self.reasons: list[str | None] = []
+        self._first: Pictured | None = None
+        self._last: Pictured | None = None
+
+    def until_renewed(self, frames: Iterator[Frame]) -> ReferenceRecord | None:
+        """Process frames until the monitor, asked with the first measured one, has calibrated anew; None: all."""
+        asked, revision = False, self._monitor.reference.revision
+        for frame in frames:
+            record = self.process(frame)
+            if not asked and record.measured:
+                asked = True
+                try:
+                    self._monitor.command(Command(CommandName.RECALIBRATE, ""), record.stamp_ns)
+                except CommandRefused:
+                    continue
+            if self._monitor.reference.revision != revision:
+                return self._monitor.reference
+        return None
+
+    def process(self, frame: Frame) -> FrameRecord:
+        record = self._monitor.process(frame)
+        self._builder.add(record)
+        self.alerts += [(record.stamp_ns, alert) for alert in record.alerts]
+        self.reasons.append(record.reason)
+        if record.verdict is Verdict.VALID and frame.image is not None and (trace := self._monitor.trace()) is not None:
+            self._first = self._first or (frame.image, trace)
+            self._last = frame.image, trace
+        return record
+
+    def table(self) -> FrameTable:
+        return TableBuilder.join([self._builder])
+
+    def pictures(self, stretches: int) -> tuple[bytes, ...]:
+        """JPEGs of the first valid frame, and if it moved of the last."""
+        shown = [self._first, self._last] if stretches > 1 else [self._first]
+        return tuple(_drawn(*each) for each in shown if each is not None)
+
+
+def _drawn(image: Image, trace: MeasurementTrace) -> bytes:
+    """A small JPEG with the predicted edges (blue) and the edge points that were believed (green)."""
+    import cv2
+    import numpy as np
+
+    shift, scale = 4, PICTURE_WIDTH_PX / image.shape[1]
+    grey: Any = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if grey.dtype != np.uint8:
+        grey = (255.0 * (grey / grey.max())).astype(np.uint8)
+    canvas = cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+
+    def placed(points: Any) -> Any:
+        return np.round(((np.asarray(points) + 0.5) * scale - 0.5) * (1 << shift)).astype(np.int32)
+
+    for edge in trace.predicted_edges_uv_px:
+        cv2.polylines(canvas, [placed(edge)[:, None]], False, (255, 120, 40), 1, cv2.LINE_AA, shift)
+    for point in placed(trace.edge_uv_px[trace.edge_used]).tolist():
+        cv2.circle(canvas, point, 1 << (shift - 1), (60, 220, 60), -1, cv2.LINE_AA, shift)
+    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes())

@@ -1,0 +1,104 @@
+"""All episodes of a dataset to one table: what was measured before is not measured again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from gripmon import __version__
+from gripmon.analyse.dataset import Journal, Written, write_dataset
+from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.dataset.engines import local, ray_cluster
+from gripmon.daemon.replaying import as_configured
+from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError
+from gripmon.io.sources.episodes import Episode, find_episodes, hash_of
+from gripmon.model.atomic import writable_folder
+from gripmon.model.errors import InputError
+from gripmon.model.records import to_json
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What came of it: the files ``written``, how many episodes there are, how many were ``measured`` now, and how many
+    could not be.
+    """
+
+    written: Written
+    episodes: int
+    measured: int
+
+    @property
+    def failed(self) -> int:
+        return self.written.failed
+
+
+def measure_dataset(
+    dataset: str | Path,
+    out: str | Path,
+    config: Config | str | Path,
+    *,
+    cameras: Sequence[str] = (),
+    lens: str = "file",
+    engine: str = "local",
+    workers: int | None = None,
+    address: str | None = None,
+    level: float = 0.01,
+    tolerance_m: float = 0.0,
+    tolerance_rad: float = 0.0,
+    step: Callable[[int], None] = lambda _total: None,
+) -> Survey:
+    """Measure every episode of a folder or URL by every one of ``cameras`` (topics, features), and write the table and
+    the report to the folder ``out``.  The dataset is only read.
+
+    ``config`` has the gripper, a camera, a rough reference, and in its source how the state gives the opening.
+    ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: processes (None: as
+    many as there are cores).  ``step`` is called with their number after each episode.  Called again with the same
+    ``out`` it measures what is new, has changed or was interrupted.
+
+    Raises :class:`InputError`: nothing to measure, several cameras of which none is named, an ``out`` that holds
+    another configuration's results, an engine that isn't there.
+    """
+    config = config if isinstance(config, Config) else load_config(config, check_source=False)
+    try:
+        episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
+    except SourceError as error:
+        raise InputError(str(error)) from None
+    folder = writable_folder(Path(out))
+    with Journal(folder, _fingerprint(config, lens)) as journal:
+        versions = {episode.key: episode.version for episode in episodes}
+        journal.keep(versions)
+        left = [episode for episode in episodes if episode.key not in journal]
+        for _ in range(len(episodes) - len(left)):
+            step(len(episodes))
+        if engine == "ray":
+            results = ray_cluster(config, left, lens, address)
+        else:
+            results = local(config, left, lens, workers or len(os.sched_getaffinity(0)))
+        for measured in results if left else ():
+            journal.add(measured)
+            step(len(episodes))
+        order = [episode.key for episode in episodes]
+        written = write_dataset(journal, order, folder, str(dataset), level, tolerance_m, tolerance_rad)
+    return Survey(written, len(episodes), len(left))
+
+
+def _configured(episode: Episode, config: Config) -> Episode:
+    source = episode.source
+    if not isinstance(source, BagSettings | LeRobotSettings):
+        return episode
+    number = source.episode if isinstance(source, LeRobotSettings) else None
+    settings = as_configured(source, config, source.camera, number)
+    return msgspec.structs.replace(episode, source=settings)
+
+
+def _fingerprint(config: Config, lens: str) -> str:
+    """Of all that a result depends on beside the episode."""
+    settings = config.settings
+    opening = getattr(settings.source, "opening", None)
+    parts = [settings.camera, settings.monitor, settings.jaw, opening, config.reference, config.gripper.model]
+    taught = "" if config.taught is None else to_json(config.taught)
+    return hash_of([__version__, lens, taught, *(msgspec.json.encode(part) for part in parts)])

@@ -1,0 +1,134 @@
+"""The episodes of a dataset: what below a folder or URL is a recording of its own."""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gripmon.io.sources.bags import BagSettings
+from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.files import FolderSettings, VideoSettings
+from gripmon.io.sources.lerobot import INFO, LeRobotSettings, open_dataset
+from gripmon.io.sources.stored import file_system, short
+from gripmon.model.images import IMAGE_SUFFIXES, natural_key
+
+_VIDEOS = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
+
+
+class Episode(msgspec.Struct, frozen=True):
+    """One recording, seen by one camera."""
+
+    name: str
+    """Its path below the dataset; of a LeRobot dataset with the episode's number behind ``#``."""
+    source: BagSettings | LeRobotSettings | FolderSettings | VideoSettings
+    version: str
+    """Changes with its files: their sizes and what the store says of when they were written."""
+
+    @property
+    def key(self) -> str:
+        """Of the episode and the camera."""
+        return f"{self.name}|{getattr(self.source, 'camera', None) or ''}"
+
+
+def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
+    """All below a folder or URL, in the order in which a person counts: LeRobot datasets, MCAP files, rosbag2 folders,
+    folders of images (``timestamps.csv`` beside them), videos; nothing in hidden folders.
+
+    ``cameras``: topics or features, one episode for each; none: the only one that there is.  No file is opened but
+    those by which LeRobot describes a dataset.  Raises :class:`SourceError` where nothing can be listed, and for a
+    LeRobot dataset of several cameras of which none is named.
+    """
+    system, inside = file_system(root)
+    try:
+        files: dict[str, dict[str, Any]] = system.find(inside, detail=True)
+    except Exception as error:  # noqa: BLE001  each store has its own
+        raise SourceError(f"path: {root} can't be listed ({short(error)})") from None
+    files = {path: one for path, one in files.items() if not _hidden(path[len(inside) :])}
+    if not files:
+        raise SourceError(f"path: there is nothing in {root}; a folder or a URL with episodes")
+    remote = "://" in root
+    found: list[Episode] = []
+    taken: set[str] = set()
+    folders: dict[str, list[str]] = {}
+    for path in files:
+        folders.setdefault(posixpath.dirname(path), []).append(path)
+
+    def add(path: str, kind: type[Any], parts: list[str], **more: Any) -> None:
+        named = system.unstrip_protocol(path) if remote else path
+        name = path[len(inside) :].strip("/") or posixpath.basename(path)
+        found.append(Episode(name, kind(path=named, **more), _version([files[part] for part in parts])))
+
+    for path in sorted(files):
+        if path.endswith(f"/{INFO}"):
+            dataset = path[: -len(INFO) - 1]
+            taken.add(dataset)
+            named = system.unstrip_protocol(dataset) if remote else dataset
+            found += _of_lerobot(named, dataset[len(inside) :].strip("/"), cameras, _version([files[path]]))
+        elif posixpath.basename(path) == "metadata.yaml" and _rosbag2(folders[posixpath.dirname(path)]):
+            taken.add(posixpath.dirname(path))
+            for camera in cameras or (None,):
+                folder = posixpath.dirname(path)
+                add(folder, BagSettings, folders[folder], camera=camera)
+    for path in sorted(files):
+        if any(path.startswith(f"{folder}/") for folder in taken):
+            continue
+        suffix = posixpath.splitext(path)[1].lower()
+        if suffix == ".mcap":
+            for camera in cameras or (None,):
+                add(path, BagSettings, [path], camera=camera)
+        elif suffix in _VIDEOS and not remote:
+            add(path, VideoSettings, [path])
+    for folder, inner in folders.items():
+        if not remote and not any(f"{folder}/".startswith(f"{other}/") for other in taken) and _has_images(inner):
+            add(folder, FolderSettings, inner)
+    if not found:
+        right = "LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos"
+        raise SourceError(f"path: there is no episode in {root}; {right}")
+    return sorted(found, key=lambda one: natural_key(one.key))
+
+
+def _of_lerobot(path: str, name: str, cameras: Sequence[str], version: str) -> list[Episode]:
+    dataset = open_dataset(path)
+    if not cameras and len(dataset.cameras) != 1:
+        raise SourceError(
+            f"camera: {path} has {len(dataset.cameras)}; name those at the wrist: {_list(dataset.cameras)}"
+        )
+    if absent := [camera for camera in cameras if camera not in dataset.cameras]:
+        raise SourceError(f"camera: {path} has no {absent[0]}; of: {_list(dataset.cameras)}")
+    return [
+        Episode(f"{name}#{number:06d}", LeRobotSettings(path=path, camera=camera, episode=number), version)
+        for number in sorted(dataset.episodes)
+        for camera in cameras or dataset.cameras
+    ]
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _hidden(path: str) -> bool:
+    return any(part.startswith(".") for part in path.split("/"))
+
+
+def _rosbag2(names: list[str]) -> bool:
+    return any(name.endswith((".db3", ".mcap")) for name in names)
+
+
+def _has_images(names: list[str]) -> bool:
+    return any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names)
+
+
+def _version(files: list[dict[str, Any]]) -> str:
+    said = [[one.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")] for one in files]
+    return str(hash_of(said))
+
+
+def hash_of(value: Any) -> str:
+    """Sixteen hexadecimal digits of plain values."""
+    import hashlib
+
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:16]
