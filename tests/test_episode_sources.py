@@ -190,6 +190,38 @@ def test_from_a_store_of_objects(tmp_path: Path):
     assert_as_written(frames_of(BagSettings(path="memory://episodes/a.mcap", opening=FINGERS)), shots(4))
 
 
+def test_from_s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Over the protocol itself, from a server on this machine: what is listed is what is read."""
+    import s3fs
+    from moto.server import ThreadedMotoServer
+
+    from gripmon.io.sources.episodes import find_episodes
+
+    server = ThreadedMotoServer("127.0.0.1", port=0)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", "nobody")
+        monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "nothing")
+        s3fs.S3FileSystem.clear_instance_cache()
+        write_lerobot(tmp_path / "set", [shots(4, 10.0), shots(3, 10.0, 4)], fps=10)
+        write_mcap(tmp_path / "a.mcap", shots(4))
+        store = s3fs.S3FileSystem()
+        store.mkdir("episodes")
+        store.put(str(tmp_path / "set"), "episodes/all/set", recursive=True)
+        store.put(str(tmp_path / "a.mcap"), "episodes/all/a.mcap")
+        found = find_episodes("s3://episodes/all")
+        assert [episode.name for episode in found] == ["a.mcap", "set#000000", "set#000001"]
+        assert_as_written(frames_of(found[0].source), shots(4), openings=False)
+        assert_as_written(frames_of(found[2].source), shots(3, 10.0, 4), openings=False, lossy_dn=1.5)
+        with pytest.raises(SourceError, match="can't be listed"):
+            find_episodes("s3://there-is-no-such-bucket/x")
+    finally:
+        server.stop()
+        s3fs.S3FileSystem.clear_instance_cache()
+
+
 def test_replay_takes_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     """The opening comes by the configuration's source, its camera is held against the one in the file."""
     from gripmon.cli import main

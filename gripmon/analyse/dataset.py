@@ -27,6 +27,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.records import Verdict
 
 TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
+_NONE = np.full(36, np.nan)
 _GROUP_ROWS, _FILE_ROWS = 1000, 50_000
 """Rows in memory at once (with their pictures some 20 MB), and in a file."""
 
@@ -39,7 +40,7 @@ class Measured(msgspec.Struct, frozen=True):
     key: str
     version: str
     frames: int = 0
-    own_reference: Annotated[bool, Meta(description="it was calibrated anew from the episode's own images")] = False
+    own_reference: Annotated[bool, Meta(description="it was recalibrated from the episode's own images")] = False
     lens: Annotated[str, Meta(description="file or configuration: whose camera calibration")] = "configuration"
     stretches: tuple[Stretch, ...] = ()
     fault: str | None = None
@@ -159,8 +160,9 @@ def write_dataset(
     tolerance_rad: float,
 ) -> Written:
     """The table and the report of the episodes ``keys``, in that order; the files before are replaced."""
-    lines = tuple(line for key in keys for line in _lines(journal.read(key)))
-    mountings = _mountings(lines, level, tolerance_m, tolerance_rad)
+    covariances: list[NDArray[np.float64]] = []
+    lines = tuple(line for key in keys for line in _lines(journal.read(key), covariances))
+    mountings = _mountings(lines, covariances, level, tolerance_m, tolerance_rad)
     fresh = out / f".{TABLE}"
     shutil.rmtree(fresh, ignore_errors=True)
     by_place = {(line.key, line.number): int(number) for line, number in zip(lines, mountings, strict=True)}
@@ -174,11 +176,15 @@ def write_dataset(
     return written
 
 
-def _lines(measured: Measured) -> list[Line]:
+def _lines(measured: Measured, covariances: list[NDArray[np.float64]]) -> list[Line]:
+    """An episode's; covariances go to a list of arrays, which take less memory: there may be hundreds of thousands."""
     plain = measured.key, measured.episode, measured.camera
     if measured.fault is not None:
+        covariances.append(_NONE)
         return [Line(*plain, 0, None, measured.fault)]
-    return [Line(*plain, number, stretch, None) for number, stretch in enumerate(measured.stretches)]
+    covariances += [_NONE if s.covariance is None else np.array(s.covariance) for s in measured.stretches]
+    bare = (msgspec.structs.replace(stretch, covariance=None) for stretch in measured.stretches)
+    return [Line(*plain, number, stretch, None) for number, stretch in enumerate(bare)]
 
 
 def matrices(cam_T_grip: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
@@ -190,7 +196,13 @@ def matrices(cam_T_grip: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
     return out
 
 
-def _mountings(lines: Sequence[Line], level: float, tolerance_m: float, tolerance_rad: float) -> NDArray[np.int64]:
+def _mountings(
+    lines: Sequence[Line],
+    covariances: Sequence[NDArray[np.float64]],
+    level: float,
+    tolerance_m: float,
+    tolerance_rad: float,
+) -> NDArray[np.int64]:
     """Of each line's camera; -1 where no transform is valid: what may be wrong says nothing of a mounting."""
     out = np.full(len(lines), -1, np.int64)
     by_camera: dict[str, list[int]] = {}
@@ -200,7 +212,7 @@ def _mountings(lines: Sequence[Line], level: float, tolerance_m: float, toleranc
     for places in by_camera.values():
         stretches = [lines[place].stretch for place in places]
         poses = matrices([one.cam_T_grip for one in stretches if one is not None and one.cam_T_grip is not None])
-        covariance = np.reshape([one.covariance for one in stretches if one is not None], (-1, 6, 6)).astype(float)
+        covariance = np.stack([covariances[place] for place in places]).reshape(-1, 6, 6)
         out[places] = mountings_of(poses, covariance, level, tolerance_m, tolerance_rad)
     return out
 
@@ -239,7 +251,7 @@ SCHEMA = pa.schema(
         _field("motion_rad", _F, "its turn"),
         _field("motion_p_value", _F, "probability of as large a difference by chance"),
         _field("motion_cause", _S, "most probable cause by the alerts; unknown: none is probable enough"),
-        _field("own_reference", pa.bool_(), "calibrated anew from this episode; false: against the configuration's"),
+        _field("own_reference", pa.bool_(), "recalibrated from this episode; false: against the configuration's"),
         _field("lens", _S, "whose camera calibration: file or configuration"),
         _field("reason", _S, "why there is no transform, or why frames weren't valid"),
         _field("picture", pa.binary(), "JPEG with what was measured; null: none"),

@@ -113,7 +113,7 @@ class _Run:
         self._last: Pictured | None = None
 
     def until_renewed(self, frames: Iterator[Frame]) -> ReferenceRecord | None:
-        """Process frames until the monitor, asked with the first measured one, has calibrated anew; None: all."""
+        """Process frames until the monitor, asked with the first measured one, has recalibrated; None: all."""
         asked, revision = False, self._monitor.reference.revision
         for frame in frames:
             record = self.process(frame)
