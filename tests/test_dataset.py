@@ -223,6 +223,8 @@ def test_every_kind_of_episode_is_found(tmp_path: Path):
     assert names == ["b/set#000000", "b/set#000001", "images", "run9.mcap", "run10.mcap"]
     with pytest.raises(SourceError, match=f"has no front; of: {WRIST}"):
         find_episodes(str(tmp_path), ["front"])
+    with pytest.raises(SourceError, match="plain images or videos, of one camera each; leave it out"):
+        find_episodes(str(tmp_path / "images"), ["front"])
     with pytest.raises(SourceError, match="nothing in"):
         find_episodes(str(tmp_path / "nowhere"))
 

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 
-from gripmon.cli.common import REQUIRED, Command, positive_number, progress_bar, whole_number
+from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number, progress_bar, whole_number
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
-
-_DESCRIPTION = """\
-Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
-its covariance and protection level, whether the camera moved within it (when, how far, why), which
-episodes share one mounting, and which share of the frames is usable.  DATASET is a folder or a URL
-(s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
-and is only read.  Below DIR:
-
-  stretches/camera=NAME/part-00000.parquet   a row for each stretch without a motion, failures too
-  report.html                                mountings over time, what failed, the worst episodes
-  journal.jsonl                              what was measured: called again, only the rest is"""
 
 _OPTIONS = """
 DATASET          folder or URL; below it every episode that is found
 --config CONFIG  configuration (YAML) with gripper, camera and a rough reference; of its source section the opening
 --out DIR        where the results go; made if it is missing
---camera NAME... a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one there is)
+--camera NAME...  a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one)
 --own-lens       the configuration's camera calibration, also where a file brings one
 --engine NAME    local (processes of this machine, the default) or ray (a Ray cluster)
 --workers N      processes of --engine local (default: as many as there are cores)
@@ -52,13 +40,22 @@ def _probability(text: str) -> float:
 
 
 @Command(
-    "dataset", "the extrinsics of every episode of a dataset", _DESCRIPTION, _OPTIONS, _EXAMPLES,
+    "dataset", "the extrinsics of every episode of a dataset", _OPTIONS, _EXAMPLES,
     config=REQUIRED, out=REQUIRED, engine={"choices": ("local", "ray")},
     workers=whole_number(1, 4096, "isn't a number of processes; 1 or more"),
     level=_probability, tolerance_mm=positive_number, tolerance_deg=positive_number, dataset=str, address=str,
 )  # fmt: skip
-def dataset(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon dataset``."""
+def dataset(arguments: Arguments) -> int:
+    """Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
+    its covariance and protection level, whether the camera moved within it (when, how far, why), which
+    episodes share one mounting, and which share of the frames is usable.  DATASET is a folder or a URL
+    (s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
+    and is only read.  Below DIR:
+
+      stretches/camera=NAME/part-00000.parquet   a row for each stretch without a motion, failures too
+      report.html                                mountings over time, what failed, the worst episodes
+      journal.jsonl                              what was measured: called again, only the rest is
+    """
     from gripmon.daemon.dataset import measure_dataset
 
     if (arguments.tolerance_mm is None) != (arguments.tolerance_deg is None):
@@ -79,9 +76,6 @@ def dataset(arguments: argparse.Namespace) -> int:
             step=step,
         )
     good = found.episodes - found.failed
-    print(
-        f"dataset: {found.episodes} episodes, {found.measured} measured now, {found.failed} without a transform; "
-        f"{found.written.table}, {found.written.report}",
-        file=sys.stderr,
-    )
+    counts = f"{found.episodes} episodes, {found.measured} measured now, {found.failed} without a transform"
+    note([f"dataset: {counts}; {found.written.table}, {found.written.report}"])
     return EXIT_DONE if good else EXIT_FAILED
