@@ -32,6 +32,7 @@ COMMANDS = (
     "schema",
     "feed",
     "replay",
+    "dataset",
     "simulate",
     "check",
     "teach",

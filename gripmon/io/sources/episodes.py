@@ -89,7 +89,7 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         right = "LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos"
         raise SourceError(f"path: there is no episode in {root}; {right}")
     if cameras and not any(getattr(one.source, "camera", None) for one in found):
-        raise SourceError(f"camera: the episodes in {root} are plain images or videos, of one camera each; leave it out")
+        raise SourceError(f"camera: {root} holds plain images or videos, of one camera each; leave it out")
     return sorted(found, key=lambda one: natural_key(one.key))
 
 
