@@ -94,6 +94,7 @@ class Weigher:
 
     def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
+        self._along = tracker.along  # (e,) which edges run along the fingers
         self._floor = _floor(settings)
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
@@ -222,7 +223,7 @@ class Weigher:
         further corner.  ``kept`` (v,): the measured edges that count.
         """
         edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
-        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
+        edge = edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
         by_edge = set(self._gripper.edge_finger[edge].tolist())
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
@@ -232,7 +233,7 @@ class Weigher:
         proven, to exclude one just now.
         """
         edge = measurement.normal.edge
-        sides = int((measurement.consensus.edge_seen[edge] & self._tracker.along[edge]).sum())
+        sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
         unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
         knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_END**sides <= self._policy.integrity_risk
