@@ -122,6 +122,7 @@ def test_the_same_with_rounded_tips_from_images(walked: Walked, driver: Any, tmp
     assert before > 0.5 and after > 0.0
 
 
+@pytest.mark.usefixtures("tools_importable")
 @pytest.mark.slow("some 60 s; the box's walk guards the page, test_gripper_cad_tracked.py the model")
 def test_the_same_with_a_gripper_from_cad_and_the_robots_own_calibration(walked: Walked, driver: Any, tmp_path: Path):
     truth = curved_meshes(tmp_path)

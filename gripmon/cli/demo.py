@@ -84,11 +84,8 @@ def demo(arguments: Arguments) -> int:
 
 
 def _as_text(summary: DemoSummary, out: Path) -> str:
-    from gripmon.daemon.config import builtin_config
-
     comparison = summary.comparison
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in comparison.verdicts.items() if count)
-    configs = shlex.quote(str(builtin_config("live_camera.yaml").parent))
     recordings = [str(out / name) for name in summary.recordings]
     return "\n".join(
         [
@@ -110,8 +107,7 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
             *(f"look at it {_viewer()} {shlex.quote(recording)}" for recording in recordings),
             _report_line(recordings, out),
-            f"next       your own camera: cp -r {configs} mine; edit mine/live_camera.yaml;",
-            "           gripmon check mine/live_camera.yaml; gripmon run mine/live_camera.yaml",
+            "next       your own camera and gripper, on one page: gripmon setup arm1",
         ]
     )
 

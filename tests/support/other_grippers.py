@@ -19,7 +19,6 @@ from gripmon.model.records import Array
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Creep
 from support.changing_backgrounds import CAMERA, images_of, moving_robot
-from support.meshes import MeshCamera, curved_fingers, wandering, write_meshes
 from support.simulated import nominal_cam_T_grip
 
 FRAMES, FPS, STEP = 60, 15.0, 30
@@ -58,6 +57,8 @@ def curved_meshes(folder: Path) -> Array:
     """``finger0.stl`` and ``finger1.stl``, mm; ``robot.yaml``, the robot's hand/eye calibration; ``work``, in which the
     camera trembles by 0.05 mm.  True ``cam_T_grip`` (frames, 4, 4) at work.
     """
+    from benchmarks.meshes import MeshCamera, curved_fingers, wandering, write_meshes
+
     meshes, nominal = curved_fingers(), nominal_cam_T_grip()
     write_meshes(meshes, folder)
     flange_T_cam = np.eye(4)
