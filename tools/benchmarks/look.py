@@ -46,9 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(_HEAD)
     for name, sequence in _rows(arguments):
         print(f"look: {name}", file=sys.stderr)
-        line = compared(name, sequence)
-        if line:
-            print(line, flush=True)
+        print(compared(name, sequence), flush=True)
     return 0
 
 
@@ -67,7 +65,7 @@ def _rows(arguments: argparse.Namespace) -> Iterator[tuple[str, Sequence]]:
 
 
 def compared(name: str, sequence: Sequence) -> str:
-    """A line of the table: frames from the first that differs, valid and measured both ways; empty if none does."""
+    """A line of the table: frames from the first that differs, valid both ways; why not, if there are none."""
     both = _Both(sequence)
     for index, shot in enumerate(sequence.shots()):
         both.add(index, shot)
@@ -77,6 +75,9 @@ def compared(name: str, sequence: Sequence) -> str:
         return f"| {name} | 0 | the look was never used |"
     after = range(same.index(False), len(same))
     use = [i for i in after if without[i].valid and with_look[i].valid]
+    if not use:
+        counts = " → ".join(str(sum(row.valid for row in rows)) for rows in both.rows)
+        return f"| {name} | 0 | no frame is valid both ways ({counts}) |"
     errors = [1e6 * np.array([rows[i].error[:3] for i in use]) for rows in both.rows]
     cells = [
         name,
