@@ -191,9 +191,9 @@ def fused_path(path: np.ndarray, rng: np.random.Generator, fusion: LookFusion) -
         true_T = perturb(np.eye(4), np.concatenate([xyz, np.zeros(3)]))
         edges_T = perturb(true_T, rng.multivariate_normal(np.zeros(6), EDGES))
         look_T = perturb(true_T, bias + rng.multivariate_normal(np.zeros(6), LOOK))
-        fused_T = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None, np.ones(2)))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None, np.ones(2)))
         fusion.learn()
-        out.append((edges_T if fused_T is None else fused_T)[:3, 3])
+        out.append((edges_T if fused is None else fused[0])[:3, 3])
     return np.array(out)
 
 
@@ -232,10 +232,10 @@ def test_after_a_motion_the_edges_decide_again_as_far_as_depths_may_be_wrong():
     errors = []
     for _ in range(20):
         edges_T = perturb(there, rng.multivariate_normal(np.zeros(6), EDGES))
-        fused_T = fusion.fuse(edges_T, EDGES, LookMotion(wrong, LOOK, None, np.ones(2)))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(wrong, LOOK, None, np.ones(2)))
         fusion.learn()
-        assert fused_T is not None
-        errors.append(fused_T[1, 3] - there[1, 3])
+        assert fused is not None
+        errors.append(fused[0][1, 3] - there[1, 3])
     assert np.abs(errors).max() < 1.2e-5 and np.abs(errors[5:]).max() < 6e-6
 
 

@@ -1,0 +1,28 @@
+"""``tools/bench look`` in small."""
+
+from __future__ import annotations
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("tools_importable")
+
+
+def lines(capsys: pytest.CaptureFixture[str], name: str, frames: int) -> list[str]:
+    from benchmarks.__main__ import main
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["bench", "look", "--only", name, "--scenes", "1", "--frames", str(frames)])
+        assert main() == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_row_says_what_changed(capsys: pytest.CaptureFixture[str]):
+    head, _, row = lines(capsys, "ordinary", 40)
+    cells = row.strip("| ").split(" | ")
+    assert len(cells) == len(head.strip("| ").split(" | "))
+    assert cells[0] == "ordinary, 0" and 0 < int(cells[1]) < 40
+    assert cells[-2] == "0 → 0"
+
+
+def test_a_scene_in_which_nothing_is_learnt_says_so(capsys: pytest.CaptureFixture[str]):
+    assert lines(capsys, "ordinary", 5)[-1] == "| ordinary, 0 | 0 | the look was never used |"
