@@ -186,7 +186,7 @@ def report(frames: int, seed: int, only: list[str]) -> Iterator[str]:
             met = seen.valid >= VALID * seen.frames and not seen.misleading and ratio <= RATIO
             cells = [
                 shape.name, motion, f"{100.0 * seen.valid / seen.frames:.0f} %", seen.misleading, seen.beyond,
-                f"{1e6 * seen.error_m:.1f}", f"{ratio:.1f}", "met" if met else f"**missed** {seen.why}",
+                f"{1e6 * seen.error_m:.1f}", f"{ratio:.1f}", "met" if met else f"**missed** {seen.why or 'error'}",
             ]  # fmt: skip
             yield "| " + " | ".join(map(str, cells)) + " |"
 
@@ -201,7 +201,7 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from benchmarks.machine import commit
 
-    lines = [f"`tools/bench shapes --frames {arguments.frames} --seed {arguments.seed}` at {commit()}", ""]
+    lines = [f"`tools/bench shapes --frames {arguments.frames} --seed {arguments.seed}`, commit {commit()}", ""]
     print(*lines, sep="\n", flush=True)
     for line in report(arguments.frames, arguments.seed, arguments.only):
         lines.append(line)

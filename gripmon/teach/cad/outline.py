@@ -210,7 +210,7 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
     straight = np.repeat([not len(edge.via_m) for edge in edges], 2)
     count, label = _met(ends, px, label, straight, bridging, STEP_PX * m_per_px)
     sharp = ~np.isfinite(centres).all(axis=1)
-    points = np.zeros((count, 3))
+    points: Array = np.zeros((count, 3))
     rounds: dict[int, tuple[Array, Array]] = {}
     for k in range(count):
         own = np.flatnonzero(label == k)
@@ -245,11 +245,11 @@ def _left_in_place(points: Array, label: NDArray[np.intp], ends: list[int]) -> t
     """A point of their own, at the same place, for ``ends`` of curves on the body: what is round ends there in such a
     curve, and wanders along it, but the curve stays.
     """
+    left = sorted({int(label[end]) for end in ends})
     label = label.copy()
-    for k in sorted({int(label[end]) for end in ends}):
-        label[[end for end in ends if label[end] == k]] = len(points)
-        points = np.vstack([points, points[k]])
-    return points, label
+    for new, k in enumerate(left, start=len(points)):
+        label[[end for end in ends if label[end] == k]] = new
+    return np.concatenate([points, points[left]]), label
 
 
 def _bridged(kept: list[int], edges: list[_Edge], found: list[tuple[int, int]]) -> list[int]:

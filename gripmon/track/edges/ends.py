@@ -152,8 +152,8 @@ class _Places:
                 at_it = (gripper.edge_points == point).any(axis=1)
                 rows += [(point, True, -1, side, curve, -1) for side in np.flatnonzero(at_it & along).tolist()[:1]]
         rows += [(point, True, -1, -1, -1, number) for number, point in enumerate(roundings.tolist())]
-        points, at_ends, *others = np.array(rows, dtype=np.intp).reshape(-1, 6).T
-        return cls(points, gripper.point_finger[points], at_ends > 0, *others)
+        columns = np.array(rows, dtype=np.intp).reshape(-1, 6).T
+        return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, *columns[2:])
 
 
 def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:

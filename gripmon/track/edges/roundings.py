@@ -138,7 +138,7 @@ class Roundings:
                 profiles = np.flatnonzero((layout.edge == edge) & prediction.ok)
                 return edge, profiles if at_start else profiles[::-1], passed > 0
             point = int(ends[edge, 1 if at_start else 0])
-            if point not in self._meeting:
+            if point not in self._meeting or not layout.visible[edge]:
                 return None
             one, other = self._meeting[point]
             edge = other if one == edge else one
