@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.anchor import CONFIRMED, Anchor, Lasting
+from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -110,7 +110,7 @@ def test_a_place_after_a_knock_is_confirmed_by_some_more_frames():
     frames = stream(np.random.default_rng(RNG_SEED), 10, common=0.0)
     assert Anchor(LASTING, BASE_T, frames[0], ROWS, 0.0).confirmed
     anchor = Anchor(LASTING, BASE_T, frames[0], ROWS, 0.0, knocked=True)
-    for number, frame in enumerate(frames[1 : 1 + CONFIRMED]):
+    for number, frame in enumerate(frames[1 : 1 + CONFIRMING_FRAMES]):
         assert not anchor.confirmed
         anchor.add(frame, ROWS, STILL, 0.1 * number)
     assert anchor.confirmed

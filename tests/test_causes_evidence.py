@@ -13,7 +13,7 @@ from scipy.stats import norm
 from support.shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
 from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
-from gripmon.judge.causes.models import FREEDOM, Errors, Model, weigh
+from gripmon.judge.causes.models import STUDENT_FREEDOM, Errors, Model, weigh
 from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.model.camera import LensSettings
@@ -178,7 +178,7 @@ def test_the_evidence_is_the_integral_over_the_prior():
 
     def density(way_m: float) -> float:
         error = (residual - jacobian[:, JAW] * way_m) / 0.2
-        likelihood = np.exp(-0.5 * (FREEDOM + 1.0) * np.log1p(error**2 / FREEDOM).sum())
+        likelihood = np.exp(-0.5 * (STUDENT_FREEDOM + 1.0) * np.log1p(error**2 / STUDENT_FREEDOM).sum())
         return float(likelihood * np.mean(norm.pdf(way_m, scale=sizes)))
 
     integral = quad(density, -1e-3, 1e-3, points=(8e-5,), limit=200)[0]
@@ -205,8 +205,8 @@ def test_the_state_that_fits_best_is_the_posteriors_mode():
     def unlikely(unknowns: np.ndarray) -> float:
         way_m, off_px = 1e-4 * unknowns[0], unknowns[1:]
         error = (residual - bias_px - jacobian[:, JAW] * way_m - off_px[edge]) / 0.2
-        tails = np.log1p(error**2 / FREEDOM).sum() + np.log1p((off_px / 0.15) ** 2 / FREEDOM).sum()
-        return float(0.5 * (FREEDOM + 1.0) * tails + 0.5 * (way_m / 1e-3) ** 2)
+        tails = np.log1p(error**2 / STUDENT_FREEDOM).sum() + np.log1p((off_px / 0.15) ** 2 / STUDENT_FREEDOM).sum()
+        return float(0.5 * (STUDENT_FREEDOM + 1.0) * tails + 0.5 * (way_m / 1e-3) ** 2)
 
     best = minimize(unlikely, np.zeros(1 + edges), method="BFGS", options={"gtol": 1e-7})
     assert found.motion[JAW] == pytest.approx(1e-4 * best.x[0], abs=3e-7)

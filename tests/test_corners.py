@@ -28,8 +28,8 @@ from gripmon.model.records import CornerFault
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import BentFinger, JawScript
 from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
-from gripmon.track.edges.consensus import ConsensusSettings
 from gripmon.track.edges.lines import CornerSettings
+from gripmon.track.edges.robust_fit import RobustFitSettings
 
 PLAIN = plain_scenario()
 IDS = box_gripper().corner_ids
@@ -79,7 +79,7 @@ def test_corners_off_the_prediction_are_measured_as_well_as_on_it():
 
 def test_covariances_are_the_spread_over_many_noisy_images():
     """With the floors for systematic errors out of the way; the noise is estimated, so it is known to a third only."""
-    settings = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))
+    settings = MeasurementSettings(consensus=RobustFitSettings(point_floor_px=0.005, edge_floor_px=0.0))
     using, rng = meter(settings=settings), np.random.default_rng(1)
     clean, truth = picture(PLAIN).astype(float), simulated(PLAIN).truth(0)
     corner_errors, claims, pose_errors, pose_claims, nees = [], [], [], [], []

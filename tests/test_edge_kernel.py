@@ -14,7 +14,7 @@ import pytest
 from support.box_models import cube_model
 from support.meters import measure, meter, moved, picture
 from support.simulated import plain_scenario
-from test_consensus import (
+from test_robust_fit import (
     CAMERA,
     EDGES,
     GRIPPER,
@@ -44,8 +44,8 @@ from gripmon.track.edges import (
     settling,
     warm_up,
 )
-from gripmon.track.edges.consensus import AGAIN_PX, Prior, agree, agree_with_numpy
-from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.robust_fit import RESTART_WIDTH_PX, Prior, fit_irls, fit_irls_with_numpy
 from gripmon.track.edges.uncertainty import (
     assess,
     assess_with_numpy,
@@ -57,13 +57,13 @@ pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
 CLOSE = 1e-9
 
 
-def many_votes() -> list[Votes]:
+def many_votes() -> list[Edgels]:
     """Edges alone, in clutter, behind an edge of the background; with polarity, spreads and cut-off edges."""
     rng = np.random.default_rng(21)
     found = [true_candidates(rng, sigma) for sigma in (0.0, 0.05, 0.3)]
     found += [with_clutter(rng, missing, extra) for missing in (0.0, 0.3, 0.8) for extra in (0.0, 0.5, 2.0)]
     found += [with_background_edge(int(edge), 1.5, seen) for edge in SAMPLED[:4] for seen in (False, True)]
-    votes = [votes_for(f) for f in found]
+    edgels = [votes_for(f) for f in found]
     polarity = np.where(np.arange(EDGES) % 3 == 0, 1, 0).astype(np.int8)
     for f in found:
         mixed = replace(
@@ -73,8 +73,8 @@ def many_votes() -> list[Votes]:
             zoom=int(rng.choice([1, 2, 4])),
         )
         spread_px, cut_off_px = rng.uniform(0.0, 0.1, EDGES), rng.uniform(0.0, 0.2, EDGES)
-        votes.append(replace(votes_for(mixed, polarity=polarity, edge_spread_px=spread_px), cut_off_px=cut_off_px))
-    return votes
+        edgels.append(replace(votes_for(mixed, polarity=polarity, edge_spread_px=spread_px), cut_off_px=cut_off_px))
+    return edgels
 
 
 VOTES = many_votes()
@@ -90,14 +90,14 @@ def prior(unknowns: int, jaw_sigma_m: float = 1e-4, opened_m: float = 0.0) -> Pr
     return Prior(np.array([0.0] * 6 + [opened_m])[:unknowns], information)
 
 
-def cases() -> Iterator[tuple[Votes, Prior, np.ndarray]]:
+def cases() -> Iterator[tuple[Edgels, Prior, np.ndarray]]:
     rng = np.random.default_rng(22)
-    for votes in (*VOTES, *HARDLY, NOTHING):
+    for edgels in (*VOTES, *HARDLY, NOTHING):
         for start in (np.zeros(7), 0.5 * XI, XI + rng.normal(size=7) * [2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3, 1e-4]):
-            yield votes, prior(7), start
-        yield votes, prior(7, 1e-6, 2e-5), np.zeros(7)
-        yield votes, prior(7, 0.02), np.zeros(7)
-        yield replace(votes, prediction=RIGID), prior(6), np.zeros(6)
+            yield edgels, prior(7), start
+        yield edgels, prior(7, 1e-6, 2e-5), np.zeros(7)
+        yield edgels, prior(7, 0.02), np.zeros(7)
+        yield replace(edgels, prediction=RIGID), prior(6), np.zeros(6)
 
 
 def assert_alike(one: object, other: object, unit: np.ndarray, condition: float) -> None:
@@ -129,27 +129,27 @@ def assert_alike(one: object, other: object, unit: np.ndarray, condition: float)
 
 
 def test_the_compiled_fit_and_covariance_are_those_of_numpy():
-    for votes, known, start in cases():
-        expected = agree_with_numpy(votes, known, start, SETTINGS)
-        assert_same_fit(votes, known, start, None)
-        assert_same_fit(votes, known, expected.xi, AGAIN_PX)
+    for edgels, known, start in cases():
+        expected = fit_irls_with_numpy(edgels, known, start, SETTINGS)
+        assert_same_fit(edgels, known, start, None)
+        assert_same_fit(edgels, known, expected.xi, RESTART_WIDTH_PX)
 
 
-def assert_same_fit(votes: Votes, known: Prior, start: np.ndarray, width_px: float | None) -> None:
-    expected = agree_with_numpy(votes, known, start, SETTINGS, width_px)
+def assert_same_fit(edgels: Edgels, known: Prior, start: np.ndarray, width_px: float | None) -> None:
+    expected = fit_irls_with_numpy(edgels, known, start, SETTINGS, width_px)
     unit = 1.0 / np.sqrt(np.diag(expected.information) + known.information)
     normal = expected.information + np.diag(known.information)
     condition = float(np.linalg.cond(normal * np.outer(unit, unit)))
-    assert_alike(agree(votes, known, start, SETTINGS, width_px), expected, unit, condition)
+    assert_alike(fit_irls(edgels, known, start, SETTINGS, width_px), expected, unit, condition)
     for shared_px in (0.0, 0.2):
-        one, other = (f(votes, expected, known.information, shared_px) for f in (assess, assess_with_numpy))
+        one, other = (f(edgels, expected, known.information, shared_px) for f in (assess, assess_with_numpy))
         assert_alike(one, other, unit, condition)
 
 
 def test_the_compiled_fits_without_one_edge_are_those_of_numpy():
-    for votes, known, start in list(cases())[::7]:
-        stays = contradictions_without(votes, known, start, SETTINGS)
-        expected = contradictions_without_with_numpy(votes, known, start, SETTINGS)
+    for edgels, known, start in list(cases())[::7]:
+        stays = contradictions_without(edgels, known, start, SETTINGS)
+        expected = contradictions_without_with_numpy(edgels, known, start, SETTINGS)
         assert len(stays) == len(SAMPLED)
         np.testing.assert_allclose(stays, expected, rtol=1e-8)
 
@@ -157,10 +157,10 @@ def test_the_compiled_fits_without_one_edge_are_those_of_numpy():
 def test_what_can_not_be_solved_is_an_error():
     """No candidates and a prior that holds nothing: all of these have a normal matrix of zeros."""
     nothing = Prior(np.zeros(7), np.zeros(7))
-    for fit in (agree, agree_with_numpy):
+    for fit in (fit_irls, fit_irls_with_numpy):
         with pytest.raises(FloatingPointError, match="not positive definite"):
             fit(NOTHING, nothing, np.zeros(7), SETTINGS)
-    empty = agree(NOTHING, prior(7), np.zeros(7), SETTINGS)
+    empty = fit_irls(NOTHING, prior(7), np.zeros(7), SETTINGS)
     for covariance in (assess, assess_with_numpy):
         with pytest.raises(FloatingPointError, match="not positive definite"):
             covariance(NOTHING, empty, np.zeros(7))

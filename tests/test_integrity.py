@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
-from gripmon.track.integrity.hypotheses import EDGE, GRIPPER
+from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
 from gripmon.track.integrity.quantiles import Tails
-from gripmon.track.integrity.separation import NEAR
+from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO
 
 # --- quantiles ---
 
@@ -194,8 +194,8 @@ def doubts_of(prior: list[float], away: list[float], sigma: list[float]) -> Doub
 
 def test_one_hypothesis_takes_all_of_the_risk():
     position, rotation, name = doubts_of([0.02], [3.0], [2.0]).levels(1e-3)
-    assert position == pytest.approx(3.0 + 2.0 * stats.chi2.isf(0.05, 1) ** 0.5, rel=NEAR - 1.0 + 5e-3)
-    assert rotation == pytest.approx(3.0 * stats.chi2.isf(0.05, 3) ** 0.5, rel=NEAR - 1.0 + 3e-3)
+    assert position == pytest.approx(3.0 + 2.0 * stats.chi2.isf(0.05, 1) ** 0.5, rel=LEVEL_TOLERANCE_RATIO - 1.0 + 5e-3)
+    assert rotation == pytest.approx(3.0 * stats.chi2.isf(0.05, 3) ** 0.5, rel=LEVEL_TOLERANCE_RATIO - 1.0 + 3e-3)
     assert name == "0"
 
 
@@ -211,7 +211,7 @@ def test_all_hypotheses_together_exceed_a_level_with_the_stated_risk(risk: float
         return float(sum(each))
 
     assert beyond(1.004 * level) <= risk * 1.02
-    assert beyond(level / NEAR / 1.004) >= risk * 0.98
+    assert beyond(level / LEVEL_TOLERANCE_RATIO / 1.004) >= risk * 0.98
     owed = [p * stats.norm.sf((level - a) / s) for p, a, s in rows]
     assert name == str(int(np.argmax(owed)))
 
@@ -219,7 +219,7 @@ def test_all_hypotheses_together_exceed_a_level_with_the_stated_risk(risk: float
 def test_what_is_improbable_takes_its_part_of_the_risk_and_bounds_nothing():
     """A hypothesis that leaves everything open, half as probable as the risk: the others have the other half."""
     both, _, _ = doubts_of([1.0, 5e-6], [0.0, 0.0], [1.0, 1e4]).levels(1e-5)
-    assert both == pytest.approx(stats.norm.isf(0.25e-5), rel=NEAR - 1.0 + 5e-3)
+    assert both == pytest.approx(stats.norm.isf(0.25e-5), rel=LEVEL_TOLERANCE_RATIO - 1.0 + 5e-3)
     open_wide, _, name = doubts_of([1.0, 2e-5], [0.0, 0.0], [1.0, 1e4]).levels(1e-5)
     assert open_wide > 5e3 and name == "1"
     nothing = doubts_of([1e-7], [5.0], [1.0]).levels(1e-5)
@@ -294,7 +294,7 @@ def test_one_wrong_edge_exceeds_the_bound_as_seldom_as_its_prior_allows(risk: fl
     nobody can miss.
     """
     hypotheses, trials = of_two_fingers(), 300
-    allowed = risk / EDGE
+    allowed = risk / WRONG_EDGE
     for k in DOUBTED:
         edge = int(np.flatnonzero(hypotheses.keep[k] == 0.0)[0])
         for size in (0.3, 1.0, 2.0, 4.0, 30.0):
@@ -312,7 +312,7 @@ def test_where_edges_err_as_often_as_their_prior_says_the_bound_holds_as_stated(
     known = np.repeat(1e-6 * np.eye(6)[None], count, axis=0)
     for _ in range(trials):
         error = LINEAR.sigma * rng.normal(size=LINEAR.sigma.shape)
-        wrong = rng.uniform(size=9) < EDGE
+        wrong = rng.uniform(size=9) < WRONG_EDGE
         error[wrong] += rng.uniform(-6.0, 6.0, (int(wrong.sum()), 1))
         pull = LINEAR.pull(error)
         found = separate(pull, LINEAR.information, LINEAR.information, hypotheses.keep, known, np.zeros((count, 6)))
@@ -354,10 +354,10 @@ def test_hypotheses_doubt_what_their_names_say():
     assert doubted == expected
     prior = dict(zip(found.name, found.prior.tolist(), strict=True))
     assert prior["nothing is wrong"] == prior["what looks like the fingers' ends is something else"] == 1.0
-    assert {p for n, p in prior.items() if n.startswith("edge ")} == {EDGE}
-    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {EDGE}
-    assert {p for n, p in prior.items() if n.startswith("finger ")} == {GRIPPER}
-    assert prior["the jaw opening is wrong"] == GRIPPER
+    assert {p for n, p in prior.items() if n.startswith("edge ")} == {WRONG_EDGE}
+    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {WRONG_EDGE}
+    assert {p for n, p in prior.items() if n.startswith("finger ")} == {WRONG_GRIPPER}
+    assert prior["the jaw opening is wrong"] == WRONG_GRIPPER
 
 
 def test_hypotheses_know_what_kind_they_are():

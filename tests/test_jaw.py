@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.track.jaw import CONTRADICTION, SYSTEMATIC_M, Fused, JawKnowledge
+from gripmon.track.jaw import SYSTEMATIC_M, UNREPORTED_MOTION_SIGMAS, Fused, JawKnowledge
 
 SIGMA_M, OFFSET_SIGMA_M = 5e-5, 2e-4
 Z_BY_JAW = -3.2  # what an error of the opening does to the distance, as with the box fingers
@@ -91,7 +91,7 @@ def test_a_jaw_that_moves_without_a_report_is_noticed_and_what_was_learnt_is_dro
     rng = np.random.default_rng(5)
     knowledge = JawKnowledge(SIGMA_M, OFFSET_SIGMA_M)
     _, out, errors_m = run(knowledge, rng, [0.034] * 40 + [0.0344] * 5, [0.034] * 45)
-    assert max(abs(f.surprise) for f in out[:40]) < CONTRADICTION < abs(out[40].surprise)
+    assert max(abs(f.surprise) for f in out[:40]) < UNREPORTED_MOTION_SIGMAS < abs(out[40].surprise)
     assert np.abs(errors_m[40:]).max() < 5.0 * IMAGE_SIGMA_M
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from test_consensus import EDGES, PREDICTION, SETTINGS
+from test_robust_fit import EDGES, PREDICTION, SETTINGS
 
 from gripmon.model.compiled import COMPILES
 from gripmon.track.edges import profile_kernel

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
-from support.still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
+from support.still_frames import CHANGING, LASTING_SHARE, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
 from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool
-from gripmon.judge.recalibrate.recalibrator import UNLIKELY
-from gripmon.judge.recalibrate.stills import LASTING as LASTING_PART
+from gripmon.judge.recalibrate.recalibrator import UNLIKELY_RESIDUALS_RISK
+from gripmon.judge.recalibrate.stills import LASTING_SHARE as LASTING_PART
 from gripmon.judge.recalibrate.stills import NEIGHBOURS, average, averaged_covariance, mean_corners
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import load_gripper
@@ -233,7 +233,7 @@ REFUSALS = {
     RefusalReason.CONTRADICTED: lambda: (all_moved(Scene().frames(20)), SURE),
     RefusalReason.AMBIGUOUS: lambda: (far_plane(), SURE),
     RefusalReason.FINGERS: lambda: (Scene(bend_m=(1e-4, 1e-4, 0.0)).frames(20), SURE),
-    RefusalReason.UNCERTAIN: lambda: (Scene(lasting=900.0 * LASTING, corner_px=0.5).frames(20), SURE),
+    RefusalReason.UNCERTAIN: lambda: (Scene(lasting=900.0 * LASTING_SHARE, corner_px=0.5).frames(20), SURE),
 }
 
 
@@ -305,15 +305,15 @@ def test_more_frames_are_waited_for_only_where_they_help():
         scene = Scene(lasting=lasting, changing=changing, corner_px=0.2)
         return proposal(scene.frames(frames), RecalibrationSettings(sure_sigma_m=5e-5, most_frames=60))
 
-    assert waits(1e-2 * LASTING, 60.0 * CHANGING).wait
-    late = waits(1e-2 * LASTING, 60.0 * CHANGING, 60)
+    assert waits(1e-2 * LASTING_SHARE, 60.0 * CHANGING).wait
+    late = waits(1e-2 * LASTING_SHARE, 60.0 * CHANGING, 60)
     assert not late.wait and late.needs_person is None
-    steady = waits(60.0 * LASTING, 1e-2 * CHANGING)
+    steady = waits(60.0 * LASTING_SHARE, 1e-2 * CHANGING)
     assert not steady.wait and steady.needs_person is not None, "what doesn't scatter isn't averaged away"
 
 
 def test_what_waits_is_looked_at_again_after_some_frames():
-    scene = Scene(lasting=1e-2 * LASTING, changing=60.0 * CHANGING, corner_px=0.2)
+    scene = Scene(lasting=1e-2 * LASTING_SHARE, changing=60.0 * CHANGING, corner_px=0.2)
     recalibrator = Recalibrator(RecalibrationSettings(sure_sigma_m=5e-5), scene.gripper, np.eye(6) * 1e-14)
     answers = []
     for frame in scene.frames(60):
@@ -400,7 +400,7 @@ def test_fingers_of_one_gripper_disagree_as_seldom_as_is_said():
 def test_a_finger_that_is_bent_by_a_tenth_of_a_millimetre_is_noticed(bend_m: tuple[float, float, float]):
     for seed in range(10):
         chance = fingers_disagree(pool(Scene(bend_m=bend_m).frames(20, seed), TRUE_T))
-        assert chance is not None and chance < UNLIKELY
+        assert chance is not None and chance < UNLIKELY_RESIDUALS_RISK
     assert fingers_disagree(pool(Scene(fingers=("left",)).frames(20), TRUE_T)) is None
 
 

@@ -150,9 +150,9 @@ def test_a_covariance_that_is_not_positive_definite_is_refused():
 def test_the_gate_lets_all_but_one_in_a_million_of_honest_measurements_pass():
     from scipy.stats import chi2
 
-    from gripmon.judge.smoothing import GATE
+    from gripmon.judge.smoothing import GATE_SQUARE
 
-    assert chi2.sf(GATE, 6) == pytest.approx(1.3e-6, rel=0.1)
+    assert chi2.sf(GATE_SQUARE, 6) == pytest.approx(1.3e-6, rel=0.1)
 
 
 # --- what is made of a stream ---

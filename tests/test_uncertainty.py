@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_consensus import EDGES, NO_FLOORS, PREDICTION, PRIOR, REPORTED, SAMPLES, XI, candidates, votes_for
+from test_robust_fit import EDGES, NO_FLOORS, PREDICTION, PRIOR, REPORTED, SAMPLES, XI, candidates, votes_for
 
-from gripmon.track.edges.consensus import agree
+from gripmon.track.edges.robust_fit import fit_irls
 from gripmon.track.edges.uncertainty import assess
 
 EDGE, STRETCH = PREDICTION.layout.edge, PREDICTION.layout.stretch
@@ -21,9 +21,9 @@ def nees(noise: Noise, assumed_px: float, edge_spread_px: float = 0.0, trials: i
     rng, out = np.random.default_rng(2), []
     for _ in range(trials):
         found = candidates(np.arange(SAMPLES), PREDICTION.jacobian @ NO_JAW + noise(rng), assumed_px)
-        votes = votes_for(found, NO_FLOORS, edge_spread_px=np.full(EDGES, edge_spread_px))
-        consensus = agree(votes, REPORTED, np.zeros(7), NO_FLOORS)
-        covariance = assess(votes, consensus, PRIOR).covariance[:6, :6]
+        edgels = votes_for(found, NO_FLOORS, edge_spread_px=np.full(EDGES, edge_spread_px))
+        consensus = fit_irls(edgels, REPORTED, np.zeros(7), NO_FLOORS)
+        covariance = assess(edgels, consensus, PRIOR).covariance[:6, :6]
         error = (consensus.xi - NO_JAW)[:6]
         out.append(error @ np.linalg.solve(covariance, error))
     return np.array(out)
@@ -74,8 +74,8 @@ def test_what_a_line_is_worth_is_the_scatter_of_its_edge():
     mine = edge == EDGE
     for _ in range(200):
         noise = neighbours_together(rng)
-        votes = votes_for(candidates(np.arange(SAMPLES), PREDICTION.jacobian @ NO_JAW + noise, 0.1), NO_FLOORS)
-        uncertainty = assess(votes, agree(votes, REPORTED, np.zeros(7), NO_FLOORS), PRIOR)
+        edgels = votes_for(candidates(np.arange(SAMPLES), PREDICTION.jacobian @ NO_JAW + noise, 0.1), NO_FLOORS)
+        uncertainty = assess(edgels, fit_irls(edgels, REPORTED, np.zeros(7), NO_FLOORS), PRIOR)
         weight = uncertainty.line_weight[mine]
         means.append(np.average(noise[mine], weights=weight))
         claimed.append(1.0 / weight.sum())
@@ -84,8 +84,8 @@ def test_what_a_line_is_worth_is_the_scatter_of_its_edge():
 
 
 def test_without_inliers_the_prior_alone_is_claimed():
-    votes = votes_for(candidates(np.arange(0), np.zeros(0)))
-    consensus = agree(votes, REPORTED, np.zeros(7), NO_FLOORS)
-    uncertainty = assess(votes, consensus, PRIOR)
+    edgels = votes_for(candidates(np.arange(0), np.zeros(0)))
+    consensus = fit_irls(edgels, REPORTED, np.zeros(7), NO_FLOORS)
+    uncertainty = assess(edgels, consensus, PRIOR)
     assert np.diag(uncertainty.covariance) == pytest.approx(1.0 / PRIOR)
     assert uncertainty.shared_px == 0.0 and len(uncertainty.line_weight) == 0

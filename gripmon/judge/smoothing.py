@@ -28,7 +28,7 @@ from gripmon.model.compiled import COMPILES, compiled
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 
-GATE = 37.7
+GATE_SQUARE = 37.7
 """Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of
 freedom).
 """
@@ -37,7 +37,7 @@ SETTLING, SETTLING_GATE = 20, 14.0
 """So many frames after a start a frame that is surprising by less starts the average anew, and at once: what has just
 moved may swing.  A needless start costs little then."""
 
-LEAST_KEPT = 0.4
+SMALLEST_VARIANCE_RATIO = 0.4
 """Least variance of the average over that of what scatters about it.  Errors have slow parts that no quiet time is long
 enough to see scatter: before moving background about a third of the whole lasts for ten seconds and longer."""
 
@@ -46,7 +46,7 @@ FOLLOW_MEMORY, FOLLOW_FROM = 0.25, 2.5
 than usual on the average lags: the transform goes along with the frames, and the average catches up."""
 SETTLING_LAG = 0.7
 """While the average settles, the transform goes along from this part of that on: averaging gains little yet."""
-CATCH_UP = 0.5
+LAG_VARIANCE_FACTOR = 0.5
 """What a lag adds to the average's variance, over the square of the lag."""
 
 PRIOR_SCATTER, LEAST_SCATTER, MOST_SCATTER = 0.5, 0.1, 9.0
@@ -115,7 +115,7 @@ class QuietTime:
         # While little is known, up to all of the reported variance may scatter.
         unknown = (1.0 - PRIOR_SCATTER) * PRIOR_FRAMES / self._scatter_frames
         self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter + unknown, LEAST_SCATTER)
-        self._least_kept = LEAST_KEPT * np.minimum(scatter, 1.0)
+        self._least_kept = SMALLEST_VARIANCE_RATIO * np.minimum(scatter, 1.0)
 
     def kept(self, ripe: Array | float) -> Array:
         """Share (6,) of a frame's reported variance that stays in the average's; all of it while ``ripe`` is 0."""
@@ -324,7 +324,7 @@ class PoseAverage:
             return
         settled = self._filter.frames >= SETTLING
         innovation, gain, surprise = self._filter.weigh(cam_T_grip, self._as_it_scatters(covariance))
-        if surprise <= (GATE if settled else SETTLING_GATE):
+        if surprise <= (GATE_SQUARE if settled else SETTLING_GATE):
             self._suspicions = 0
             self._conclude(self._filter.correct(innovation, gain), covariance, quiet, settled)
             return
@@ -372,7 +372,7 @@ class PoseAverage:
         self.cam_T_grip = mean_T
         if learnt.vibrates or lag.max() > 0.0:
             catch_up = np.maximum(self._recent - learnt.lag_from, 0.0)
-            self._filter.wander(CATCH_UP * catch_up * variance)
+            self._filter.wander(LAG_VARIANCE_FACTOR * catch_up * variance)
             # As much of the motion as of the frame's error is in the distance: the transform goes along by that share.
             motion = learnt.vibration + np.maximum(lag, 0.0)
             follow = motion / (motion + 1.0)

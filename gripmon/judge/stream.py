@@ -21,10 +21,10 @@ from gripmon.model.records import Cause, Frame, Image
 
 _NS = 1_000_000_000
 
-SEEN_BEFORE = 8
+RING_FRAMES = 8
 """Newest frames among which a frame that comes again is recognised: drivers that hang hand over a ring of buffers."""
 
-USUAL_RUNS = 4
+FREEZE_TO_USUAL_RATIO = 4
 """A source that repeats frames now and then is frozen after so many times its longest repetition."""
 
 STOOD_SHARE = 0.95
@@ -46,7 +46,7 @@ CALM_FRAMES = 30
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
 """A stamp that is so many usual periods, and so long, after the one before has jumped."""
 
-BLOCK = 8
+BLOCK_INTERVALS = 8
 """Intervals that are taken together."""
 
 LEARN_BLOCKS, LEARN_NS = 6, 2 * _NS
@@ -55,7 +55,7 @@ LEARN_BLOCKS, LEARN_NS = 6, 2 * _NS
 ARRIVALS, MOST_BLOCKS = 64, 512
 """How many newest intervals and blocks are kept."""
 
-REGULAR = 0.3
+REGULAR_INTERVAL_DEVIATION = 0.3
 """Median deviation of the intervals over their median up to which there is a usual rate at all."""
 
 DEPARTED, RETURNED = 1.6, 1.3
@@ -143,7 +143,7 @@ class _Frozen:
         self._settings = settings
         self.pixels: Image | None = None
         self._coded = 0
-        self._before: deque[int] = deque(maxlen=SEEN_BEFORE)
+        self._before: deque[int] = deque(maxlen=RING_FRAMES)
         self._run = 0
         self._since_ns = 0
         self._longest = 0
@@ -172,7 +172,7 @@ class _Frozen:
         self._run += 1
         # Stamps may stand still together with the images.
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
-        enough = max(self._settings.frozen_frames, USUAL_RUNS * self._longest)
+        enough = max(self._settings.frozen_frames, FREEZE_TO_USUAL_RATIO * self._longest)
         settings = self._settings
         frozen_s = settings.frozen_s if self._coded < SURE_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
         self._frozen |= self._run >= enough and lasted_ns >= _NS * frozen_s
@@ -277,7 +277,7 @@ class _Rate:
 
     @property
     def frames_per_s(self) -> float | None:
-        if len(self._arrivals_ns) < BLOCK:
+        if len(self._arrivals_ns) < BLOCK_INTERVALS:
             return None
         half, odd = divmod(len(self._in_order_ns), 2)
         upper_ns = self._in_order_ns[half]
@@ -301,7 +301,7 @@ class _Rate:
         self._arrivals_ns.append(step_ns)
         bisect.insort(self._in_order_ns, step_ns)
         self._block_ns.append(interval_ns)
-        if len(self._block_ns) == BLOCK:
+        if len(self._block_ns) == BLOCK_INTERVALS:
             middle_ns = statistics.median(self._block_ns)
             uneven = statistics.median(abs(t - middle_ns) for t in self._block_ns) / middle_ns
             self._blocks.append(_Block(middle_ns, sum(self._block_ns), uneven))
@@ -333,7 +333,7 @@ class _Rate:
         if len(self._blocks) < LEARN_BLOCKS or sum(block.lasted_ns for block in self._blocks) < LEARN_NS:
             return
         # Frames that come as they like have no usual rate.
-        if statistics.median(block.uneven for block in self._blocks) < REGULAR:
+        if statistics.median(block.uneven for block in self._blocks) < REGULAR_INTERVAL_DEVIATION:
             self.usual_ns = _middle_ns(list(self._blocks))
 
 

@@ -14,24 +14,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.smoothing import LEAST_KEPT, MOST_SCATTER
+from gripmon.judge.smoothing import MOST_SCATTER, SMALLEST_VARIANCE_RATIO
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
-from gripmon.monitor.refits import INFLATION, Refits
+from gripmon.monitor.refits import SIGMA_INFLATION, Refits
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, telling
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
 
-DISPLACED = 33.1
+DISPLACED_SQUARE = 33.1
 """Squared normalised distance that six normal errors exceed once in 100,000 times (chi-square)."""
 
-LEAST_YOUNG = 0.2
+YOUNG_VARIANCE_RATIO = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
 little more off than is believed of any average.
 """
 
-CONFIRMED = 5
+CONFIRMING_FRAMES = 5
 """Further frames that have to prove a place after a knock in full."""
 
 NOTHING, UNKNOWN = -1, 1e12
@@ -78,7 +78,7 @@ class Anchor:
     ):
         """``knocked``: the first pose stands elsewhere than before."""
         self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
-        self._to_confirm = CONFIRMED if knocked else 0
+        self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
         self._scatter = np.zeros((len(rows), 6))
@@ -111,11 +111,11 @@ class Anchor:
     def _conclude(self) -> None:
         young = np.einsum("hii->hi", self._filters.covariance) / self._frames_variance
         # The filters' own covariances, which this changes.
-        scale = np.sqrt(np.maximum(LEAST_YOUNG / young, 1.0))
+        scale = np.sqrt(np.maximum(YOUNG_VARIANCE_RATIO / young, 1.0))
         self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
-        young = np.clip(young, LEAST_YOUNG, 1.0)
+        young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
         # Of errors that last, averaging takes away less than of independent ones.
-        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT * self._scatter)
+        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, SMALLEST_VARIANCE_RATIO * self._scatter)
         scale = np.sqrt(kept / young)
         self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
         self.cam_T_grip = perturb(self._base_T, self._filters.shift[0])
@@ -131,8 +131,8 @@ class Anchor:
         at = perturbation_between(self._base_T, cam_T_grip)
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
-        told = telling(average, at, wander / INFLATION**2, frame, rows, DISPLACED)
-        return Doubts.of(self._lasting.name, self._lasting.prior, told, INFLATION)
+        told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, DISPLACED_SQUARE)
+        return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

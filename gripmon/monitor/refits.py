@@ -13,7 +13,7 @@ from gripmon.model.records import Array, Protection
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, with_and_without
 
-INFLATION = 1.2
+SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
 
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
@@ -99,7 +99,7 @@ class Refits:
         else:
             at, covariance = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor
             # The free fit's distance from the anchor, in units of both covariances.
-            self._free, fits, surprise = with_and_without(*of, at, covariance, known.of_model, INFLATION**2)
+            self._free, fits, surprise = with_and_without(*of, at, covariance, known.of_model, SIGMA_INFLATION**2)
             self.anchored = Anchored(fits, surprise)
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
@@ -122,7 +122,7 @@ class Refits:
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
-        return Doubts.of(self.hypotheses.name, prior, fits, INFLATION)
+        return Doubts.of(self.hypotheses.name, prior, fits, SIGMA_INFLATION)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

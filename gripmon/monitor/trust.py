@@ -20,11 +20,11 @@ from gripmon.monitor.finer import FinerLook
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Trust, Weigher
 from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
-PROOF_EVERY = 4
+PROOF_EVERY_FRAMES = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""
 
 ONE_EDGE_PX = 2.0
@@ -134,7 +134,7 @@ class Integrity:
         weigh = self._weigher.weigh
         cam_T_grip, covariance = self._tracker.update(measurement)
         trust = weigh(measurement, cam_T_grip, None, now_s)
-        due = self._frames % PROOF_EVERY == 0
+        due = self._frames % PROOF_EVERY_FRAMES == 0
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
@@ -257,7 +257,7 @@ class Integrity:
         if not self._look.ready or frame.image is None:
             return False
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
-        return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
+        return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
     def _slide_m(self, frame: Frame, here: _Candidate) -> Array | None:
         """By how much (3,), gripper frame, the fingers are seen to stand along themselves from a candidate's pose; None
@@ -266,13 +266,13 @@ class Integrity:
         if frame.image is None:
             return None
         opening_m = here.measurement.jaw_opening_m
-        return self._strips.slide_m(frame.image, here.cam_T_grip, opening_m, LOOK_RISK)
+        return self._strips.slide_m(frame.image, here.cam_T_grip, opening_m, LOOK_ODDS)
 
     def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
         """Whether the gripper's look is seen at a pose (4, 4)."""
         if not self._look.ready or frame.image is None:
             return False
-        return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_RISK)
+        return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_ODDS)
 
     def _short(self, trust: Trust) -> bool:
         """Whether the bound is above the alert limit."""

@@ -17,7 +17,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import DISPLACED, Anchor, Lasting
+from gripmon.monitor.anchor import DISPLACED_SQUARE, Anchor, Lasting
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -35,18 +35,18 @@ from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
 
-SWINGS = 20.0
+VIBRATION_FRAMES = 20.0
 """Proven frames over which the mount's vibration is learnt."""
 
-MISREAD_END = 0.1
+MISREAD_PROBABILITY = 0.1
 """Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
 border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
 """
 
-LOOK_RISK = 1e-3
+LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
 
-KNOCKED_UNSEEN = 5e-4
+KNOCK_UNSEEN_PROBABILITY = 5e-4
 """Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
 that the rate of knocks over all the time says too little.
 """
@@ -151,14 +151,14 @@ class Weigher:
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses = fits.hypotheses
         # What would need a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= DISPLACED
+        holds = anchored.surprise <= DISPLACED_SQUARE
         displaced = not holds[0] and explained is None
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else 1.0 if slid else MISREAD_END ** self.confirmations(measurement, ends, kept)
+        misread = 0.0 if proven else 1.0 if slid else MISREAD_PROBABILITY ** self.confirmations(measurement, ends, kept)
         prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread * (LOOK_RISK if look_seen else 1.0)
+        prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         if self.anchor is None:
             # A finger is taken to be straight at first; the ends may have been something else from that on.
             lasting = ~hypotheses.sudden
@@ -191,7 +191,7 @@ class Weigher:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is no vibration, but what rings after it is.
             noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
+            self.swing = self.swing + (np.minimum(square, DISPLACED_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
         elif trust.displaced:
             # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
@@ -214,7 +214,7 @@ class Weigher:
 
     def _knocked(self, unseen_s: float, hidden: bool) -> float:
         """Probability that the mount was knocked since then; ``hidden``: something is at the gripper."""
-        return max(self._jumps_per_s * unseen_s, KNOCKED_UNSEEN if hidden else 0.0)
+        return max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
 
     def confirmations(
         self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
@@ -236,7 +236,7 @@ class Weigher:
         sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
         unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
         knocked = self._knocked(unseen_s, hidden=True)
-        return knocked * MISREAD_END**sides <= self._policy.integrity_risk
+        return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The bound by what the first frames differ from the reference, ``away`` (6,)."""

@@ -20,9 +20,9 @@ from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
 from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.track.edges.consensus import Consensus
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Candidates, Votes
+from gripmon.track.edges.profiles import Candidates, Edgels
+from gripmon.track.edges.robust_fit import RobustFit
 from gripmon.track.edges.uncertainty import Uncertainty, assess
 
 EDGE_POINT_SIGMA_PX = 0.05
@@ -164,7 +164,7 @@ class ForecastMeter(FingertipMeter):
         here = Patience(when_doubtful=False, when_lost=False)
         return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
 
-    def _look(self, image: Image, prediction: Prediction) -> Votes:
+    def _look(self, image: Image, prediction: Prediction) -> Edgels:
         gripper, eye_grip_m = self._gripper, invert(prediction.cam_T_grip)[:3, 3]
         points_grip_m = gripper.points_grip_m(prediction.jaw_opening_m)
         hidden = samples_behind(gripper, prediction.layout, points_grip_m, eye_grip_m)
@@ -174,9 +174,9 @@ class ForecastMeter(FingertipMeter):
         step = np.where(self._polarity[prediction.layout.edge[sample]] < 0, -40.0, 40.0)
         return self._votes(Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0), prediction)
 
-    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
+    def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
         """As assumed: nothing scatters here."""
-        scatters = assess(votes, consensus, self._prior, CLUTTER_PX)
+        scatters = assess(edgels, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
         return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from gripmon.judge.smoothing import GATE
+from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.records import Array
 from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, Pooled, find_line, pool, slopes
 from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Viewer, sampled
@@ -315,9 +315,10 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
     # Bevels on the inner sides alone look like a wider opening.
     allowed_m = JAW_SIGMAS * jaw_sigma_m + SHAPE_M
     faults = []
-    if pose_square > GATE:
+    if pose_square > GATE_SQUARE:
+        times = np.sqrt(pose_square / GATE_SQUARE)
         faults.append(
-            f"the gripper is off the reference, {viewer.distance(pose)}, {np.sqrt(pose_square / GATE):.1f} times what "
+            f"the gripper is off the reference, {viewer.distance(pose)}, {times:.1f} times what "
             f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose)}"
         )
     if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:

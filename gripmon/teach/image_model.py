@@ -19,7 +19,7 @@ from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, leaves_smo
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
-from gripmon.track.edges.ends import ALONG_COSINE
+from gripmon.track.edges.ends import PARALLEL_COSINE
 
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0
@@ -134,7 +134,7 @@ def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -
     """
     way = np.array([local[b] - local[a] for a, b in placed]).reshape(-1, 3)
     length = np.linalg.norm(way, axis=1)
-    along = np.abs(way[:, 2]) > ALONG_COSINE * length
+    along = np.abs(way[:, 2]) > PARALLEL_COSINE * length
     side = along & (length >= LONG_SIDE * length[along].max(initial=0.0))
     runs: list[list[tuple[int, int]]] = [[]]
     for piece, straight in zip(placed, side.tolist(), strict=True):

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.smoothing import GATE
+from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.estimate import (
@@ -185,7 +185,7 @@ def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtE
         found = viewer.measured(image, arrays)
         xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
         away_px = found.prediction.moved_px(xi) if found.trusted else math.inf
-        explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE
+        explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE_SQUARE
         worst_px = max(worst_px, away_px)
         if away_px > max(CLOSED_PX, refused_px) and not (found.trusted and explained):
             shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"

@@ -20,7 +20,6 @@ from gripmon.model.records import Array, Image
 from gripmon.teach.lines import EdgePoints, Line, settle_line
 from gripmon.teach.outlines import INNERMOST, Outline
 from gripmon.teach.plate_print import PlatePrint, look_at, moves, rough_line, sharpness
-from gripmon.track.edges.consensus import ConsensusSettings
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
     EdgeSettings,
@@ -31,6 +30,7 @@ from gripmon.track.edges.profiles import (
     quantum,
     read_profiles,
 )
+from gripmon.track.edges.robust_fit import RobustFitSettings
 
 REACH_PX = 10.0
 """Search distance from the rough ends of an edge."""
@@ -223,14 +223,14 @@ def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
     """
     steps = np.arange(-reach_px, reach_px + 0.5 * _GRID_PX, _GRID_PX)
     ends = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    votes = np.zeros(len(ends))
+    edgels = np.zeros(len(ends))
     for k in range(0, len(ends), 256):
         part = ends[k : k + 256]
         lines = part[:, :1] * (1.0 - points.way) + part[:, 1:] * points.way
         nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
-        votes[k : k + 256] = nearness @ worth
+        edgels[k : k + 256] = nearness @ worth
     away = np.square(ends).mean(axis=1) / reach_px**2
-    best: Array = ends[int((votes * (1.0 - 0.3 * away)).argmax())]
+    best: Array = ends[int((edgels * (1.0 - 0.3 * away)).argmax())]
     return best
 
 
@@ -321,7 +321,7 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     # Known from few stretches itself: Student's distribution has this variance.
     student = free / (free - 2.0) if free >= _FEWEST_FREE else _FEWEST_FREE
     usual_px2 = student * float(squares.sum()) / max(free, 1.0)
-    floor_px = ConsensusSettings().edge_floor_px
+    floor_px = RobustFitSettings().edge_floor_px
     out = []
     for edge, own, count in zip(seen, squares, freedom, strict=True):
         design = edge.design()[0]

@@ -14,7 +14,7 @@ import numpy as np
 
 from gripmon.model.records import Array
 
-CONTRADICTION = 5.0
+UNREPORTED_MOTION_SIGMAS = 5.0
 """Standard deviations between what is known and what an image shows past which the jaw has moved without a report."""
 
 SYSTEMATIC_M = 2e-6
@@ -89,7 +89,7 @@ class JawKnowledge:
         self._travel(reported_m)
         surprise = (error_m - self._mean.sum()) / math.sqrt(seen_variance + self._known_variance)
         known_m, known = float(self._mean.sum()), self._known_variance
-        contradicted = abs(surprise) > CONTRADICTION
+        contradicted = abs(surprise) > UNREPORTED_MOTION_SIGMAS
         if contradicted:
             known_m, known = 0.0, prior
         fused = 1.0 / (image + 1.0 / known)

@@ -11,15 +11,15 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.teach.accuracy import EDGE_POINT_SIGMA_PX, ForecastMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
-from gripmon.track.edges.consensus import Consensus, ConsensusSettings
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.robust_fit import RobustFit, RobustFitSettings
 from gripmon.track.edges.uncertainty import Uncertainty
 from support.meters import box_gripper, difference
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 # Floors out of the way: edge points have the assumed standard deviation and nothing beside.
-INDEPENDENT = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))
+INDEPENDENT = MeasurementSettings(consensus=RobustFitSettings(point_floor_px=0.005, edge_floor_px=0.0))
 OPENING_M = 0.034
 _GROSS_PX = 6.0
 
@@ -41,16 +41,16 @@ class NoisyMeter(ForecastMeter):
         super().__init__(make_camera(lens), gripper or box_gripper(), INDEPENDENT, jaw_sigma_m)
         self.gross, self.rng = gross, np.random.default_rng(seed)
 
-    def _look(self, image: Image, prediction: Prediction) -> Votes:
-        votes = super()._look(image, prediction)
-        jacobian = prediction.jacobian[votes.candidates.sample]
+    def _look(self, image: Image, prediction: Prediction) -> Edgels:
+        edgels = super()._look(image, prediction)
+        jacobian = prediction.jacobian[edgels.candidates.sample]
         to_truth = difference(prediction.cam_T_grip, nominal_cam_T_grip())
         to_truth = np.append(to_truth, OPENING_M - prediction.jaw_opening_m)[: jacobian.shape[1]]
         offset_px = jacobian @ to_truth + self.rng.normal(scale=EDGE_POINT_SIGMA_PX, size=len(jacobian))
         lost = self.rng.random(len(offset_px)) < self.gross
         offset_px[lost] = self.rng.uniform(-_GROSS_PX, _GROSS_PX, np.count_nonzero(lost))
-        return dataclasses.replace(votes, candidates=dataclasses.replace(votes.candidates, offset_px=offset_px))
+        return dataclasses.replace(edgels, candidates=dataclasses.replace(edgels.candidates, offset_px=offset_px))
 
-    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
+    def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
         """As for an image: by what the points show."""
-        return FingertipMeter._assess(self, votes, consensus)
+        return FingertipMeter._assess(self, edgels, consensus)

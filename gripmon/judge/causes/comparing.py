@@ -22,13 +22,13 @@ Key = tuple[Cause | None, int | None]
 FOLLOWED = (Cause.CAMERA_MOUNT, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 """Causes by which the whole gripper shows elsewhere, however far."""
 
-FLOOR_PX = 0.015
+PIECE_SIGMA_PX = 0.015
 """Standard deviation of a piece's place that nothing else explains."""
 
-WITH_BASELINE = 0.1
+BASELINE_ERROR_SHARE = 0.1
 """Part of what a whole edge is off by that is left when it is compared with itself before."""
 
-EDGE_PX = 0.02
+EDGE_SIGMA_PX = 0.02
 """What a whole edge is off by at least."""
 
 MODEL_M = 3e-5
@@ -42,18 +42,18 @@ LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
 """Scatter of the blur while the lens stays as it is, and how far it goes when it doesn't."""
 
-WORST = -40.0
+LOWEST_BLUR_LOG_RATIO = -40.0
 """Log likelihood ratio that a change of the blur is worth at most."""
 
-ABSENT = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
+ABSENT_PROBABILITY = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 """How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
-several things happened; with every other cause it is a ``STRAY``."""
-STRAY = 0.02
+several things happened; with every other cause it is a ``STRAY_PROBABILITY``."""
+STRAY_PROBABILITY = 0.02
 
 STANDS_SIGMAS = 4.0
 """Standard deviations within which a piece of an edge stands at a place: one in 16,000 is farther off by chance."""
 
-BLOCKED = 0.15
+BLOCKED_VIEW_PROBABILITY = 0.15
 """Probability of a blocked view beforehand, where a finger isn't seen."""
 
 
@@ -95,16 +95,16 @@ def compare(
     reported = evidence.jaw_reported_m is not None
     opening_m = evidence.jaw_opening_m if evidence.jaw_reported_m is None else evidence.jaw_reported_m
     start = State(ref_cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
-    sigma_px: Array = np.hypot(evidence.sigma_px, FLOOR_PX)
+    sigma_px: Array = np.hypot(evidence.sigma_px, PIECE_SIGMA_PX)
     bias_px: Array = np.zeros(len(evidence.edge))
     model_px = MODEL_M / (evidence.per_px * float(ref_cam_T_grip[2, 3]))
-    spread_px: Array = np.hypot(np.hypot(evidence.spread_px, EDGE_PX), model_px)
+    spread_px: Array = np.hypot(np.hypot(evidence.spread_px, EDGE_SIGMA_PX), model_px)
     if baseline is not None:
         start = baseline.start(start, reported, gripper)
         bias_px, bias_sigma_px = baseline.bias_of(pooled.piece)
         sigma_px = np.hypot(sigma_px, bias_sigma_px)
         seen = baseline.known(pooled.piece)
-        spread_px = np.where(seen, np.hypot(WITH_BASELINE * evidence.spread_px, EDGE_PX), spread_px)
+        spread_px = np.where(seen, np.hypot(BASELINE_ERROR_SHARE * evidence.spread_px, EDGE_SIGMA_PX), spread_px)
     known = _knowledge(evidence.jaw_reported_m, reference_sigma, report, baseline)
     models = suspects(gripper, float(ref_cam_T_grip[2, 3]), known, interrupted)
     view = EdgeView(camera, gripper, evidence)
@@ -131,11 +131,13 @@ def compare(
         for key in log:
             log[key] += _blur_log_likelihood(change_px, may=key[0] in LENS_CHANGES)
     if pooled.absent:
-        log[Cause.VIEW_BLOCKED, None] = fits[None, None].log_evidence + math.log(BLOCKED)
+        log[Cause.VIEW_BLOCKED, None] = fits[None, None].log_evidence + math.log(BLOCKED_VIEW_PROBABILITY)
         fits[Cause.VIEW_BLOCKED, None] = fits[None, None]
         for cause, part in log:
-            chance = ABSENT.get(cause, STRAY) if cause is not None else STRAY
-            log[cause, part] += math.log(STRAY if part is not None and part not in pooled.absent else chance)
+            chance = ABSENT_PROBABILITY.get(cause, STRAY_PROBABILITY) if cause is not None else STRAY_PROBABILITY
+            log[cause, part] += math.log(
+                STRAY_PROBABILITY if part is not None and part not in pooled.absent else chance
+            )
     finger = gripper.edge_finger[evidence.edge]
     return Comparison(log, fits, change_px, _elsewhere(fits, alone_px, finger, len(gripper.finger_ids)))
 
@@ -188,6 +190,6 @@ def _blur_log_likelihood(change_px: float, *, may: bool) -> float:
     """Of a change of the blur where the lens stays as it is, or may have changed."""
     stays = -0.5 * (change_px / BLUR_SIGMA_PX) ** 2
     if not may:
-        return max(stays, WORST)
+        return max(stays, LOWEST_BLUR_LOG_RATIO)
     changes = math.log(BLUR_SIGMA_PX * math.sqrt(2.0 * math.pi) / BLUR_RANGE_PX)
     return float(np.logaddexp(stays, changes)) - math.log(2.0)

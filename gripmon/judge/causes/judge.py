@@ -33,12 +33,12 @@ SCATTERED_PX = 0.4
 ENOUGH, SETTLED = 20, 6
 """Frames in which all was well that make a baseline, and with which a first one is made if it is asked for earlier."""
 
-CONTRADICTED = 8.0
+CONTRADICTION_LOG_EVIDENCE = 8.0
 """Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
 
-BLIND = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
+BLIND_CAUSES = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
 """Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
-BAD_IMAGE = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
+BAD_IMAGE_CAUSES = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
 MUCH_NOISE, LEAST_NOISE, DARK, BRIGHT = 4.0, 0.02, 0.08, 0.95
 
@@ -49,12 +49,12 @@ by how much its cells may have wandered before, and may differ now, parts of the
 that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
 """
 
-MOST = 0.5
+FINGER_AGREEING_SHARE = 0.5
 """Share of a finger's profiles that must agree with where it is said to be.  What fewer show may be anything that has
 an edge or two: a shadow, a finger's other side, what lies behind.
 """
 
-GONE = 2.0 / 3.0
+FINGER_GONE_SHARE = 2.0 / 3.0
 """Share of the pieces of a finger's edges beyond which it has gone elsewhere, though its ends aren't seen: its outline
 has two sides and a tip, and a thing before one corner of it shows borders of its own for two of these.
 """
@@ -132,12 +132,12 @@ class CauseJudge:
         pooled = pool(self._frames, self._camera, self._gripper)
         blind = len(pooled.piece) < FEWEST_PIECES
         scatter_px = 0.0 if blind else float(np.median(pooled.evidence.sigma_px))
-        ill_seen = bool((pooled.share < MOST).any())
+        ill_seen = bool((pooled.share < FINGER_AGREEING_SHARE).any())
         # What the image itself explains needs no other cause.
         if blind or (baseline is not None and (ill_seen or scatter_px > SCATTERED_PX)):
             spoilt = _spoilt(pooled, baseline)
             if spoilt is not None:
-                return self._told(BAD_IMAGE, spoilt)
+                return self._told(BAD_IMAGE_CAUSES, spoilt)
         if blind and baseline is not None and _unsharp(pooled, baseline):
             text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
             return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
@@ -145,7 +145,9 @@ class CauseJudge:
             text = f"no part of the image is below {100.0 * BRIGHT:.0f} % of the full scale: too much light, or hidden"
             return self._told({Cause.IMAGE_BAD: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind:
-            return self._told(BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place")
+            return self._told(
+                BLIND_CAUSES, "no finger is seen where it should be, nor near it; hidden, or far out of place"
+            )
         if scatter_px > SCATTERED_PX:
             text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: they don't tell what is wrong"
             return self._told({Cause.UNKNOWN: 1.0}, text)
@@ -186,7 +188,7 @@ class CauseJudge:
             return None
         comparison = self._compared(pooled, ref_cam_T_grip, None)
         nothing = comparison.fits[None, None]
-        if max(comparison.log.values()) - comparison.log[None, None] > CONTRADICTED:
+        if max(comparison.log.values()) - comparison.log[None, None] > CONTRADICTION_LOG_EVIDENCE:
             return None
         edges = len(self._gripper.edge_ids)
         self._baseline = Baseline.of(pooled, nothing.motion, nothing.residual_px, edges)
@@ -228,7 +230,7 @@ def _not_seen_elsewhere(
     finger, fingers = finger_of_ends(gripper), len(gripper.finger_ids)
     wanted = np.bincount(finger[expected], minlength=fingers)
     endless = np.bincount(finger[pooled.ends], minlength=fingers) < np.minimum(wanted, END_CORNERS)
-    return np.asarray(endless & (comparison.elsewhere <= GONE))
+    return np.asarray(endless & (comparison.elsewhere <= FINGER_GONE_SHARE))
 
 
 def _ill_founded(key: Key, pooled: Pooled, unseen: NDArray[np.bool_]) -> bool:
@@ -240,9 +242,9 @@ def _ill_founded(key: Key, pooled: Pooled, unseen: NDArray[np.bool_]) -> bool:
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
-        return part not in pooled.absent and (not pooled.share[part] >= MOST or bool(unseen[part]))
+        return part not in pooled.absent and (not pooled.share[part] >= FINGER_AGREEING_SHARE or bool(unseen[part]))
     several = min(len(pooled.share), 2)
-    return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= MOST).sum()) < several
+    return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_AGREEING_SHARE).sum()) < several
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

@@ -99,7 +99,7 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
     return out
 
 
-FREEDOM = 3.0
+STUDENT_FREEDOM = 3.0
 """Degrees of freedom of Student's distribution of the errors."""
 
 _COARSE_PX = 1.0
@@ -197,13 +197,13 @@ def _weights(residual: Array, off_px: Array, errors: Errors, spread_px: Array, c
     rest = residual - off_px[errors.edge]
     if coarse_px > 0.0:
         return 1.0 / (errors.sigma_px**2 + coarse_px**2), np.asarray(1.0 / spread_px**2)
-    weight = (FREEDOM + 1.0) / (FREEDOM * errors.sigma_px**2 + rest**2)
-    return weight, (FREEDOM + 1.0) / (FREEDOM * spread_px**2 + off_px**2)
+    weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.sigma_px**2 + rest**2)
+    return weight, (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * spread_px**2 + off_px**2)
 
 
 def _student(error: Array, scale: Array) -> float:
     """Log of the density over that of an error of zero."""
-    return -0.5 * (FREEDOM + 1.0) * float(np.log1p((error / scale) ** 2 / FREEDOM).sum())
+    return -0.5 * (STUDENT_FREEDOM + 1.0) * float(np.log1p((error / scale) ** 2 / STUDENT_FREEDOM).sum())
 
 
 def _volume(design: Array, weight: Array, spread_weight: Array, motion: Array, priors: Array) -> Array:

@@ -19,13 +19,13 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
 
-PIECES = 5
+EDGE_PIECES = 5
 """Pieces that an edge is divided into."""
 
-SEEN_IN = 1.0 / 3.0
+SEEN_FRAME_SHARE = 1.0 / 3.0
 """Part of the frames in which a piece has to be seen, or an end, and which have to show so much of a finger."""
 
-CONSTANT = 0.5
+TEXTURE_SIGMA_SHARE = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
 
 FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
@@ -59,7 +59,7 @@ class Pooled:
 
 def piece_of(edge: NDArray[np.intp], fraction: Array) -> NDArray[np.intp]:
     """(s,) number of the piece among all pieces of all edges."""
-    return np.asarray(edge * PIECES + np.minimum((fraction * PIECES).astype(np.intp), PIECES - 1))
+    return np.asarray(edge * EDGE_PIECES + np.minimum((fraction * EDGE_PIECES).astype(np.intp), EDGE_PIECES - 1))
 
 
 def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Pooled:
@@ -96,8 +96,8 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
-    numbers = numbers[count >= SEEN_IN * len(frames)]
-    numbers = numbers[~np.isin(gripper.edge_finger[numbers // PIECES], often)]
+    numbers = numbers[count >= SEEN_FRAME_SHARE * len(frames)]
+    numbers = numbers[~np.isin(gripper.edge_finger[numbers // EDGE_PIECES], often)]
     rows = [np.flatnonzero(piece == number) for number in numbers]
 
     def middle(values: Array) -> Array:
@@ -110,7 +110,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         [1.4826 * np.median(np.abs(residual[own] - r)) for own, r in zip(rows, shift_px, strict=True)]
     )
     scatter_px = np.where(size >= 3, scatter_px, own_px)
-    edge = numbers // PIECES
+    edge = numbers // EDGE_PIECES
     xy, across_xy = edge_places(gripper, base, edge, at)
     per_px = other[:, 0]
     evidence = replace(
@@ -119,7 +119,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         fraction=at,
         xy=xy + (shift_px * per_px)[:, None] * across_xy,
         per_px=per_px,
-        sigma_px=np.hypot(1.25 * scatter_px / np.sqrt(size), CONSTANT * own_px),
+        sigma_px=np.hypot(1.25 * scatter_px / np.sqrt(size), TEXTURE_SIGMA_SHARE * own_px),
         spread_px=other[:, 1],
         blur_px2=other[:, 2],
         across=other[:, 3:],
@@ -131,13 +131,13 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
 def _share(frames: Sequence[EdgeEvidence]) -> Array:
     """(f,) what the shares reach in as many of the frames as a piece has to be seen in; NaN without such frames."""
     shares = np.sort(np.nan_to_num([frame.finger_share for frame in frames], nan=-1.0), axis=0)
-    reached = shares[-math.ceil(SEEN_IN * len(frames))]
+    reached = shares[-math.ceil(SEEN_FRAME_SHARE * len(frames))]
     return np.where(reached >= 0.0, reached, np.nan)
 
 
 def _often(flags: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """(p,) what holds in as many of the frames as a piece has to be seen in."""
-    return np.asarray(np.mean(flags, axis=0) >= SEEN_IN)
+    return np.asarray(np.mean(flags, axis=0) >= SEEN_FRAME_SHARE)
 
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
@@ -218,7 +218,7 @@ class Baseline:
 
     @classmethod
     def of(cls, pooled: Pooled, motion: Array, residual_px: Array, edges: int) -> Baseline:
-        bias_px, sigma_px = np.full(edges * PIECES, np.nan), np.full(edges * PIECES, np.nan)
+        bias_px, sigma_px = np.full(edges * EDGE_PIECES, np.nan), np.full(edges * EDGE_PIECES, np.nan)
         bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
         then = pooled.evidence
         image = pooled.ends, pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
@@ -239,9 +239,9 @@ class Baseline:
     def bias_of(self, piece: NDArray[np.intp]) -> tuple[Array, Array]:
         """(s,) bias and its standard deviation in px; of a piece that wasn't seen that of its edge, else zero."""
         bias_px, sigma_px = self.bias_px[piece], self.sigma_px[piece]
-        by_edge = self.bias_px.reshape(-1, PIECES)
+        by_edge = self.bias_px.reshape(-1, EDGE_PIECES)
         for k in np.flatnonzero(~np.isfinite(bias_px)):
-            own = by_edge[piece[k] // PIECES]
+            own = by_edge[piece[k] // EDGE_PIECES]
             own = own[np.isfinite(own)]
             bias_px[k], sigma_px[k] = (float(np.median(own)), 0.0) if len(own) else (0.0, 0.0)
         return bias_px, sigma_px

@@ -20,7 +20,7 @@ LEARNT, NEWEST = 20, 5
 CHANGED_PX, CHANGED = 0.25, 0.3
 """By how much the blur must differ, px, and part of the usual one."""
 
-FEWER = 0.8
+FINGER_MISSING_RATIO = 0.8
 """Part of the usual share of a finger's profiles that agree, below which the finger may be elsewhere."""
 
 
@@ -86,7 +86,7 @@ class FingerWatch:
         fewer = False
         for known, share in zip(self._shares, shares, strict=True):
             now = known.add(share)
-            fewer |= known.usual is not None and now < FEWER * known.usual
+            fewer |= known.usual is not None and now < FINGER_MISSING_RATIO * known.usual
         return fewer
 
 

@@ -17,7 +17,7 @@ from gripmon.model.records import Array
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
-ROUNDS = 30
+JACOBI_SWEEPS = 30
 """Sweeps of Jacobi's rotations, of which some six suffice: each squares what is left."""
 
 
@@ -302,7 +302,7 @@ def _exceeding(matrix: Array, vectors: Array, out: Array) -> None:
     vectors[:] = 0.0
     for i in range(6):
         vectors[i, i] = 1.0
-    for _ in range(ROUNDS):
+    for _ in range(JACOBI_SWEEPS):
         rest, whole = 0.0, 0.0
         for i in range(6):
             whole += matrix[i, i] * matrix[i, i]

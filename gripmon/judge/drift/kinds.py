@@ -23,10 +23,10 @@ FEWEST_BLOCKS = 6
 LASTING_BLOCKS = 3
 """Blocks that must have come after a step."""
 
-BETTER = 0.6
+EXPLAINED_SQUARES_RATIO = 0.6
 """A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
 
-SIGNIFICANT = 4.0
+SIGNIFICANT_SIGMAS = 4.0
 """Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero, and a
 first shift from the reference on some axis is more than the reference's error.
 """
@@ -73,7 +73,7 @@ class History:
         along = means @ towards
         step, _ = _best_step(along)
         ramp, onset = _best_ramp(along, times_s)
-        if ramp > BETTER * step:
+        if ramp > EXPLAINED_SQUARES_RATIO * step:
             return None
         moving = slice(max(onset, count - 4 * FEWEST_BLOCKS), None)
         velocity = _slopes(times_s[moving], means[moving], along[moving], towards)
@@ -88,7 +88,7 @@ class History:
         step, before = _best_step(along)
         # Of a creep that has just begun the first block is a step, too.
         lasts = count - 1 - before >= LASTING_BLOCKS
-        return lasts and step <= BETTER * _best_ramp(along, np.array(self._times_s))[0]
+        return lasts and step <= EXPLAINED_SQUARES_RATIO * _best_ramp(along, np.array(self._times_s))[0]
 
 
 def goes_on(values: Array) -> bool:
@@ -140,7 +140,7 @@ def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array
     slope = float(t @ along) / spread
     residual = along - along.mean() - slope * t
     sigma = math.sqrt(float(residual @ residual) / (len(t) - 2) / spread)
-    return (t @ means) / spread if abs(slope) > SIGNIFICANT * sigma else None
+    return (t @ means) / spread if abs(slope) > SIGNIFICANT_SIGMAS * sigma else None
 
 
 KEPT_FRAMES = 128
@@ -151,11 +151,11 @@ LOOK_FRAMES = 32
 
 PARTS = 4
 
-TIMES = 6.0
+VIBRATION_VARIANCE_RATIO = 6.0
 """Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
 
 
-STILL_THERE = 0.5
+VIBRATION_RELEASE_RATIO = 0.5
 """Part of what it takes to find a vibration from which one that was found goes on."""
 
 
@@ -196,7 +196,7 @@ class VibrationWatch:
             learnt = usual()[:3, :3]
             if self._found is None:
                 self._before = learnt.copy()
-            self._found = self._look(self._before, learnt, 1.0 if self._found is None else STILL_THERE)
+            self._found = self._look(self._before, learnt, 1.0 if self._found is None else VIBRATION_RELEASE_RATIO)
         return self._found
 
     def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
@@ -206,9 +206,9 @@ class VibrationWatch:
         direction = _loudest(np.einsum("pni,pnj->ij", parts, parts) / KEPT_FRAMES, usual)
         loud = sorted(np.square(parts @ direction).mean(axis=1).tolist())
         expected = float(direction @ usual @ direction)
-        if loud[1] < ease * TIMES * expected:
+        if loud[1] < ease * VIBRATION_VARIANCE_RATIO * expected:
             return None
-        self._learnt = loud[1] < TIMES * float(direction @ learnt @ direction)
+        self._learnt = loud[1] < VIBRATION_VARIANCE_RATIO * float(direction @ learnt @ direction)
         # A part may hold less than a period: the size is that about a line through all of them.
         along = _about_its_line(shifts) @ direction
         excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected

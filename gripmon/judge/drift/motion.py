@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT, History, VibrationWatch, goes_on
+from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT_SIGMAS, History, VibrationWatch, goes_on
 from gripmon.judge.drift.sequential import SequentialTest
 from gripmon.judge.drift.settings import DriftSettings
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
@@ -28,7 +28,7 @@ class Baseline:
         """``reference_sigma`` (6,): standard deviations of the reference's error, m and rad.  ``error`` (6,) if it is
         known from before.
         """
-        self._allowed = SIGNIFICANT * reference_sigma
+        self._allowed = SIGNIFICANT_SIGMAS * reference_sigma
         self._frames = frames
         self._first: list[Array] = []
         self.error = error
@@ -64,7 +64,7 @@ USUAL_SQUARE = 12.6
 the camera counts as back, so that between this and the test's threshold an alert stays.
 """
 
-SUSPICIOUS = 0.4
+EVIDENCE_LOOK_RATIO = 0.4
 """Part of the threshold from which the evidence is looked at more closely, before it is decided."""
 
 VIBRATING_FRAMES = 256
@@ -72,7 +72,7 @@ VIBRATING_FRAMES = 256
 twice as many the mean tells whether the camera is back.
 """
 
-BEYOND_VIBRATION = 4.0
+VIBRATION_STEP_RATIO = 4.0
 """Times a vibration's root mean square by which two frames must be off to be a step nevertheless: a sinusoid swings by
 1.4 to either side.
 """
@@ -160,7 +160,7 @@ class MotionWatch:
             step_frames=length if at_once else 0,
             creep=self._creep,
             vibration=self._vibrates,
-            suspicious=bool(finding.excess[0] > SUSPICIOUS),
+            suspicious=bool(finding.excess[0] > EVIDENCE_LOOK_RATIO),
         )
         return self._last
 
@@ -185,7 +185,7 @@ class MotionWatch:
         frames = min(int(self.test.windows.frames[0]), VIBRATING_FRAMES)
         middle = self._level(frames)[0] if frames > 1 else np.zeros(6)
         off_m = min(float(np.linalg.norm((each - middle)[:3])) for each in (shift, self._newest[-1]))
-        return 1 if off_m > BEYOND_VIBRATION * self._vibrates.rms_m else VIBRATING_FRAMES
+        return 1 if off_m > VIBRATION_STEP_RATIO * self._vibrates.rms_m else VIBRATING_FRAMES
 
     def _goes_on(self, length: int) -> bool:
         """Whether the frames about a difference between windows of ``length`` frames show a creep, not a step."""

@@ -24,7 +24,7 @@ from gripmon.judge.drift.statistics import (
     ARITHMETIC,
     BLOCK_FRAMES,
     COUNT,
-    LARGEST,
+    LARGEST_SQUARE,
     LENGTHS,
     RARE,
     ByArithmetic,
@@ -59,18 +59,18 @@ heavier, tails has this much of the logarithm of its inflation at least and at m
 SURGE_FRAMES, SURGE_WINDOWS = 32, 16
 """Differences over the last frames, or windows, that are larger than learnt count as noise."""
 
-MARGIN = 1.55
+THRESHOLD_MARGIN = 1.55
 """Factor on the threshold: biases have heavier tails than normal ones, too, and change by more than theory has it (on
 streams simulated after images the contract needed 1.2 to 1.5).
 """
 
-SHORT = 9
+SHORT_LENGTHS = 9
 """Lengths, 1 to 256 frames, whose limits are learnt: of longer windows a stream shows too few."""
 
 ALIKE_FRAMES = 512.0
 """Frames over which a background stays, at least, and bursts come and go: their extremes count as one together."""
 
-FAR = 2.0
+OUTLIER_LIMIT_RATIO = 2.0
 """Times its limit beyond which a difference is no noise, and raises no limit.  What is nearer may be either."""
 
 EXTREME_FRAMES = 2
@@ -83,7 +83,7 @@ REPORTED_MEMORY = 1.0 / 64.0
 
 _LENGTHS = np.array(LENGTHS)
 
-WORTH = 0.25
+SEARCH_THRESHOLD_RATIO = 0.25
 """Part of its threshold from which a statistic is worth the search for the shift that may be tolerated."""
 
 
@@ -124,14 +124,14 @@ class SequentialTest(ByArithmetic):
         self._seen_last: tuple[Array, Array, Array, np.ndarray | None] | None = None
         self._threshold = 1.0
         self._inflation: Array | None = None
-        self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
+        self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT_LENGTHS], ALIKE_FRAMES), (2, 1)), streams)
         self._of_extremes: tuple[float, np.ndarray, Array] | None = None
         self._limit = np.full((2, len(LENGTHS), streams), np.inf)
         self._known = np.zeros(self._limit.shape, dtype=bool)
         self._middle: Array = np.zeros((streams, 6))
         lengths, each = len(LENGTHS), (streams, 6, 6)
         self._to_reported, self._from_reported = np.zeros((2, *each))
-        self._plain, self._whitening = np.zeros((2, SHORT, *each)), np.zeros((2, lengths, *each))
+        self._plain, self._whitening = np.zeros((2, SHORT_LENGTHS, *each)), np.zeros((2, lengths, *each))
         self._mean_covariance, self._learnt_whitening = np.zeros((2, lengths, *each))
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
@@ -173,7 +173,7 @@ class SequentialTest(ByArithmetic):
             self.windows.keep(self._seen < 3, 0)
         beyond, found = by.decide(
             mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
-            self._tolerated, WORTH, SWEEPS, LENGTHS.index(at_least),
+            self._tolerated, SEARCH_THRESHOLD_RATIO, SWEEPS, LENGTHS.index(at_least),
         )  # fmt: skip
         self._seen_last = mean, difference, beyond, learn
         return Finding(*found)
@@ -184,7 +184,7 @@ class SequentialTest(ByArithmetic):
             return
         (mean, difference, beyond, learn), self._seen_last = self._seen_last, None
         if self._frames % EXTREME_FRAMES == 0:
-            usable = np.stack(self.windows.full()) & (beyond[1] <= FAR).all(axis=0)
+            usable = np.stack(self.windows.full()) & (beyond[1] <= OUTLIER_LIMIT_RATIO).all(axis=0)
             self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
         if self._frames % LEARNING_FRAMES == 0:
             # An offset that stays says nothing against what differences show.
@@ -236,7 +236,7 @@ class SequentialTest(ByArithmetic):
     def _learn_surge(self, normalised: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
         rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * COUNT), 0.0)
-        self._surge += rate * (np.minimum(normalised / 6.0, LARGEST) - self._surge)
+        self._surge += rate * (np.minimum(normalised / 6.0, LARGEST_SQUARE) - self._surge)
 
     def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
         """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
@@ -249,12 +249,12 @@ class SequentialTest(ByArithmetic):
     def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
         """Means about that of the longest window: an offset that stays is no noise, and a creep is hardly any."""
         squares = self._by.extremes(
-            mean, difference, self._middle, self._plain, self._limit, self._known, FAR
+            mean, difference, self._middle, self._plain, self._limit, self._known, OUTLIER_LIMIT_RATIO
         )  # fmt: skip
-        usable = usable[:, :SHORT].copy()
+        usable = usable[:, :SHORT_LENGTHS].copy()
         # The longest window was full already when its mean was taken last.
         usable[0] &= self.windows.frames >= LENGTHS[-1] + REFRESH_FRAMES
-        kinds = (2 * SHORT, self._streams)
+        kinds = (2 * SHORT_LENGTHS, self._streams)
         if self._extremes.add(squares.reshape(kinds), usable.reshape(kinds), EXTREME_FRAMES):
             self._stale = True
             self._learnt_limits()  # what the next frame's refresh wants, so that no frame pays for both
@@ -297,18 +297,20 @@ class SequentialTest(ByArithmetic):
         learnt = self._learnt_limits()
         limit = np.full((2, len(LENGTHS), self._streams), self._threshold)
         known = np.zeros(limit.shape, dtype=bool)
-        known[:, :SHORT] = np.isfinite(learnt)
-        limit[:, :SHORT] = np.where(known[:, :SHORT], learnt, self._threshold)
+        known[:, :SHORT_LENGTHS] = np.isfinite(learnt)
+        limit[:, :SHORT_LENGTHS] = np.where(known[:, :SHORT_LENGTHS], learnt, self._threshold)
         return limit, known
 
     def _learnt_limits(self) -> Array:
-        """(2, SHORT, s) by the extremes of the blocks so far; infinite where too few are known."""
+        """(2, SHORT_LENGTHS, s) by the extremes of the blocks so far; infinite where too few are known."""
         chance, blocks = self._settings.false_alarms_per_day / (86_400.0 * self._frames_per_s), self._extremes.blocks
         if self._of_extremes is None or self._of_extremes[0] != chance or self._of_extremes[1] is not blocks:
-            learnt = self._extremes.limits(min(chance * BLOCK_FRAMES / (2 * SHORT), 0.1)).reshape(2, SHORT, -1)
-            seen = np.clip(chance * BLOCK_FRAMES * blocks.reshape(2, SHORT, -1)[1], 1e-12, 0.5)
+            learnt = self._extremes.limits(min(chance * BLOCK_FRAMES / (2 * SHORT_LENGTHS), 0.1)).reshape(
+                2, SHORT_LENGTHS, -1
+            )
+            seen = np.clip(chance * BLOCK_FRAMES * blocks.reshape(2, SHORT_LENGTHS, -1)[1], 1e-12, 0.5)
             changes = 6.0 * special.fdtri(6.0, BIAS_FREEDOM, 1.0 - seen)
-            normal = np.full(changes.shape, special.chdtri(6, min(chance / (2 * SHORT), 0.1)))
+            normal = np.full(changes.shape, special.chdtri(6, min(chance / (2 * SHORT_LENGTHS), 0.1)))
             self._of_extremes = chance, blocks, np.maximum(learnt, np.stack([normal, changes]))
         return self._of_extremes[2]
 
@@ -324,7 +326,7 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
     chance = false_alarms_per_day / (86_400.0 * frames_per_s * 2 * len(LENGTHS))
     freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * COUNT**FREEDOM_GROWTH))
     threshold = float(special.chdtri(6, chance))
-    return MARGIN * threshold, np.asarray(special.fdtri(6.0, freedom, 1.0 - chance) * 6.0 / threshold)
+    return THRESHOLD_MARGIN * threshold, np.asarray(special.fdtri(6.0, freedom, 1.0 - chance) * 6.0 / threshold)
 
 
 def warm_up() -> None:

@@ -110,7 +110,7 @@ MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
 
 _MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
 
-LARGEST = 4.0
+LARGEST_SQUARE = 4.0
 """Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
 
 RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
@@ -141,7 +141,8 @@ class Scatter(ByArithmetic):
         """
         share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
         self._by.learn(
-            difference, normalised, usable, self._of_difference, self._windows, share, _MOST_WINDOWS, 6.0 * LARGEST
+            difference, normalised, usable, self._of_difference, self._windows, share, _MOST_WINDOWS,
+            6.0 * LARGEST_SQUARE,
         )  # fmt: skip
 
     @property
@@ -175,7 +176,7 @@ at 60 frames/s, since rare changes of the background must be among them.
 FEWEST_BLOCKS = 32
 """Blocks below which nothing is said: eight of them are in the tail then, and its scale is known to a third."""
 
-UPPER = 0.25
+TAIL_SHARE = 0.25
 """Part of the blocks that is the tail."""
 
 _LEFT_OUT = -1.0  # below the root of any square
@@ -220,7 +221,7 @@ class Extremes:
         enough = self.blocks >= FEWEST_BLOCKS * self._alike
         if not enough.any():
             return np.full(enough.shape, np.inf)
-        tail = (UPPER * self.blocks).astype(np.intp)
+        tail = (TAIL_SHARE * self.blocks).astype(np.intp)
         # Those that are left out come first; only the upper ones need be in order.
         ordered = np.sort(self._ring[..., :count], axis=-1)
         start = np.take_along_axis(ordered, (count - tail - 1).clip(0)[..., None], axis=-1)[..., 0]
@@ -228,5 +229,5 @@ class Extremes:
         scale = np.where(rank <= tail[..., None], ordered, 0.0).sum(axis=-1) / np.maximum(tail, 1) - start
         # An exponential law whose scale is the mean of n values: (1 + x / (n scale))^-n is the chance of the next.
         known = np.maximum(tail / self._alike, 1.0)
-        reach = known * np.expm1(math.log(UPPER / chance) / known)
+        reach = known * np.expm1(math.log(TAIL_SHARE / chance) / known)
         return np.where(enough, np.square(start + scale * reach), np.inf)

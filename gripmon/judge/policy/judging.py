@@ -51,10 +51,10 @@ _MOTION_KINDS = {AlertKind.STEP: "a step", AlertKind.CREEP: "a creep", AlertKind
 
 NO_EXPLANATION = Explanation()
 
-SWINGS = 3.0
+VIBRATION_SIGMAS = 3.0
 """Standard deviations of a vibrating camera's way that are no drift."""
 
-RELIEF = 0.8
+RELEASE_RATIO = 0.8
 """Part of a limit below which what was said to be past it no longer is."""
 
 
@@ -90,7 +90,7 @@ class Evidence:
         if not self.motion.present or self.swing is None:
             return self.motion.present
         # Of whole vectors: a slow beat along one axis belongs to the vibration along another.
-        way, swing = np.square(self.motion.shift), SWINGS**2 * self.swing
+        way, swing = np.square(self.motion.shift), VIBRATION_SIGMAS**2 * self.swing
         return bool(way[:3].sum() > swing[:3].sum() or way[3:].sum() > swing[3:].sum())
 
 
@@ -364,10 +364,10 @@ def _severity(past_warning: float, past_limit: float, before: Alert | None) -> S
     severe until it is clearly less: at a limit's edge noise would be told again and again.
     """
     said = None if before is None else before.severity
-    if past_limit >= (RELIEF if said is Severity.ERROR else 1.0):
+    if past_limit >= (RELEASE_RATIO if said is Severity.ERROR else 1.0):
         return Severity.ERROR
     warned = said in (Severity.WARNING, Severity.ERROR)
-    return Severity.WARNING if past_warning >= (RELIEF if warned else 1.0) else Severity.INFO
+    return Severity.WARNING if past_warning >= (RELEASE_RATIO if warned else 1.0) else Severity.INFO
 
 
 def _motion_text(motion: Motion) -> str:

@@ -18,7 +18,7 @@ STRETCH_PX, EDGE_PX = 0.015, 0.03
 FEWEST_FREE = 3
 """Stretches beyond the unknowns from which their residuals say anything."""
 
-LOST = 1.0
+UNDETERMINED_VARIANCE = 1.0
 """Variance of a pose that isn't determined without one of its edges, m² and rad²."""
 
 WORST_CONDITION = 1e10
@@ -91,21 +91,21 @@ def _about(frame: StillFrame, evidence: EdgeSums, cam_T_grip: Array) -> EdgeSums
 
 def leave_one_out(pooled: PooledEdges) -> Array:
     """Covariance (6, 6) of the pose as the edges show it: by how much it moves when each of them is left out (the
-    jackknife, Tukey 1958).  :data:`LOST` where the others don't determine a pose.
+    jackknife, Tukey 1958).  :data:`UNDETERMINED_VARIANCE` where the others don't determine a pose.
     """
     edges = np.unique(pooled.edge)
     information = pooled.information * np.outer(_SCALE, _SCALE)
     moment = pooled.moment * _SCALE
     total, pull = information.sum(axis=0), moment.sum(axis=0)
     if len(edges) < 2 or not np.linalg.cond(total) < WORST_CONDITION:
-        return np.eye(6) * LOST
+        return np.eye(6) * UNDETERMINED_VARIANCE
     whole = np.linalg.solve(total, pull)
     covariance = np.zeros((6, 6))
     for edge in edges.tolist():
         own = pooled.edge == edge
         rest = total - information[own].sum(axis=0)
         if not np.linalg.cond(rest) < WORST_CONDITION:
-            return np.eye(6) * LOST
+            return np.eye(6) * UNDETERMINED_VARIANCE
         moved = _SCALE * (np.linalg.solve(rest, pull - moment[own].sum(axis=0)) - whole)
         covariance += np.outer(moved, moved)
     return covariance * (len(edges) - 1) / len(edges)

@@ -23,13 +23,13 @@ FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
 COPLANAR_RATIO = 1e-3
 """Corners whose thickness is below this part of their extent count as coplanar."""
 
-AMBIGUITY = 16.0
+AMBIGUITY_SQUARED_ERROR = 16.0
 """Corners can't tell two poses apart whose weighted squared errors differ by less than this: the worse one is less
 likely by a factor of exp(8) at most.
 """
 
 
-SAME = 1.0
+SAME_POSE_SQUARED_DISTANCE = 1.0
 """Squared distance of two refined poses, in units of their covariance, below which they are the same one."""
 
 
@@ -88,14 +88,14 @@ def rivals(every: list[Recalibration], corners: int) -> list[Recalibration]:
     """Those of some :func:`solutions` that n ``corners`` can't tell from the best."""
     squares, freedom = 2 * corners * every[0].weighted_rms ** 2, 2 * corners - 6
     # Where even the best pose fits badly, the corners' covariances are too small and so are differences in their units.
-    largest = squares + AMBIGUITY * max(1.0, squares / freedom)
+    largest = squares + AMBIGUITY_SQUARED_ERROR * max(1.0, squares / freedom)
     return [pose for pose in every if 2 * corners * pose.weighted_rms**2 <= largest]
 
 
 def _apart(one: Recalibration, other: Recalibration) -> bool:
     """Whether two refined poses are not the same minimum."""
     xi = perturbation_between(one.cam_T_grip, other.cam_T_grip)
-    return bool(xi @ np.linalg.solve(one.covariance, xi) > SAME)
+    return bool(xi @ np.linalg.solve(one.covariance, xi) > SAME_POSE_SQUARED_DISTANCE)
 
 
 def coplanar(points_grip_m: Array) -> bool:

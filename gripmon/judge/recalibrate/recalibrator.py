@@ -26,21 +26,29 @@ from gripmon.judge.recalibrate.pnp import (
     solutions,
 )
 from gripmon.judge.recalibrate.settings import RecalibrationSettings
-from gripmon.judge.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
+from gripmon.judge.recalibrate.stills import (
+    OUTLYING_ERROR_SQUARE,
+    Average,
+    MeanCorners,
+    StillFrame,
+    average,
+    larger,
+    mean_corners,
+)
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 
-MOST_OUTLYING = 0.25
+OUTLIER_FRAME_SHARE = 0.25
 """Part of the frames whose pose may lie far from the others' while the camera counts as standing still."""
 
-OUTLIERS = 0.25
+OUTLIER_CORNER_SHARE = 0.25
 """Part of the corners that may be left out because the others contradict them; at least one."""
 
-PATIENCE = 5
+RETRY_FRAMES = 5
 """Frames until what waits for more frames is looked at again."""
 
-UNLIKELY = 0.02
+UNLIKELY_RESIDUALS_RISK = 0.02
 """Chance below which residuals are believed to say that the fingers don't belong together."""
 
 
@@ -124,9 +132,9 @@ class Recalibrator:
     def outcome(self, reference: ReferenceRecord) -> Proposal | Refusal:
         """What the frames say of a new reference in place of the one in force.
 
-        An answer that waits for more frames is given again until :data:`PATIENCE` more have come.
+        An answer that waits for more frames is given again until :data:`RETRY_FRAMES` more have come.
         """
-        if self._waiting is not None and self._waiting[0] == reference.reference_id and self._since < PATIENCE:
+        if self._waiting is not None and self._waiting[0] == reference.reference_id and self._since < RETRY_FRAMES:
             return self._waiting[1]
         answer = self._answer(reference)
         waits = answer.wait and self.frames >= self._settings.frames
@@ -203,17 +211,17 @@ class Recalibrator:
         return asks
 
     def _check_still(self, tracked: Average) -> None:
-        if tracked.outlying > MOST_OUTLYING:
+        if tracked.outlying > OUTLIER_FRAME_SHARE:
             raise _Refused(
                 RefusalReason.NOT_STILL, f"{100 * tracked.outlying:.0f} % of the frames show the gripper elsewhere"
             )
         way_m = float(np.linalg.norm(tracked.way[:3]))
-        if tracked.trend > GATE and way_m > self._settings.sure_sigma_m:
+        if tracked.trend > OUTLYING_ERROR_SQUARE and way_m > self._settings.sure_sigma_m:
             raise _Refused(RefusalReason.NOT_STILL, f"the camera still moves: by {1e3 * way_m:.3f} mm between halves")
 
     def _check_fingers(self, pooled: PooledEdges) -> None:
         chance = fingers_disagree(pooled)
-        if chance is not None and chance < UNLIKELY:
+        if chance is not None and chance < UNLIKELY_RESIDUALS_RISK:
             raise _Refused(
                 RefusalReason.FINGERS,
                 f"the fingers don't show as one gripper (chance {chance:.1g}): one is bent, or the jaw is elsewhere",
@@ -270,7 +278,7 @@ class Recalibrator:
 
     def _agreeing(self, corners: MeanCorners, every: list[Recalibration]) -> tuple[MeanCorners, list[Recalibration]]:
         """Without the corner, or the few, that the others contradict: whichever leaves the smallest residuals."""
-        for _ in range(max(1, int(OUTLIERS * len(corners.corner)))):
+        for _ in range(max(1, int(OUTLIER_CORNER_SHARE * len(corners.corner)))):
             count = len(corners.corner)
             if _rms(every[0], count) <= self._settings.worst_weighted_rms:
                 break
@@ -304,4 +312,4 @@ def _rms(pose: Recalibration, corners: int) -> float:
 def _agree(pose: Recalibration, tracked: Average) -> bool:
     """Whether the corners' pose is the tracked one within both covariances, as if they were independent."""
     difference = perturbation_between(tracked.cam_T_grip, pose.cam_T_grip)
-    return bool(difference @ np.linalg.solve(pose.covariance + tracked.covariance, difference) <= GATE)
+    return bool(difference @ np.linalg.solve(pose.covariance + tracked.covariance, difference) <= OUTLYING_ERROR_SQUARE)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, EdgeSums
 
-LASTING = 0.25
+LASTING_SHARE = 0.25
 """Part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""
 
 NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
@@ -23,13 +23,13 @@ NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
 of neighbours that a few frames can tell.
 """
 
-GATE = 22.46
+OUTLYING_ERROR_SQUARE = 22.46
 """Squared normalised error that six normal errors exceed once in a thousand times (chi-square)."""
 
-OUTLYING = 37.7
+OUTLYING_FRAME_SQUARE = 37.7
 """The same for once in a million times: from there on one frame doesn't belong to the others."""
 
-FIRST = 3
+FIRST_FRAMES = 3
 """First frames, whose claims are taken for those of all if they are larger."""
 
 FEWEST_SEEN = 0.2
@@ -77,14 +77,14 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
     xis = np.array([perturbation_between(middle_T, f.cam_T_grip) for f in frames])
     weights = np.array([np.linalg.inv(f.covariance) for f in frames])
     centre = np.median(xis, axis=0)
-    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > OUTLYING
+    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > OUTLYING_FRAME_SQUARE
     outlying = float(far.mean())
     if np.count_nonzero(~far) >= 4:
         xis, weights = xis[~far], weights[~far]
     claimed = np.linalg.inv(weights.mean(axis=0))
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, xis))
     # What later frames claim to know better, of the jaw's opening say, they have learnt from pictures that err alike.
-    claimed = larger(claimed, np.mean([f.covariance for f in frames[:FIRST]], axis=0))
+    claimed = larger(claimed, np.mean([f.covariance for f in frames[:FIRST_FRAMES]], axis=0))
     scatter = np.cov(xis.T)
     half = len(xis) // 2
     way = xis[-half:].mean(axis=0) - xis[:half].mean(axis=0)
@@ -104,15 +104,15 @@ def averaged_covariance(claimed: Array, values: Array, count: int) -> Array:
     of them, ``values`` (n, m), show.
 
     Along each common axis of what is claimed and of the values' scatter, with v the scatter in units of what is
-    claimed: what doesn't scatter, 1 - v, but at least :data:`LASTING`, stays as it is, and v becomes less as the mean
-    of so many independent values as the values' own likeness from one to the next leaves.
+    claimed: what doesn't scatter, 1 - v, but at least :data:`LASTING_SHARE`, stays as it is, and v becomes less as
+    the mean of so many independent values as the values' own likeness from one to the next leaves.
     """
     factor = np.linalg.cholesky(claimed)
     off = np.linalg.solve(factor, (values - values.mean(axis=0)).T)
     part, axes = np.linalg.eigh(off @ off.T / (len(values) - 1))
     part = np.maximum(part, 0.0)
     alike = np.array([_alike(row) for row in axes.T @ off])
-    left = np.maximum(1.0 - part, LASTING) + part * np.minimum(alike / count, 1.0)
+    left = np.maximum(1.0 - part, LASTING_SHARE) + part * np.minimum(alike / count, 1.0)
     axes = factor @ axes
     return np.asarray((axes * left) @ axes.T)
 
@@ -184,7 +184,7 @@ def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
     # As if each corner had been seen once, and all together: what lasts of their errors is in every frame.
     once = np.sqrt(np.repeat(times, 2))
     claimed = np.linalg.inv(information / np.outer(once, once))
-    left = max(1.0 - part, LASTING) + part * NEIGHBOURS / max(int(times.min(initial=len(frames))), 1)
+    left = max(1.0 - part, LASTING_SHARE) + part * NEIGHBOURS / max(int(times.min(initial=len(frames))), 1)
     points = np.array([f.points_grip_m[corner] for f in frames]) * usable[:, corner, None]
     points_grip_m = points.sum(axis=0) / times[:, None]
     xy = _image(points_grip_m, cam_T_grip) + mean.reshape(-1, 2)

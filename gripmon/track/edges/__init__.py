@@ -1,9 +1,9 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
-from gripmon.track.edges.consensus import prior_information
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, finger_of_ends
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
+from gripmon.track.edges.robust_fit import prior_information
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement, MeasurementSettings
 from gripmon.track.edges.sums import edge_sums

@@ -20,7 +20,7 @@ from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_pro
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settling import Measurement
 
-ALONG_COSINE = 0.87
+PARALLEL_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""
 
 MAJORITY = 0.5
@@ -34,28 +34,28 @@ that makes a corner seen (``corners.neighbourhood_px``).
 PROBES = 10
 """Profiles on it: one each 1.5 px, since neighbours see the same pixels."""
 
-CLEAR = 2
+PROBES_SKIPPED = 2
 """Probes next to a corner that another edge of the finger may run through."""
 
-FROM_THE_CORNER = 3
+PROBES_AT_CORNER = 3
 """Probes next to a corner that all show an edge where it goes on a little: beyond a step on the finger."""
 
-REACH_PX = 4.0
+PROBE_REACH_PX = 4.0
 """How far they reach to both sides, px: the shortest that shows the decline of the edge filter's response."""
 
-NEAR_PX = 1.0
+CONTINUATION_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
 
-CLEAR_OF_CURVE_PX = 2.0 * NEAR_PX
+CLEAR_OF_CURVE_PX = 2.0 * CONTINUATION_PX
 """So far beside a continued side its curve is no continuation of it, with as much again for what it is off by, px."""
 
-AS_STRONG = 0.4
+CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
 
-GOES_ON = 0.5
+CONTINUATION_SHARE = 0.5
 """Share of the probes that must show it: half of them, as for an edge beside a corner."""
 
-SHOWN = 0.5
+TURN_SEEN_SHARE = 0.5
 """Share of the profiles on a stretch of the curve that must agree for a turn to be seen, and over the rest of its side
 that of the side's end: half, as for an edge beside a corner.
 """
@@ -70,7 +70,7 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
     way = points_m[gripper.edge_points[:, 1]] - points_m[gripper.edge_points[:, 0]]
     length = np.linalg.norm(way, axis=1)
     direction = way / length[:, None]
-    near = np.abs(direction @ direction.T) > ALONG_COSINE
+    near = np.abs(direction @ direction.T) > PARALLEL_COSINE
     together = near @ length
     best = int(np.argmax(together))
     if together[best] < MAJORITY * length.sum():
@@ -167,7 +167,7 @@ class FingerEnds:
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
         self.axis, self.along = along_fingers(gripper)
-        self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], ALONG_COSINE)
+        self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
 
@@ -210,7 +210,7 @@ class FingerEnds:
             if places.rounding[number] < 0:
                 usual[0] = consensus.edge_share[places.side[number]]
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
-            measured[number] = seen and (shown >= SHOWN * usual).all()
+            measured[number] = seen and (shown >= TURN_SEEN_SHARE * usual).all()
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
@@ -226,14 +226,14 @@ class FingerEnds:
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
         step = _own_step(measurement)[prediction.layout.edge[probes.sample]]
         of = found.sample // PROBES
-        near = np.abs(found.offset_px) < NEAR_PX
+        near = np.abs(found.offset_px) < CONTINUATION_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
-        strong = near & (np.abs(found.step) > AS_STRONG * np.abs(step[of]))
+        strong = near & (np.abs(found.step) > CONTINUATION_STEP_RATIO * np.abs(step[of]))
         shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
-        goes_on = well_shown[:, CLEAR:].mean(axis=1) > GOES_ON
-        return np.asarray(goes_on | shown[:, :FROM_THE_CORNER].all(axis=1) if strict else goes_on)
+        goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > CONTINUATION_SHARE
+        return np.asarray(goes_on | shown[:, :PROBES_AT_CORNER].all(axis=1) if strict else goes_on)
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
         places, points = self._places, self._gripper.edge_points
@@ -250,7 +250,7 @@ class FingerEnds:
                 here, from_uv_px, way = beyond
                 if places.corner[number] < 0:
                     turns[number] = self._turn(prediction, number, here, from_uv_px)
-                    back = crossing(prediction, turns[number][2], from_uv_px, way, ALONG_COSINE)
+                    back = crossing(prediction, turns[number][2], from_uv_px, way, PARALLEL_COSINE)
                     further += [] if back is None else [(number, back)]
                 place.append(number)
                 sample.append(here)
@@ -269,7 +269,7 @@ class FingerEnds:
             nowhere = np.zeros((0, 3), dtype=np.float32)
             none = np.zeros(0, dtype=np.intp)
             return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool), {})
-        half = round(REACH_PX / STEP_PX)
+        half = round(PROBE_REACH_PX / STEP_PX)
         offsets = np.arange(-half, half + 1) * STEP_PX
         probes = np.concatenate(at)
         maps = probes[:, :, None] + np.concatenate(across)[:, :, None] * offsets

@@ -21,22 +21,22 @@ from gripmon.model.compiled import compiled
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
-from gripmon.track.edges.consensus import Consensus, Prior, agree
 from gripmon.track.edges.ends import FingerEnds
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
-from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
 from gripmon.track.edges.settling import Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
 
-CLEARLY_BETTER = 1.2
+FINGER_ELSEWHERE_RATIO = 1.2
 """Factor by which more profiles of a finger must agree elsewhere than where the gripper as a whole shows."""
 
-SEEN = 0.5
+FINGER_SEEN_SHARE = 0.5
 """Share of a finger's profiles below which it is looked for farther away."""
 
-FOUND = 0.55
+FINGER_FOUND_SHARE = 0.55
 """Share of a finger's profiles that must agree there: other things have a straight edge or two as well."""
 
 WIDE_ZOOMS = (2, 4)
@@ -53,8 +53,8 @@ _FIXED = 1e12  # information of an opening that stays
 class _Place(NamedTuple):
     """A finger's own fit on some votes, and the share of its profiles that agree."""
 
-    votes: Votes
-    fit: Consensus
+    edgels: Edgels
+    fit: RobustFit
     share: float
 
 
@@ -76,9 +76,9 @@ class FingerMeter(Settler):
         without stretches.
         """
         self._zoom_to(measurement.candidates.zoom)
-        votes = self._votes(measurement.candidates, measurement.prediction)
+        edgels = self._votes(measurement.candidates, measurement.prediction)
         places = [
-            self._finger_place(image, measurement, votes, finger, elsewhere)
+            self._finger_place(image, measurement, edgels, finger, elsewhere)
             for finger in range(len(self._gripper.finger_ids))
         ]
         found = [place for place in places if place is not None]
@@ -112,7 +112,7 @@ class FingerMeter(Settler):
         return residual_px
 
     def _finger_place(
-        self, image: Image, measurement: Measurement, votes: Votes, finger: int, elsewhere: tuple[Array, ...]
+        self, image: Image, measurement: Measurement, edgels: Edgels, finger: int, elsewhere: tuple[Array, ...]
     ) -> _Place | None:
         """The finger's best place: where all fingers together show unless another is clearly better; None if none of
         its edges is in view.
@@ -121,8 +121,8 @@ class FingerMeter(Settler):
         poses = [perturbation_between(prediction.cam_T_grip, pose) for pose in elsewhere]
         starts = [joint, *(np.concatenate([xi, np.zeros(len(joint) - 6)]) for xi in poses)]
         starts = [s for s in starts if prediction.moved_px(s) < 2.0 * self._reach_px] or [np.zeros(len(joint))]
-        best = self._best(votes, finger, [*starts, *_shifted(votes, finger_of(self, votes) == finger, starts[-1])])
-        if best is None or best.share >= SEEN:
+        best = self._best(edgels, finger, [*starts, *_shifted(edgels, finger_of(self, edgels) == finger, starts[-1])])
+        if best is None or best.share >= FINGER_SEEN_SHARE:
             return best
         opening_m = prediction.jaw_opening_m
         for zoom in WIDE_ZOOMS:
@@ -130,9 +130,9 @@ class FingerMeter(Settler):
                 continue
             for pose in (measurement.cam_T_grip, *elsewhere):
                 other = self._farther(image, Expected(pose, opening_m, opening_m), zoom, finger)
-                if other is not None and other.share >= max(FOUND, CLEARLY_BETTER * best.share):
+                if other is not None and other.share >= max(FINGER_FOUND_SHARE, FINGER_ELSEWHERE_RATIO * best.share):
                     best = other
-            if best.share >= SEEN:
+            if best.share >= FINGER_SEEN_SHARE:
                 break
         return best
 
@@ -140,16 +140,16 @@ class FingerMeter(Settler):
         """Looked for with a coarser zoom, then measured with the present one."""
         present = self._zoom
         with self._zoomed(zoom):
-            votes = self._look(image, self._predict(self._lay_out(expected), expected))
-            own = finger_of(self, votes) == finger
+            edgels = self._look(image, self._predict(self._lay_out(expected), expected))
+            own = finger_of(self, edgels) == finger
             start = np.zeros(len(self._prior))
-            rough = self._best(votes, finger, [start, *_shifted(votes, own, start)])
+            rough = self._best(edgels, finger, [start, *_shifted(edgels, own, start)])
         if rough is None:
             return None
         there = replace(expected, cam_T_grip=perturb(expected.cam_T_grip, rough.fit.xi[:6]))
         with self._zoomed(present):
-            votes = self._look(image, self._predict(self._lay_out(there), there))
-            return self._best(votes, finger, [start])
+            edgels = self._look(image, self._predict(self._lay_out(there), there))
+            return self._best(edgels, finger, [start])
 
     def _ends_at(
         self, image: Image, measurement: Measurement, places: list[_Place | None]
@@ -172,18 +172,18 @@ class FingerMeter(Settler):
 
         A corner is looked for beside where it is predicted: farther off it is predicted, and its edges are seen, anew.
         """
-        prediction, xi = place.votes.prediction, place.fit.xi
+        prediction, xi = place.edgels.prediction, place.fit.xi
         if prediction.moved_px(xi) > self._settings.relinearise_px:
             opening_m = measurement.jaw_opening_m
             there = self._moved(prediction, xi, Expected(prediction.cam_T_grip, opening_m, opening_m))
             prediction = self._predict(self._lay_out(there), there)
             again = self._best(self._look(image, prediction), finger, [np.zeros(len(self._prior))])
             place = place if again is None else again
-        votes, fit = place.votes, place.fit
-        geometry = CornerGeometry.of(self._gripper, votes.prediction, self._settings.corners)
-        corners = intersect_edges(votes, fit, fit.weight, geometry, self._settings.corners)
+        edgels, fit = place.edgels, place.fit
+        geometry = CornerGeometry.of(self._gripper, edgels.prediction, self._settings.corners)
+        corners = intersect_edges(edgels, fit, fit.weight, geometry, self._settings.corners)
         return replace(
-            measurement, prediction=votes.prediction, candidates=votes.candidates, consensus=fit, corners=corners
+            measurement, prediction=edgels.prediction, candidates=edgels.candidates, consensus=fit, corners=corners
         )
 
     @contextmanager
@@ -194,21 +194,21 @@ class FingerMeter(Settler):
         finally:
             self._zoom = before
 
-    def _best(self, votes: Votes, finger: int, starts: Iterable[Array]) -> _Place | None:
+    def _best(self, edgels: Edgels, finger: int, starts: Iterable[Array]) -> _Place | None:
         """The best fit of one finger from starts (m,), the first unless another is clearly better."""
-        own = finger_of(self, votes)
-        sampled = int(np.count_nonzero(own[votes.prediction.ok] == finger))
+        own = finger_of(self, edgels)
+        sampled = int(np.count_nonzero(own[edgels.prediction.ok] == finger))
         if not sampled:
             return None
-        votes = replace(votes, weight=np.where(own[votes.candidates.sample] == finger, votes.weight, 0.0))
+        edgels = replace(edgels, weight=np.where(own[edgels.candidates.sample] == finger, edgels.weight, 0.0))
         best: _Place | None = None
         for start in starts:
             information = np.full(len(start), _FIXED)
             information[:6] = FINGER_SIGMA**-2
-            fit = agree(votes, Prior(start, information), start, self._settings.consensus)
+            fit = fit_irls(edgels, Prior(start, information), start, self._settings.consensus)
             share = np.count_nonzero(fit.supported) / sampled
-            if best is None or share > CLEARLY_BETTER * best.share:
-                best = _Place(votes, fit, share)
+            if best is None or share > FINGER_ELSEWHERE_RATIO * best.share:
+                best = _Place(edgels, fit, share)
         return best
 
 
@@ -262,15 +262,15 @@ def _cells(image: Image) -> Array:
     return cells if cells.ndim == 2 else cells.mean(axis=2)
 
 
-def finger_of(meter: FingerMeter, votes: Votes) -> NDArray[np.intp]:
+def finger_of(meter: FingerMeter, edgels: Edgels) -> NDArray[np.intp]:
     """(n,) the finger of each profile."""
-    return np.asarray(meter._gripper.edge_finger[votes.prediction.layout.edge])
+    return np.asarray(meter._gripper.edge_finger[edgels.prediction.layout.edge])
 
 
-def _shifted(votes: Votes, own: NDArray[np.bool_], base: Array) -> list[Array]:
+def _shifted(edgels: Edgels, own: NDArray[np.bool_], base: Array) -> list[Array]:
     """The most promising starts that shift a finger, of which the profiles ``own`` (n,) are, in the image."""
-    prediction, candidates = votes.prediction, votes.candidates
-    active = np.flatnonzero((votes.weight > 0.0) & own[candidates.sample])
+    prediction, candidates = edgels.prediction, edgels.candidates
+    active = np.flatnonzero((edgels.weight > 0.0) & own[candidates.sample])
     if not prediction.pixels_per_m > 0.0 or not len(active):
         return []
     reach_px = float(np.abs(candidates.offset_px[active]).max())
@@ -300,13 +300,13 @@ class _Stretches(NamedTuple):
 
     @classmethod
     def of(cls, place: _Place, kernel_px: float) -> _Stretches:
-        votes, prediction, candidates = place.votes, place.votes.prediction, place.votes.candidates
+        edgels, prediction, candidates = place.edgels, place.edgels.prediction, place.edgels.candidates
         index = _points(place)
         sample = candidates.sample[index]
         if not len(sample):
             return _EMPTY
         stretch = np.unique(prediction.layout.stretch[sample], return_inverse=True)[1]
-        weight = votes.weight[index]
+        weight = edgels.weight[index]
         total = np.bincount(stretch, weight)
 
         def mean(values: Array) -> Array:
@@ -323,7 +323,7 @@ class _Stretches(NamedTuple):
             xy=np.column_stack([mean(xy[:, 0]), mean(xy[:, 1])]),
             per_px=mean(prediction.gain[sample]),
             sigma_px=1.0 / np.sqrt(total),
-            spread_px=np.hypot(votes.edge_spread_px, votes.cut_off_px)[edge[first]],
+            spread_px=np.hypot(edgels.edge_spread_px, edgels.cut_off_px)[edge[first]],
             blur_px2=mean(candidates.width_px[index] ** 2) - (candidates.zoom * kernel_px) ** 2,
             across=np.column_stack([mean(normal[:, 0]), mean(normal[:, 1])]),
         )
@@ -343,9 +343,9 @@ _EMPTY = _Stretches(
 
 def _points(place: _Place) -> NDArray[np.intp]:
     """Candidates of a fit on well seen stretches: of two in one profile the heavier counts."""
-    prediction, candidates = place.votes.prediction, place.votes.candidates
+    prediction, candidates = place.edgels.prediction, place.edgels.candidates
     index = np.flatnonzero(place.fit.weight)
-    index = index[np.lexsort((-place.votes.weight[index], candidates.sample[index]))]
+    index = index[np.lexsort((-place.edgels.weight[index], candidates.sample[index]))]
     index = index[np.diff(candidates.sample[index], prepend=-1) > 0]
     number = prediction.layout.stretch
     profiles = np.bincount(number[prediction.ok], minlength=int(number.max(initial=0)) + 1)

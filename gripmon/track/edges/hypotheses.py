@@ -18,8 +18,8 @@ from gripmon.model.geometry import invert, skew
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.track.edges.reduced import (
-    LEVELS,
     ORIENTATIONS,
+    RANK_LEVELS,
     Floats,
     Window,
     against_surroundings,
@@ -28,7 +28,7 @@ from gripmon.track.edges.reduced import (
     gradients,
 )
 
-DENSITY = 0.75
+POINTS_LENGTH_EXPONENT = 0.75
 """Exponent of the length in an edge's number of points: short edges across the fingers tell what long ones don't."""
 
 FEWEST_EDGES = 3
@@ -80,7 +80,7 @@ def outline_points(
         limit = np.array([camera.width_px, camera.height_px]) - 1.0 + margin_px
         near: NDArray[np.bool_] = np.all((uv >= -margin_px) & (uv <= limit), axis=2)
     way_px = np.where(near[:, 1:] & near[:, :-1], np.linalg.norm(np.diff(uv, axis=1), axis=2), 0.0)
-    weight = np.nansum(way_px, axis=1) ** DENSITY
+    weight = np.nansum(way_px, axis=1) ** POINTS_LENGTH_EXPONENT
     counts = np.maximum(np.round(count * weight / max(float(weight.sum()), 1e-9)), 3).astype(int)
     chosen, which = [], []
     for k in np.flatnonzero(weight > 0.0).tolist():
@@ -197,10 +197,10 @@ class _Table(NamedTuple):
     @classmethod
     def of(cls, values: Floats) -> _Table:
         if not values.size:
-            return cls(np.zeros(LEVELS, np.float32), 0.0)
+            return cls(np.zeros(RANK_LEVELS, np.float32), 0.0)
         place = int(0.998 * (values.size - 1))
-        per_level = (LEVELS - 1) / (float(np.partition(values, place)[place]) + 1e-12)
-        counts = np.bincount(_levels(values, per_level), minlength=LEVELS)
+        per_level = (RANK_LEVELS - 1) / (float(np.partition(values, place)[place]) + 1e-12)
+        counts = np.bincount(_levels(values, per_level), minlength=RANK_LEVELS)
         return cls(evidence_table(counts.astype(float)), per_level)
 
     def look_up(self, values: Floats) -> Floats:
@@ -208,7 +208,7 @@ class _Table(NamedTuple):
 
 
 def _levels(values: Floats, per_level: float) -> NDArray[np.uint8]:
-    return np.minimum(values * np.float32(per_level), LEVELS - 1).astype(np.uint8)
+    return np.minimum(values * np.float32(per_level), RANK_LEVELS - 1).astype(np.uint8)
 
 
 class ProfileScore:

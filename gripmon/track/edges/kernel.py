@@ -20,15 +20,15 @@ SIZE = 7
 TUKEY = 4.685
 """Width of the biweight in standard deviations that is 95 % efficient for normal errors."""
 
-NARROWING = 0.4
+WIDTH_DECAY = 0.4
 """What is left of the width that covers the start's error, from round to round."""
 
-CONVERGED = 0.04
+CONVERGED_SQUARED_STEP = 0.04
 """Squared step over its covariance, a fifth of a standard deviation, at which the fit ends; what is still to come is
 less.
 """
 
-FARTHEST_PX = 1.0
+LARGEST_SPREAD_PX = 1.0
 """Robust spread (px) beyond which edge points are not believed to show the gripper's edges."""
 
 LARGEST_SPREAD, SMALLEST_SPREAD_PX, FEWEST_SPREAD = 3.0, 0.05, 12
@@ -42,7 +42,7 @@ FEWEST_EDGES = 3
 FEWEST_AGREEING = 5
 """Profiles of an edge that must agree for it to count as seen."""
 
-SMALLEST_SCATTER = 0.1
+SMALLEST_VARIANCE_RATIO = 0.1
 """Points are never taken to be better than by this factor of their variance."""
 
 FEWEST_FREE = 3
@@ -55,9 +55,9 @@ def fit(
     prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float, support_sigmas: float,
     support_share: float,
 ) -> Any:  # fmt: skip
-    """``consensus.agree``: whether it could be solved, then the fields of ``Consensus`` in their order."""
+    """``robust_fit.fit_irls``: whether it could be solved, then the fields of ``RobustFit`` in their order."""
     count = len(start)
-    near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * FARTHEST_PX))
+    near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
     unknowns, wanted, held = np.zeros(SIZE), np.zeros(SIZE), np.ones(SIZE)
     unknowns[:count], wanted[:count], held[:count] = start, mean, prior
     solved, final, information, spread_px, stiffness = _irls(
@@ -111,7 +111,7 @@ def _near(
 def _irls(
     near: Any, edge_spread_px: Any, mean: Any, prior: Any, xi: Any, width: float, rounds: int, start_width_px: float,
 ) -> tuple[bool, Any, Any, float, float]:  # fmt: skip
-    """The rounds of ``consensus.agree``; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
+    """The rounds of ``robust_fit.fit_irls``; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
     solved, weights of the candidates near by, information (SIZE, SIZE), spread and stiffness.
     """
     _, jacobian, offset, sigma, base, edge = near
@@ -119,11 +119,11 @@ def _irls(
     residual, reach, weight, buffer = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     on_edge = np.empty(len(edge_spread_px))
     information, normal, step = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE)
-    spread, spread_px, solved = 1.0, FARTHEST_PX, True
+    spread, spread_px, solved = 1.0, LARGEST_SPREAD_PX, True
     _residuals(jacobian, offset, xi, residual)
     for round_ in range(rounds):
         if round_:
-            width *= NARROWING
+            width *= WIDTH_DECAY
             spread, spread_px = _spread(residual, sigma, start_width_px, buffer)
         # Tukey's biweight; all points of an edge together are worth no more than one with the spread that they share.
         on_edge[:] = 0.0
@@ -166,7 +166,7 @@ def _irls(
             length += step[i] * information[i, i] * step[i]
             xi[i] += step[i]
         _residuals(jacobian, offset, xi, residual)
-        if round_ >= rounds - 3 and length < CONVERGED:
+        if round_ >= rounds - 3 and length < CONVERGED_SQUARED_STEP:
             break
     return solved, weight, information, spread_px, _stiffness(weight, residual, reach)
 
@@ -189,7 +189,7 @@ def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float
             buffer[count] = abs(residual[j])
             count += 1
     if count < FEWEST_SPREAD:
-        return 1.0, FARTHEST_PX
+        return 1.0, LARGEST_SPREAD_PX
     spread_px = 1.4826 * _nth(buffer, count, count // 2)
     count = 0
     for j in range(len(residual)):
@@ -197,7 +197,7 @@ def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float
             buffer[count] = abs(residual[j]) / sigma[j]
             count += 1
     spread = 1.4826 * _nth(buffer, count, count // 2)
-    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), FARTHEST_PX)
+    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), LARGEST_SPREAD_PX)
 
 
 @compiled
@@ -241,7 +241,7 @@ def _judge(
     sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, edges: int, start_width_px: float,
     gate_px: float, support_sigmas: float, support_share: float,
 ) -> tuple[Any, Any, Any, float]:  # fmt: skip
-    """``consensus._judge``: the profiles that agree, each edge's share and whether it is seen, the share of pairs."""
+    """``robust_fit._judge``: the profiles that agree, each edge's share and whether it is seen, the share of pairs."""
     supported = np.zeros(len(edge), np.bool_)
     profiles, agreeing, others = np.zeros(edges), np.zeros(edges), np.zeros(edges)
     reach_px = start_width_px
@@ -315,7 +315,7 @@ def assess(
     first, total, moment, pulls = _stretches(sample, weight, residual_px, jacobian, edge, stretch, worth)
     contradiction = _contradiction(total, moment, unknowns)
     freedom = len(total) - unknowns
-    scatter, shared = max(min(contradiction, 1.0), SMALLEST_SCATTER), 0.0
+    scatter, shared = max(min(contradiction, 1.0), SMALLEST_VARIANCE_RATIO), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / total.sum()
     if len(total):
@@ -448,7 +448,7 @@ def contradictions_without(
         for k in range(len(sample)):
             if edge[sample[k]] == left_out[v]:
                 rest[k] = 0.0
-        near = _near(sample, offset_px, rest, jacobian, edge, start, max(width_px, TUKEY * FARTHEST_PX))
+        near = _near(sample, offset_px, rest, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
         xi = np.zeros(SIZE)
         xi[:count] = start
         solved, final, _, _, _ = _irls(near, edge_spread_px, wanted, held, xi, width_px, rounds, width_px)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
-from gripmon.track.edges.consensus import Consensus
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.robust_fit import RobustFit
 
 
 class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -158,8 +158,8 @@ class Corners:
 
 
 def intersect_edges(
-    votes: Votes,
-    consensus: Consensus,
+    edgels: Edgels,
+    consensus: RobustFit,
     line_weight: Array,
     geometry: CornerGeometry,
     settings: CornerSettings,
@@ -170,7 +170,7 @@ def intersect_edges(
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
     of the corner with ``(right - slope * direction) . shift = offset + slope * along``.
     """
-    candidates, prediction = votes.candidates, votes.prediction
+    candidates, prediction = edgels.candidates, edgels.prediction
     layout, predicted = prediction.layout, prediction.corners
     lines = _fit_lines(
         candidates.sample,
@@ -180,8 +180,8 @@ def intersect_edges(
         prediction.along,
         layout.edges,
         layout.first,
-        votes.edge_spread_px,
-        votes.cut_off_px,
+        edgels.edge_spread_px,
+        edgels.cut_off_px,
     )
     fault, rests, xy, uv_px, covariance_xy, sigma_px = _intersect(
         lines,

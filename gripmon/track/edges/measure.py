@@ -16,26 +16,26 @@ from numpy.typing import NDArray
 
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.consensus import (
-    Consensus,
-    agree,
-    agree_from_grid,
-    grid_of_starts,
-)
 from gripmon.track.edges.ends import FingerEndsSeen
 from gripmon.track.edges.evidence import FingerMeter
 from gripmon.track.edges.look import unevenness
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
+from gripmon.track.edges.robust_fit import (
+    RobustFit,
+    fit_irls,
+    fit_irls_from_grid,
+    grid_of_starts,
+)
 from gripmon.track.edges.search import search_poses
 from gripmon.track.edges.settling import ZOOMS, Effort, Expected, Measurement
 
-FOUND_EDGES = 0.85
+FOUND_EDGE_SHARE = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""
 
-LOOKS_LIKE_IT = (0.35, 0.7)
+EVEN_SIDES = (0.35, 0.7)
 """Unevenness of the edges' calmer sides up to which a smaller part suffices, and that part."""
 
-LOOKS_OTHERWISE = 0.6
+UNEVEN_SIDES = 0.6
 """Unevenness from which all edges must be seen: neither side of them is of one shade."""
 
 FITTED_AGAIN, SETTLED = 4, 2
@@ -44,13 +44,13 @@ FITTED_AGAIN, SETTLED = 4, 2
 PROMISING, NEARLY_AS_GOOD = 0.8, 0.9
 """What places must show in a rough fit to be followed: parts of the share to beat, and of the best one's."""
 
-SATISFIED = 0.65
+SATISFYING_SHARE_RATIO = 0.65
 """Part of the usual share below which the gripper may be elsewhere."""
 
-TRUSTED = 0.4
+TRUSTED_SHARE_RATIO = 0.4
 """Part of the usual share below which a fit is not believed, whatever the settings allow."""
 
-CLEARLY_BETTER = 1.3
+ELSEWHERE_SHARE_RATIO = 1.3
 """Factor by which the share elsewhere must exceed a trusted one where the gripper was expected."""
 
 
@@ -129,7 +129,7 @@ class FingertipMeter(FingerMeter):
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         expected = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
-        satisfied = SATISFIED * usual_share
+        satisfied = SATISFYING_SHARE_RATIO * usual_share
         if self._gripper.has_jaw and not jaw_reported:
             best = self._from_openings(image, expected, satisfied, best)
         if best.consensus.share < satisfied:
@@ -171,8 +171,8 @@ class FingertipMeter(FingerMeter):
         """The best of the places farther away, if one is better than the expected one."""
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true, and such a place is not given up for one that isn't believed.
-        beat = (CLEARLY_BETTER if best.trusted else 1.0) * best.consensus.share
-        least = max(self._settings.consensus.found_share, TRUSTED * usual_share)
+        beat = (ELSEWHERE_SHARE_RATIO if best.trusted else 1.0) * best.consensus.share
+        least = max(self._settings.consensus.found_share, TRUSTED_SHARE_RATIO * usual_share)
         for effort in (Effort.GRID, Effort.SEARCH) if at_once else (Effort.SEARCH,):
             enough = PROMISING * max(beat, least)
             if effort is Effort.GRID:
@@ -188,7 +188,7 @@ class FingertipMeter(FingerMeter):
                     continue
                 if other.consensus.share > beat and other.trusted >= best.trusted:
                     best, beat = other, other.consensus.share
-            if best.trusted and best.consensus.share >= SATISFIED * usual_share:
+            if best.trusted and best.consensus.share >= SATISFYING_SHARE_RATIO * usual_share:
                 break
         return best
 
@@ -218,7 +218,7 @@ class FingertipMeter(FingerMeter):
         others = [zoom for zoom in ZOOMS if zoom != chosen]
         for zoom in others[self._lost % len(others) :][:1] if self._lost else others:
             self._zoom_to(zoom)
-            beat = CLEARLY_BETTER * best.consensus.share
+            beat = ELSEWHERE_SHARE_RATIO * best.consensus.share
             least = PROMISING * max(beat, self._settings.consensus.trusted_share)
             if self._rough_share(image, expected) < least:
                 continue
@@ -236,14 +236,14 @@ class FingertipMeter(FingerMeter):
     def _trusted(self, image: Image, measurement: Measurement, usual_share: float) -> bool:
         consensus, share = self._settings.consensus, measurement.consensus.share
         if measurement.effort is Effort.NARROW:
-            return share >= max(consensus.trusted_share, TRUSTED * usual_share)
-        if share < max(consensus.found_share, TRUSTED * usual_share):
+            return share >= max(consensus.trusted_share, TRUSTED_SHARE_RATIO * usual_share)
+        if share < max(consensus.found_share, TRUSTED_SHARE_RATIO * usual_share):
             return False
         # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
-        uneven, part = unevenness(image, measurement.prediction), FOUND_EDGES
-        if uneven <= LOOKS_LIKE_IT[0]:
-            part = LOOKS_LIKE_IT[1]
-        elif uneven >= LOOKS_OTHERWISE:
+        uneven, part = unevenness(image, measurement.prediction), FOUND_EDGE_SHARE
+        if uneven <= EVEN_SIDES[0]:
+            part = EVEN_SIDES[1]
+        elif uneven >= UNEVEN_SIDES:
             part = 1.0
         return bool(_seen_part(measurement.consensus, measurement.prediction) >= part)
 
@@ -271,8 +271,8 @@ class FingertipMeter(FingerMeter):
                 break
             there = replace(expected, jaw_opening_m=opening_m)
             seen = self._predict(prediction.layout, there)
-            votes, prior = self._look(image, seen), self._prior_about(seen, there)
-            fit = agree_from_grid(votes, prior, starts, self._settings.consensus, refine=len(starts))
+            edgels, prior = self._look(image, seen), self._prior_about(seen, there)
+            fit = fit_irls_from_grid(edgels, prior, starts, self._settings.consensus, refine=len(starts))
             if _completeness(fit, seen) > _completeness(best.consensus, best.prediction):
                 other = self._settle(image, self._moved(seen, fit.xi, there))
                 best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
@@ -298,7 +298,7 @@ class FingertipMeter(FingerMeter):
         settings = self._settings.consensus
         starts = grid_of_starts(prediction, self._reach_px, settings.start_width_px)
         prior = self._prior_about(prediction, expected)
-        fit = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
+        fit = fit_irls_from_grid(self._look(image, prediction), prior, starts + start, settings)
         return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
 
     def _fitted_again(self, image: Image, places: list[_Place], least_share: float) -> Sequence[Expected]:
@@ -325,7 +325,7 @@ class FingertipMeter(FingerMeter):
             return _Place(0.0, expected)
         prior = self._prior_about(prediction, expected)
         start = np.zeros(len(self._prior))
-        fit = agree(self._look(image, prediction), prior, start, self._settings.consensus)
+        fit = fit_irls(self._look(image, prediction), prior, start, self._settings.consensus)
         return _Place(fit.share, self._moved(prediction, fit.xi, expected))
 
     def _rough_share(self, image: Image, expected: Expected) -> float:
@@ -334,7 +334,7 @@ class FingertipMeter(FingerMeter):
         if not prediction.ok.any():
             return 0.0
         prior = self._prior_about(prediction, expected)
-        return agree(self._look(image, prediction), prior, start, self._settings.consensus).share
+        return fit_irls(self._look(image, prediction), prior, start, self._settings.consensus).share
 
 
 def _best(places: list[_Place], count: int = FITTED_AGAIN) -> list[_Place]:
@@ -348,15 +348,15 @@ def _promising(places: list[_Place], least: float) -> list[_Place]:
 
 
 def _shows_nearly_all(measurement: Measurement) -> bool:
-    return _seen_part(measurement.consensus, measurement.prediction) >= FOUND_EDGES
+    return _seen_part(measurement.consensus, measurement.prediction) >= FOUND_EDGE_SHARE
 
 
-def _seen_part(consensus: Consensus, prediction: Prediction) -> float:
+def _seen_part(consensus: RobustFit, prediction: Prediction) -> float:
     """Part of the sampled edges that are seen."""
     edges = prediction.layout.edges
     return np.count_nonzero(consensus.edge_seen[edges]) / max(len(edges), 1)
 
 
-def _completeness(consensus: Consensus, prediction: Prediction) -> float:
+def _completeness(consensus: RobustFit, prediction: Prediction) -> float:
     """At a wrong opening one finger can agree alone: what agrees counts by how many edges it is spread over."""
     return consensus.share * _seen_part(consensus, prediction)

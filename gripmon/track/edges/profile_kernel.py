@@ -27,10 +27,10 @@ SHARPNESS = -0.75
 BEYOND_PX = 3.0
 """So far outside the image everything is the border's pixel."""
 
-FLAT = 1e-6
+FLAT_PEAK_CURVATURE = 1e-6
 """Curvature of a peak over its height below which rounding alone makes it one."""
 
-CUT_OFF = 0.998
+SATURATION_SHARE = 0.998
 """Share of an image's range from which grey levels count as cut off: 254.5 of 255."""
 
 SURELY, HARDLY = 1.1, 1.6
@@ -38,7 +38,7 @@ SURELY, HARDLY = 1.1, 1.6
 its height or less gets there within the first, one that just reaches it not before the second.
 """
 
-SPREAD = 0.58
+SATURATION_SHIFT_WIDTHS = 0.58
 """Root mean square shift in widths of the edge response, if anything from none to a whole one is equally likely: a step
 of twice to five times the visible height is found 0.5 to 1 of them too far on the dark side.
 """
@@ -250,7 +250,7 @@ def find_candidates(
             if not (centre > left and centre >= right and centre > threshold):
                 continue
             curvature = (centre - left) + (centre - right)
-            if not curvature > FLAT * centre:
+            if not curvature > FLAT_PEAK_CURVATURE * centre:
                 continue
             # A blurred step answers with a Gaussian, whose logarithm is a parabola.
             log_left, log_right = math.log(max(left / centre, 1e-3)), math.log(max(right / centre, 1e-3))
@@ -263,7 +263,7 @@ def find_candidates(
             found[1, k] = response[c]
             found[2, k] = max(peak_noise / centre, step_px * unrest / curvature)
             found[3, k] = step_px * width
-            found[4, k] = _doubt(profiles, n, place, bright, width, CUT_OFF * full_scale)
+            found[4, k] = _doubt(profiles, n, place, bright, width, SATURATION_SHARE * full_scale)
             k += 1
     return (
         sample[:k].copy(),
@@ -318,7 +318,7 @@ def worth(
     sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
     point_floor_px: float, edge_floor_px: float,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
-    """What ``consensus.Votes`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
+    """What ``profiles.Edgels`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
     count, edges = len(sample), len(bevel_px)
     weight = np.empty(count)
     energy, cut_off_energy = np.zeros(edges), np.zeros(edges)
@@ -332,5 +332,5 @@ def worth(
     spread_px, cut_off_px = np.empty(edges), np.empty(edges)
     for e in range(edges):
         spread_px[e] = math.hypot(bevel_px[e], edge_floor_px * usual_px)
-        cut_off_px[e] = usual_px * SPREAD * cut_off_energy[e] / max(energy[e], 1e-12)
+        cut_off_px[e] = usual_px * SATURATION_SHIFT_WIDTHS * cut_off_energy[e] / max(energy[e], 1e-12)
     return weight, spread_px, cut_off_px

@@ -20,11 +20,19 @@ from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array, Image
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profile_kernel import BEYOND_PX, BLUE, FLAT, GREEN, RED, SHARPNESS, SPREAD
+from gripmon.track.edges.profile_kernel import (
+    BEYOND_PX,
+    BLUE,
+    FLAT_PEAK_CURVATURE,
+    GREEN,
+    RED,
+    SATURATION_SHIFT_WIDTHS,
+    SHARPNESS,
+)
 from gripmon.track.edges.saturation import doubt
 
 if TYPE_CHECKING:
-    from gripmon.track.edges.consensus import ConsensusSettings
+    from gripmon.track.edges.robust_fit import RobustFitSettings
 
 GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
 """Luma weights of ITU-R BT.601 in OpenCV's channel order."""
@@ -233,7 +241,7 @@ def find_candidates_with_numpy(
     curved = (middle - left) + (middle - right)
     peak = (middle > left) & (middle >= right) & (middle > _threshold(kernel, noise, grey_range, settings))
     # A flat top is no peak of anything but rounding.
-    peak &= (curved > FLAT * middle) & ok[:, None]
+    peak &= (curved > FLAT_PEAK_CURVATURE * middle) & ok[:, None]
     sample, column = np.nonzero(peak)
     left, centre, right, curvature = left[peak], middle[peak], right[peak], curved[peak]
     # A blurred step answers with a Gaussian, whose logarithm is a parabola.
@@ -295,7 +303,7 @@ def low_third_difference(profiles: Array) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Votes:
+class Edgels:
     """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
     ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
 
@@ -311,9 +319,9 @@ class Votes:
 
 
 def weigh(
-    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
-) -> Votes:
-    """The candidates as votes; ``polarity`` (e,) belongs to the gripper's edges."""
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: RobustFitSettings
+) -> Edgels:
+    """The candidates with their weights; ``polarity`` (e,) belongs to the gripper's edges."""
     if not COMPILES:
         return weigh_with_numpy(candidates, prediction, polarity, settings)
     worth = profile_kernel.worth(
@@ -328,16 +336,16 @@ def weigh(
         settings.point_floor_px,
         settings.edge_floor_px,
     )
-    return Votes(candidates, prediction, *worth)
+    return Edgels(candidates, prediction, *worth)
 
 
 def weigh_with_numpy(
-    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
-) -> Votes:
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: RobustFitSettings
+) -> Edgels:
     """:func:`weigh` where nothing compiles, and what the compiled one is held against."""
     # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
     width_px = max(median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
-    return Votes(
+    return Edgels(
         candidates,
         prediction,
         base_weights(candidates, prediction, polarity, settings),
@@ -347,7 +355,7 @@ def weigh_with_numpy(
 
 
 def base_weights(
-    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: ConsensusSettings
+    candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: RobustFitSettings
 ) -> Array:
     """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees."""
     edge = prediction.layout.edge[candidates.sample]
@@ -364,7 +372,7 @@ def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
     # High steps are the outline's, low ones texture beside it.
     energy = candidates.step**2
     total = np.bincount(edge, energy, edges)
-    return SPREAD * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
+    return SATURATION_SHIFT_WIDTHS * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
 
 
 def usual_width_px(candidates: Candidates, weight: Array) -> tuple[int, float]:

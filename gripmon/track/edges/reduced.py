@@ -29,22 +29,22 @@ ORIENTATIONS = 16
 HALF_LENGTH = 4
 """Cells to both sides over which strengths are averaged along an edge: texture cancels, straight edges don't."""
 
-HIDDEN = 0.3
+HIDDEN_PROBABILITY = 0.3
 """Probability that an edge of the gripper doesn't show at a place: hidden, or of too little contrast."""
 
-RARITY = 0.35
+RANK_EXPONENT = 0.35
 """Exponent of the distribution of an edge's rank where it shows: median at the strongest 14 % of all places."""
 
 SMALLEST_RANK = 0.004
 """Strengths rarer than this count alike."""
 
-SIDE = 3
+BESIDE_CELLS = 3
 """Cells from an outline to where its sides are looked at."""
 
-QUIET = 0.1
+QUIET_GRADIENT_SHARE = 0.1
 """Changes smaller than this part of the image's strong ones, the strongest 5 %, are none."""
 
-LEVELS = 256
+RANK_LEVELS = 256
 """Steps in which values are ranked."""
 
 _NODE = 8  # cells between places at which the lens is reckoned
@@ -132,11 +132,11 @@ def evidence_table(counts: Array) -> Floats:
     probability on such an edge over that anywhere, with mean zero.
 
     The rank of a place's strength, the share of the image that is stronger, is uniform anywhere; on an edge that
-    shows it is distributed as Beta(``RARITY``, 1), on one that doesn't as anywhere.
+    shows it is distributed as Beta(``RANK_EXPONENT``, 1), on one that doesn't as anywhere.
     """
     total = max(float(counts.sum()), 1.0)
     rank = np.maximum((np.cumsum(counts[::-1])[::-1] - 0.5 * counts) / total, SMALLEST_RANK)
-    table = np.log(HIDDEN + (1.0 - HIDDEN) * RARITY * rank ** (RARITY - 1.0))
+    table = np.log(HIDDEN_PROBABILITY + (1.0 - HIDDEN_PROBABILITY) * RANK_EXPONENT * rank ** (RANK_EXPONENT - 1.0))
     return np.asarray(table - (table @ counts) / total, dtype=np.float32)
 
 
@@ -146,7 +146,7 @@ def calmness(gx: Floats, gy: Floats, seen: NDArray[np.bool_]) -> Floats:
     """
     strength = np.hypot(gx, gy)
     some = strength[::2, ::2][seen[::2, ::2]]
-    least = QUIET * float(np.quantile(some, 0.95)) if some.size else 0.0
+    least = QUIET_GRADIENT_SHARE * float(np.quantile(some, 0.95)) if some.size else 0.0
     return np.asarray(1.0 / np.maximum(cv2.blur(strength, (3, 3)), least + 1e-12), dtype=np.float32)
 
 
@@ -164,7 +164,9 @@ def evidence_maps(grey: Floats, seen: NDArray[np.bool_]) -> Floats:
         angle = math.pi * k / ORIENTATIONS
         c, s = math.cos(angle), math.sin(angle)
         maps[k] = cv2.dilate(np.abs(cv2.filter2D(c * gx + s * gy, -1, _line_kernel(angle))), block)
-        calmer[k] = np.maximum(*(_moved(calm, round(sign * SIDE * c), round(sign * SIDE * s)) for sign in (1, -1)))
+        calmer[k] = np.maximum(
+            *(_moved(calm, round(sign * BESIDE_CELLS * c), round(sign * BESIDE_CELLS * s)) for sign in (1, -1))
+        )
     maps *= against_surroundings(maps.mean(axis=0), seen)
     _add_evidence(maps, calmer, seen)
     maps *= seen
@@ -187,14 +189,14 @@ def _add_evidence(maps: Floats, calmer: Floats, seen: NDArray[np.bool_]) -> None
     levels = [_levels(values) for values in (maps, calmer)]
     for k in range(ORIENTATIONS):
         for which, level in enumerate(levels):
-            counts = cv2.calcHist([level[k]], [0], mask, [LEVELS], [0, LEVELS]).ravel().astype(float)
+            counts = cv2.calcHist([level[k]], [0], mask, [RANK_LEVELS], [0, RANK_LEVELS]).ravel().astype(float)
             found = cv2.LUT(level[k], evidence_table(counts))
             maps[k] = maps[k] + found if which else found
 
 
 def _levels(values: Floats) -> NDArray[np.uint8]:
     top = float(np.quantile(values[:, ::3, ::3], 0.998)) + 1e-12
-    return np.minimum(values * ((LEVELS - 1) / top), LEVELS - 1).astype(np.uint8)
+    return np.minimum(values * ((RANK_LEVELS - 1) / top), RANK_LEVELS - 1).astype(np.uint8)
 
 
 @lru_cache(maxsize=ORIENTATIONS)

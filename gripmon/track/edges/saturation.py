@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.track.edges.profile_kernel import CUT_OFF, HARDLY, SURELY
+from gripmon.track.edges.profile_kernel import HARDLY, SATURATION_SHARE, SURELY
 
 
 def doubt(
@@ -28,7 +28,7 @@ def doubt(
     its response in samples, and on which ``side`` (-1, 1) it is bright.
     """
     out = np.zeros(len(sample))
-    level = CUT_OFF * end
+    level = SATURATION_SHARE * end
     if not (profiles >= level).any():
         return out
     last = profiles.shape[1] - 1

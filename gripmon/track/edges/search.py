@@ -30,30 +30,30 @@ from gripmon.track.edges.hypotheses import (
     project,
     rotations,
 )
-from gripmon.track.edges.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
+from gripmon.track.edges.reduced import BESIDE_CELLS, ORIENTATIONS, Floats, Window, evidence_maps, rectify, window_about
 
 POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""
 
-TICK = 3.0
+STEP_CELLS = 3.0
 """Step of turn and scale: so many cells of motion at the farthest outline point."""
 
-PLACES = 64
+FOLLOWED_PLACES = 64
 """Best places of the votes that are followed."""
 
-POLISHED = 24
+POLISHED_PLACES = 24
 """Of these, how many are polished."""
 
-SHAKES = ((24, 2.5, 1.0), (12, 1.25, 0.5))
+PERTURBATION_ROUNDS = ((24, 2.5, 1.0), (12, 1.25, 0.5))
 """Rounds of perturbations: how many of each place, by how many cells, and by which part of the searched tilt."""
 
-FINER = 2
+POLISHING_ZOOM = 2
 """Resolution of the image for polishing over that for voting."""
 
 POLISH_REACH, POLISH_ROUNDS = 4, 4
 """Cells beside the outlines that are looked at when polishing, at first; steps."""
 
-APART = 2.0
+DISTINCT_CELLS = 2.0
 """Poses whose outlines differ by less than so many (finer) cells are one."""
 
 
@@ -119,14 +119,16 @@ def search_poses(
     maps = evidence_maps(*rectify(image, camera, window))
     poses = place.voted(maps, window)
     score = MapScore(points, window, maps)
-    for count, cells, part in SHAKES:
+    for count, cells, part in PERTURBATION_ROUNDS:
         poses, scores = score.shaken(poses, place.shakes(count, cells * window.pitch, part), place.middle_m)
-    poses = poses.take(np.array(apart(poses, points, window, scores, 0.5 * APART / FINER, POLISHED)))
-    finer = window.finer(FINER)
+    poses = poses.take(
+        np.array(apart(poses, points, window, scores, 0.5 * DISTINCT_CELLS / POLISHING_ZOOM, POLISHED_PLACES))
+    )
+    finer = window.finer(POLISHING_ZOOM)
     points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS)
-    profiles = ProfileScore(points, finer, *rectify(image, camera, finer), FINER * SIDE)
+    profiles = ProfileScore(points, finer, *rectify(image, camera, finer), POLISHING_ZOOM * BESIDE_CELLS)
     poses = profiles.polished(poses, POLISH_REACH, POLISH_ROUNDS, place.sigma)
-    best = apart(poses, points, finer, profiles.score(poses), APART, settings.starts)
+    best = apart(poses, points, finer, profiles.score(poses), DISTINCT_CELLS, settings.starts)
     return poses.take(np.array(best)).matrices()
 
 
@@ -162,7 +164,7 @@ class _Place:
         orientation = orientation_of(seen)[0] * (math.pi / ORIENTATIONS)
         reach = math.ceil(self.reach_m / self.depth_m / window.pitch)
         padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
-        tick = TICK * window.pitch / self._spread
+        tick = STEP_CELLS * window.pitch / self._spread
         found: list[tuple[float, float, float, Array]] = []
         for turn in _ticks(settings.turn_rad, tick):
             c, s = math.cos(turn), math.sin(turn)
@@ -173,7 +175,7 @@ class _Place:
                 votes = _votes(padded, index, column, row, reach)
                 found += [(score, turn, scale, shift) for score, shift in _peaks(votes, 2)]
         found.sort(key=lambda item: -item[0])
-        return self._poses(found[:PLACES], window)
+        return self._poses(found[:FOLLOWED_PLACES], window)
 
     def _poses(self, found: list[tuple[float, float, float, Array]], window: Window) -> Poses:
         turns, scales = np.array([item[1] for item in found]), np.array([item[2] for item in found])

@@ -16,21 +16,12 @@ from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.consensus import (
-    AGAIN_PX,
-    Consensus,
-    ConsensusSettings,
-    Prior,
-    agree,
-    agree_on_seen,
-    prior_information,
-)
 from gripmon.track.edges.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
 from gripmon.track.edges.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import (
     Candidates,
+    Edgels,
     EdgeSettings,
-    Votes,
     estimate_noise,
     find_candidates,
     full_scale,
@@ -40,9 +31,18 @@ from gripmon.track.edges.profiles import (
     usual_width_px,
     weigh,
 )
+from gripmon.track.edges.robust_fit import (
+    RESTART_WIDTH_PX,
+    Prior,
+    RobustFit,
+    RobustFitSettings,
+    fit_irls,
+    prior_information,
+    refit_visible,
+)
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.taught import TaughtEdges
-from gripmon.track.edges.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
+from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, NormalEquations, Uncertainty, assess, without_one_edge
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""
@@ -65,7 +65,7 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
     sampling: SamplingSettings = SamplingSettings()
     edges: EdgeSettings = EdgeSettings()
-    consensus: ConsensusSettings = ConsensusSettings()
+    consensus: RobustFitSettings = RobustFitSettings()
     corners: CornerSettings = CornerSettings()
     search: SearchSettings = SearchSettings()
     relinearise_px: Annotated[
@@ -99,7 +99,7 @@ class Measurement:
 
     prediction: Prediction
     candidates: Candidates
-    consensus: Consensus
+    consensus: RobustFit
     corners: Corners
     cam_T_grip: Array
     jaw_opening_m: float
@@ -205,12 +205,12 @@ class Settler:
         settings, moved = self._settings, None
         for _ in range(3):
             prediction, start = self._predicted(expected)
-            votes = self._look(image, prediction)
+            edgels = self._look(image, prediction)
             prior = self._prior_about(prediction, expected)
-            consensus = agree(votes, prior, start, settings.consensus)
+            consensus = fit_irls(edgels, prior, start, settings.consensus)
             if expected.held_T is not None:
                 free = self._prior_about(prediction, replace(expected, held_T=None))
-                consensus = agree(votes, free, consensus.xi, settings.consensus, AGAIN_PX)
+                consensus = fit_irls(edgels, free, consensus.xi, settings.consensus, RESTART_WIDTH_PX)
             moved_px = prediction.moved_px(consensus.xi)
             if moved_px > 2.0 * self._reach_px:
                 # Nothing was seen out there: the few points that agree don't determine the motion.
@@ -222,19 +222,19 @@ class Settler:
                 break
         if expected.held_T is not None:
             prior = self._prior_about(prediction, replace(expected, held_T=None))
-        votes, consensus = agree_on_seen(votes, prior, consensus, settings.consensus)
-        uncertainty = self._assess(votes, consensus)
-        if uncertainty.contradiction > CONTRADICTION and consensus.share > 0.0:
-            found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
+        edgels, consensus = refit_visible(edgels, prior, consensus, settings.consensus)
+        uncertainty = self._assess(edgels, consensus)
+        if uncertainty.contradiction > CONTRADICTION_RATIO and consensus.share > 0.0:
+            found = without_one_edge(edgels, prior, start, settings.consensus, uncertainty.contradiction)
             if found is not None:
-                votes, consensus, uncertainty = found
+                edgels, consensus, uncertainty = found
         if consensus is not moved:
             expected = self._moved(prediction, consensus.xi, expected)
         geometry = self._geometry_of(prediction)
-        corners = intersect_edges(votes, consensus, uncertainty.line_weight, geometry, settings.corners)
+        corners = intersect_edges(edgels, consensus, uncertainty.line_weight, geometry, settings.corners)
         return Measurement(
             prediction,
-            votes.candidates,
+            edgels.candidates,
             consensus,
             corners,
             expected.cam_T_grip,
@@ -246,7 +246,7 @@ class Settler:
             uncertainty.normal,
             expected.jaw_reported_m,
             float(self._prior[6] ** -0.5) if len(self._prior) == 7 else 0.0,
-            self._blur_px(votes.candidates, consensus.weight),
+            self._blur_px(edgels.candidates, consensus.weight),
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:
@@ -321,18 +321,18 @@ class Settler:
         points_grip_m = self._gripper.points_grip_m(expected.jaw_opening_m)[self._gripper.corner_points]
         return self._camera.project(points_grip_m @ expected.cam_T_grip[:3, :3].T + expected.cam_T_grip[:3, 3])
 
-    def _look(self, image: Image, prediction: Prediction) -> Votes:
+    def _look(self, image: Image, prediction: Prediction) -> Edgels:
         settings = self._settings
         profiles = read_profiles(image, prediction.map_x, prediction.map_y)
         noise = estimate_noise(profiles, quantum(image))
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges, self._zoom)
         return self._votes(candidates, prediction)
 
-    def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
+    def _votes(self, candidates: Candidates, prediction: Prediction) -> Edgels:
         return weigh(candidates, prediction, self._polarity, self._settings.consensus)
 
-    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
-        return assess(votes, consensus, self._prior)
+    def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
+        return assess(edgels, consensus, self._prior)
 
     def _jaw_surprise(self, xi: Array, prior: Prior) -> float:
         """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a

@@ -11,19 +11,19 @@ from scipy.linalg.lapack import dposv
 from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
 from gripmon.track.edges import kernel
-from gripmon.track.edges.consensus import (
+from gripmon.track.edges.kernel import FEWEST_FREE, SMALLEST_VARIANCE_RATIO
+from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.robust_fit import (
     NOT_SOLVED,
     ROUNDS,
-    Consensus,
-    ConsensusSettings,
     Prior,
-    agree,
-    agree_with_numpy,
+    RobustFit,
+    RobustFitSettings,
+    fit_irls,
+    fit_irls_with_numpy,
 )
-from gripmon.track.edges.kernel import FEWEST_FREE, SMALLEST_SCATTER
-from gripmon.track.edges.profiles import Votes
 
-CONTRADICTION = 3.0
+CONTRADICTION_RATIO = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
 
 _EXPLAINED = 1.0 / 3.0
@@ -60,7 +60,7 @@ class Uncertainty:
 
 
 def assess(
-    votes: Votes, consensus: Consensus, prior_information: Array, expected_shared_px: float = 0.0
+    edgels: Edgels, consensus: RobustFit, prior_information: Array, expected_shared_px: float = 0.0
 ) -> Uncertainty:
     """Covariance of a fit whose points err together.
 
@@ -78,19 +78,19 @@ def assess(
     which is given in px, has to be multiplied by k.  ``expected_shared_px``: at least this much of tau is assumed.
     """
     if not COMPILES:
-        return assess_with_numpy(votes, consensus, prior_information, expected_shared_px)
-    layout = votes.prediction.layout
+        return assess_with_numpy(edgels, consensus, prior_information, expected_shared_px)
+    layout = edgels.prediction.layout
     solved, (covariance, line_weight, shared_px, contradiction), normal = kernel.assess(
-        votes.candidates.sample,
+        edgels.candidates.sample,
         consensus.weight,
         consensus.residual_px,
         consensus.information,
         consensus.stiffness,
-        votes.prediction.jacobian,
+        edgels.prediction.jacobian,
         layout.edge,
         layout.stretch,
-        votes.edge_spread_px,
-        votes.cut_off_px,
+        edgels.edge_spread_px,
+        edgels.cut_off_px,
         prior_information,
         expected_shared_px,
     )
@@ -100,7 +100,7 @@ def assess(
 
 
 def assess_with_numpy(
-    votes: Votes, consensus: Consensus, prior_information: Array, expected_shared_px: float = 0.0
+    edgels: Edgels, consensus: RobustFit, prior_information: Array, expected_shared_px: float = 0.0
 ) -> Uncertainty:
     """:func:`assess` where nothing compiles, and what the compiled one is held against."""
     inlier = np.flatnonzero(consensus.weight)
@@ -116,11 +116,11 @@ def assess_with_numpy(
             np.zeros(0, dtype=np.intp), np.zeros((0, unknowns)), *np.zeros((2, 0, unknowns, unknowns))
         )
         return Uncertainty(0.5 * (inverse + inverse.T), np.zeros(len(consensus.weight)), 0.0, 1.0, nothing)
-    prediction = votes.prediction
-    sample, weight = votes.candidates.sample[inlier], consensus.weight[inlier]
+    prediction = edgels.prediction
+    sample, weight = edgels.candidates.sample[inlier], consensus.weight[inlier]
     edge, stretch = prediction.layout.edge[sample], prediction.layout.stretch[sample]
     # The weights were limited for what an edge's points share; this undoes it.
-    worth = 1.0 - votes.edge_spread_px**2 * np.bincount(edge, weight, len(votes.edge_spread_px))
+    worth = 1.0 - edgels.edge_spread_px**2 * np.bincount(edge, weight, len(edgels.edge_spread_px))
     alone = weight / worth[edge]
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     total = np.add.reduceat(alone, first)
@@ -128,7 +128,7 @@ def assess_with_numpy(
     moment = np.add.reduceat(alone * residual_px, first)
     freedom = len(total) - unknowns
     contradiction = _contradiction(total, moment, freedom)
-    scatter, shared = max(min(contradiction, 1.0), SMALLEST_SCATTER), 0.0
+    scatter, shared = max(min(contradiction, 1.0), SMALLEST_VARIANCE_RATIO), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
     shared = max(shared, (stiffness * expected_shared_px) ** 2)
@@ -142,7 +142,7 @@ def assess_with_numpy(
     # Sums over each edge: of points, of stretches, and of the edge as a whole.
     information = np.add.reduceat(weighted[:, None] * jacobian, at_edge, axis=2).transpose(2, 0, 1)
     by_stretch = np.add.reduceat(pulls[:, None] * pulls, begin, axis=2).transpose(2, 0, 1)
-    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)
+    spread_px = np.hypot(edgels.edge_spread_px, edgels.cut_off_px)
     whole = (np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[seen])).T
     middles = scatter * worth[seen][:, None, None] * information + shared * by_stretch
     middles += whole[:, :, None] * whole[:, None, :]
@@ -169,8 +169,8 @@ def _contradiction(total: Array, moment: Array, freedom: int) -> float:
 
 
 def without_one_edge(
-    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, contradiction: float
-) -> tuple[Votes, Consensus, Uncertainty] | None:
+    edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings, contradiction: float
+) -> tuple[Edgels, RobustFit, Uncertainty] | None:
     """The fit, from ``start`` (m,), without the one edge of the gripper that contradicts all others; None if no single
     edge explains the ``contradiction``.
 
@@ -178,26 +178,26 @@ def without_one_edge(
     towards that, a little at each of its other edges, which are too many to be outliers.
     """
     without = contradictions_without if COMPILES else contradictions_without_with_numpy
-    stays = without(votes, prior, start, settings)
+    stays = without(edgels, prior, start, settings)
     if not len(stays) or not stays.min() < _EXPLAINED * contradiction:
         return None
-    rest = _without(votes, int(votes.prediction.layout.edges[stays.argmin()]))
-    consensus = agree(rest, prior, start, settings)
+    rest = _without(edgels, int(edgels.prediction.layout.edges[stays.argmin()]))
+    consensus = fit_irls(rest, prior, start, settings)
     return rest, consensus, assess(rest, consensus, prior.information)
 
 
-def contradictions_without(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Array:
+def contradictions_without(edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings) -> Array:
     """(v,) the contradiction that stays in the fit from ``start`` (m,) without each of the sampled edges."""
-    candidates, prediction = votes.candidates, votes.prediction
+    candidates, prediction = edgels.candidates, edgels.prediction
     stays: Array = kernel.contradictions_without(
         prediction.layout.edges,
         candidates.sample,
         candidates.offset_px,
-        votes.weight,
+        edgels.weight,
         prediction.jacobian,
         prediction.layout.edge,
         prediction.layout.stretch,
-        votes.edge_spread_px,
+        edgels.edge_spread_px,
         prior.mean,
         prior.information,
         start,
@@ -209,15 +209,15 @@ def contradictions_without(votes: Votes, prior: Prior, start: Array, settings: C
     return stays
 
 
-def contradictions_without_with_numpy(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Array:
+def contradictions_without_with_numpy(edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings) -> Array:
     """:func:`contradictions_without` where nothing compiles, and what the compiled one is held against."""
     fits = []
-    for left_out in votes.prediction.layout.edges.tolist():
-        rest = _without(votes, left_out)
-        fits.append(assess_with_numpy(rest, agree_with_numpy(rest, prior, start, settings), prior.information))
+    for left_out in edgels.prediction.layout.edges.tolist():
+        rest = _without(edgels, left_out)
+        fits.append(assess_with_numpy(rest, fit_irls_with_numpy(rest, prior, start, settings), prior.information))
     return np.array([fit.contradiction for fit in fits])
 
 
-def _without(votes: Votes, left_out: int) -> Votes:
-    edge = votes.prediction.layout.edge[votes.candidates.sample]
-    return replace(votes, weight=np.where(edge == left_out, 0.0, votes.weight))
+def _without(edgels: Edgels, left_out: int) -> Edgels:
+    edge = edgels.prediction.layout.edge[edgels.candidates.sample]
+    return replace(edgels, weight=np.where(edge == left_out, 0.0, edgels.weight))

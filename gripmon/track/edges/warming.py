@@ -8,7 +8,6 @@ import numpy as np
 
 from gripmon.model.compiled import COMPILES
 from gripmon.track.edges import prediction_kernel
-from gripmon.track.edges.consensus import ConsensusSettings, Prior, agree
 from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
 from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction, SamplingSettings
@@ -21,6 +20,7 @@ from gripmon.track.edges.profiles import (
     usual_width_px,
     weigh,
 )
+from gripmon.track.edges.robust_fit import Prior, RobustFitSettings, fit_irls
 from gripmon.track.edges.settling import corner_rms
 from gripmon.track.edges.uncertainty import assess, contradictions_without
 
@@ -33,20 +33,20 @@ def warm_up() -> float:
     if not COMPILES:
         return 0.0
     begin_s = time.perf_counter()
-    prediction, settings = _of_one_edge(), ConsensusSettings()
+    prediction, settings = _of_one_edge(), RobustFitSettings()
     for shape in ((9, 9), (9, 9, 3)):
         profiles = read_profiles(np.zeros(shape, dtype=np.uint8), prediction.map_x, prediction.map_y)
     noise = estimate_noise(profiles)
     candidates = find_candidates(profiles, prediction.ok, noise, 255.0, EdgeSettings())
-    votes = weigh(candidates, prediction, np.zeros(1, dtype=np.int8), settings)
+    edgels = weigh(candidates, prediction, np.zeros(1, dtype=np.int8), settings)
     prior, start = Prior(np.zeros(6), np.ones(6)), np.zeros(6)
-    consensus = agree(votes, prior, start, settings)
-    line_weight = assess(votes, consensus, prior.information).line_weight
-    contradictions_without(votes, prior, start, settings)
+    consensus = fit_irls(edgels, prior, start, settings)
+    line_weight = assess(edgels, consensus, prior.information).line_weight
+    contradictions_without(edgels, prior, start, settings)
     nothing = np.zeros(0, dtype=np.intp)
     places = nothing.reshape(0, 4)
     geometry = CornerGeometry(nothing, nothing, nothing, np.zeros((0, 3)), places, np.zeros(1, dtype=np.intp))
-    corners = intersect_edges(votes, consensus, line_weight, geometry, CornerSettings())
+    corners = intersect_edges(edgels, consensus, line_weight, geometry, CornerSettings())
     prediction.moved_px(consensus.xi)
     usual_width_px(candidates, consensus.weight)
     here, edge, points_m = prediction.cam_T_grip, prediction.layout.edge, prediction.corners.cam_m

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 
-EDGE = 1e-2
+WRONG_EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else, a border parallel to it, a pad, a shadow; or
 that the ends of one finger do, together.
 """
 
-GRIPPER = 1e-3
+WRONG_GRIPPER = 1e-3
 """Probability that the gripper isn't as it is said to be: a finger bent, shifted in its holder or exchanged, or the jaw
 opening off by more than the report's standard deviation allows.
 """
@@ -50,16 +50,16 @@ def hypotheses_of(
     whole = np.ones(count)
     rows.append(("nothing is wrong", 1.0, whole, False, False))
     for number, name in enumerate(edge_names):
-        rows.append((f"edge {name} belongs to something else", EDGE, np.arange(count) != number, False, False))
+        rows.append((f"edge {name} belongs to something else", WRONG_EDGE, np.arange(count) != number, False, False))
     for number, name in enumerate(finger_names):
         own = finger == number
         if (own & ~along).sum() > 1:
             what = f"the ends of finger {name} belong to something else"
-            rows.append((what, EDGE, ~(own & ~along), False, False))
+            rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
-            rows.append((f"finger {name} is not where its model says", GRIPPER, ~own, False, True))
+            rows.append((f"finger {name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
     if has_opening:
-        rows.append(("the jaw opening is wrong", GRIPPER, whole, True, False))
+        rows.append(("the jaw opening is wrong", WRONG_GRIPPER, whole, True, False))
     ends = len(rows)
     rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
     names, prior, keep, opening, sudden = zip(*rows, strict=True)

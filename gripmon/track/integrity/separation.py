@@ -26,7 +26,7 @@ from gripmon.model.records import Array
 from gripmon.track.integrity import kernel, plain
 from gripmon.track.integrity.quantiles import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
 
-NEAR = 1.02
+LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
 
 
@@ -171,7 +171,7 @@ class Doubts:
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        of = self.prior, self.away, *self.tails, risk, NEAR
+        of = self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO
         if COMPILES:
             position, rotation, number = kernel.levels(*of, SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP)
         else:

@@ -10,26 +10,26 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 
-AGREES = 0.6
+AGREEING_CORRELATION = 0.6
 """Correlation from which a patch agrees: two that have nothing to do with each other reach it once in a hundred times
 (13 free numbers).
 """
 
-HIDDEN = 0.5
+HIDDEN_PROBABILITY = 0.5
 """Probability that a patch of a finger is hidden, or looks otherwise than learnt, where the finger is: held objects
 often hide half of a finger.
 """
 
-MISSES = (0.02, 0.5)
+MISS_BOUNDS = (0.02, 0.5)
 """Bounds on the probability that a patch doesn't agree where it is and can be seen."""
 
-CHANCES = (0.02, 0.3)
+CHANCE_BOUNDS = (0.02, 0.3)
 """Bounds on the probability that a patch agrees where the finger isn't: below, some hundred slid views are too few to
 tell; above, a patch isn't used.
 """
 
 
-MINORITY = 0.5
+MINORITY_SHARE = 0.5
 """Of the patches that agree at another pose, below which those here are chance: noise, blur and a tenth of a millimetre
 take a few of thirty, a slide of a millimetre left 0 to 8 of them.
 """
@@ -42,9 +42,9 @@ def patch_evidence(hit: Array, chance: Array) -> tuple[Array, Array]:
     ``hit`` (n,): share of frames in which the patch agreed where it was; ``chance`` (n,): share in which it did where
     it wasn't.
     """
-    here = (1.0 - HIDDEN) * np.clip(hit, 1.0 - MISSES[1], 1.0 - MISSES[0])
-    elsewhere = np.clip(chance, *CHANCES)
-    here = here + HIDDEN * elsewhere
+    here = (1.0 - HIDDEN_PROBABILITY) * np.clip(hit, 1.0 - MISS_BOUNDS[1], 1.0 - MISS_BOUNDS[0])
+    elsewhere = np.clip(chance, *CHANCE_BOUNDS)
+    here = here + HIDDEN_PROBABILITY * elsewhere
     return np.log(here / elsewhere), np.log((1.0 - here) / (1.0 - elsewhere))
 
 
@@ -79,4 +79,4 @@ class LookAgreement:
         enough = -math.log(risk)
         best, column = odds.argmax(axis=0), np.arange(odds.shape[1])
         unlikely = (odds[best, column] > enough) & (odds[best, column] - odds[pose] > enough)
-        return bool((unlikely & (agree[pose] < MINORITY * agree[best, column])).any())
+        return bool((unlikely & (agree[pose] < MINORITY_SHARE * agree[best, column])).any())

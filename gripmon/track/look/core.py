@@ -22,8 +22,8 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.records import Array, Image, LookRecord
-from gripmon.track.look.agreement import AGREES, LookAgreement, patch_evidence
-from gripmon.track.look.layout import POINTS, SIDE, Layout, lay_out
+from gripmon.track.look.agreement import AGREEING_CORRELATION, LookAgreement, patch_evidence
+from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
 
 FORGET_S = 4.0 * 3600.0
 """Time after which a frame counts 1/e, s: a shift of work; dirt and wear take hours, lamps and daylight minutes."""
@@ -31,16 +31,16 @@ FORGET_S = 4.0 * 3600.0
 FEWEST_VIEWS = 12
 """Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
 
-ENOUGH_TRIES = 3
+KEPT_SLIDE_TRIES = 3
 """Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
 
 LAY_OUT_AGAIN_S = 60.0
 """Pause before fingers that weren't in view are looked for again, s: it takes as long as some frames."""
 
-CHANGED = 0.5
+CHANGED_BACKGROUND_CORRELATION = 0.5
 """Correlation of a patch beside a finger with the last learnt frame's, below which its background is another one."""
 
-CHANGED_SHARE = 0.33
+CHANGED_BACKGROUND_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
@@ -49,25 +49,25 @@ SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
 ELSEWHERE_M = 2e-3
 """From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
 
-CONSTANT = 0.7
+CONSTANT_PATCH_LENGTH = 0.7
 """Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
 
-TELLS_APART = 0.3
+LARGEST_CHANCE = 0.3
 """A patch that agrees more often than this where the gripper isn't tells nothing."""
 
 KEPT_PATCHES = 16
 """Most telling ones of a finger that poses are compared with: 512 points on two fingers."""
 
-UNLIKE_WEIGHT = 0.125
+DISAGREEING_FRAME_WEIGHT = 0.125
 """Of a frame in which a known patch disagrees, when it is learnt: mostly something hides it, rarely it has changed."""
 
-NOISE_QUANTA = 1.0
+SMALLEST_CONTRAST_LEVELS = 1.0
 """Contrast (root mean square) below which a patch has none, in steps of grey."""
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
 """Brightness of blue, green and red (ITU-R BT.601)."""
 
-_U, _V = np.meshgrid(np.linspace(-1.0, 1.0, SIDE), np.linspace(-1.0, 1.0, SIDE))
+_U, _V = np.meshgrid(np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS), np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS))
 _LIGHT = np.linalg.qr(np.column_stack([np.ones(POINTS), _U.ravel(), _V.ravel()]))[0]
 _TEXTURE = (np.eye(POINTS) - _LIGHT @ _LIGHT.T).astype(np.float32)
 """(POINTS, POINTS), symmetric: takes brightness and both slopes out of a patch."""
@@ -184,7 +184,7 @@ class GripperLook:
             return LookAgreement(np.full(none.shape, np.nan), none, none, np.zeros(none.shape))
         look, inside = self._look(image, poses, jaw_opening_m, self._chosen_points, self._chosen_finger)
         alike = np.einsum("knp,np->kn", look, self._template)
-        agree = (alike > AGREES) & inside
+        agree = (alike > AGREEING_CORRELATION) & inside
         odds = np.where(agree, self._gain, self._loss) * inside
         ends = np.append(self._starts, len(self._chosen))
         out = LookAgreement(
@@ -315,9 +315,9 @@ class GripperLook:
         """
         length = np.linalg.norm(self._mean, axis=1)
         alike = np.einsum("knp,np->kn", look, self._mean) / np.maximum(length, 1e-12)
-        agree = alike > AGREES
-        known = (length > CONSTANT) & (self._weight > FEWEST_VIEWS / 2)
-        weight = np.where(known & ~agree[0], UNLIKE_WEIGHT, 1.0) * inside[0]
+        agree = alike > AGREEING_CORRELATION
+        known = (length > CONSTANT_PATCH_LENGTH) & (self._weight > FEWEST_VIEWS / 2)
+        weight = np.where(known & ~agree[0], DISAGREEING_FRAME_WEIGHT, 1.0) * inside[0]
         self._weight = np.maximum(kept * self._weight, np.minimum(self._weight, FEWEST_VIEWS)) + weight
         share = weight / np.maximum(self._weight, 1e-12)
         self._mean += share[:, None].astype(np.float32) * (look[0] - self._mean)
@@ -325,14 +325,14 @@ class GripperLook:
         if self.views >= len(SLIDES_M):  # before, there is little that a slid image could agree with
             now = slice(pair, pair + 2)
             tried = self._tried[now]
-            self._tried[now] = np.maximum(kept * tried, np.minimum(tried, ENOUGH_TRIES)) + 1.0
+            self._tried[now] = np.maximum(kept * tried, np.minimum(tried, KEPT_SLIDE_TRIES)) + 1.0
             self._chance[now] += (agree[1:] - self._chance[now]) / self._tried[now, None]
 
     def _choose(self) -> None:
         """The patches of each finger that tell most: always the same where they are, and another view elsewhere."""
         length = np.linalg.norm(self._mean, axis=1)
         chance = self._chance[self._far].max(axis=0)
-        tells = (length > CONSTANT) & (chance <= TELLS_APART) & bool((self._tried >= 0.5).all())
+        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= LARGEST_CHANCE) & bool((self._tried >= 0.5).all())
         worth = np.where(tells, length - chance, -np.inf)
         best = []
         for finger in range(len(self._first)):
@@ -355,7 +355,7 @@ def _texture(values: NDArray[np.float32], quantum: float) -> NDArray[np.float32]
     """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero without contrast."""
     texture = values @ _TEXTURE
     length = np.sqrt(np.einsum("np,np->n", texture, texture))
-    shows = length > NOISE_QUANTA * quantum * math.sqrt(POINTS)
+    shows = length > SMALLEST_CONTRAST_LEVELS * quantum * math.sqrt(POINTS)
     np.divide(texture, length[:, None], out=texture, where=shows[:, None])
     texture[~shows] = 0.0
     return texture
@@ -365,4 +365,4 @@ def another_background(now: NDArray[np.float32], before: NDArray[np.float32]) ->
     """Whether enough of the patches beside the fingers (n, POINTS) show something else than before."""
     if not len(now):
         return True  # nothing but the gripper is in view
-    return bool(np.mean(np.einsum("np,np->n", now, before) < CHANGED) > CHANGED_SHARE)
+    return bool(np.mean(np.einsum("np,np->n", now, before) < CHANGED_BACKGROUND_CORRELATION) > CHANGED_BACKGROUND_SHARE)

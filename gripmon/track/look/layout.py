@@ -15,10 +15,10 @@ from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 
-SIDE = 4
+PATCH_SIDE_POINTS = 4
 """Points along a patch's side: a shade, two slopes of light and 13 numbers of texture."""
 
-POINTS = SIDE * SIDE
+POINTS = PATCH_SIDE_POINTS * PATCH_SIDE_POINTS
 
 PITCH_PX = 3.0
 """Between points, px: the lens blurs by 0.6 px (sigma), so that nearer ones tell the same."""
@@ -26,7 +26,7 @@ PITCH_PX = 3.0
 MOST_PATCHES = 96
 """On a finger while it is learnt; the most telling ones are kept."""
 
-MOST_GUARDS = 16
+MOST_BACKGROUND_PATCHES = 16
 """Beside a finger: enough to tell a third of them from a half."""
 
 BORDER_PX = 3
@@ -64,7 +64,7 @@ def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: 
             continue
         uv_px = _patches_in(1 - _dilated(1 - shown, BORDER_PX), MOST_PATCHES)
         u, v = np.rint(uv_px).astype(int).T
-        beside_px = _patches_in(_dilated(shown, BESIDE_PX[1]) & free, MOST_GUARDS)
+        beside_px = _patches_in(_dilated(shown, BESIDE_PX[1]) & free, MOST_BACKGROUND_PATCHES)
         z_m = np.append(depth_m[v, u], np.full(len(beside_px), np.nanmean(depth_m)))
         xy = camera.undistort(np.concatenate([uv_px, beside_px]))
         place = (np.column_stack([xy, np.ones(len(xy))]) * z_m[:, None] - cam_T_grip[:3, 3]) @ cam_T_grip[:3, :3]
@@ -101,8 +101,8 @@ def _dilated(mask: NDArray[np.uint8], radius_px: int) -> NDArray[np.uint8]:
 def _patches_in(mask: NDArray[np.uint8], most: int) -> Array:
     """Points (p * POINTS, 2), px, of patches side by side that lie wholly inside a mask, ``most`` evenly chosen."""
     height, width = mask.shape
-    step = SIDE * PITCH_PX
-    reach = np.arange(SIDE) * PITCH_PX
+    step = PATCH_SIDE_POINTS * PITCH_PX
+    reach = np.arange(PATCH_SIDE_POINTS) * PITCH_PX
     corner = np.stack(np.meshgrid(np.arange(0, width - step, step), np.arange(0, height - step, step)), axis=-1)
     own = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     uv_px = corner.reshape(-1, 1, 2) + own
@@ -155,7 +155,7 @@ def _fill_between_edges(camera: Camera, ends_cam_m: Array, depth_m: Array) -> No
     uv_px = camera.project(along)
     sound = np.isfinite(uv_px).all(axis=1)
     along, uv_px = along[sound], uv_px[sound]
-    if len(along) < SIDE:
+    if len(along) < PATCH_SIDE_POINTS:
         return
     # One over the depth is linear in ideal coordinates on a plane.
     try:

@@ -27,13 +27,13 @@ beside the ends, where what is mistaken for them lies.
 SHORTEST_PX = 16
 """Of a strip that is learnt: four independent points."""
 
-LINES = 3
+STRIP_LINES = 3
 """Side by side behind each end edge: something partly in front of a finger hides some of them."""
 
 SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
 """A tenth of a millimetre must do no harm, and light that falls off along the finger says nothing."""
 
-CLIP = 3.0
+CLIP_RMS = 3.0
 """Root mean squares of what was learnt that a grey level counts at most: a bright thing in front of a finger weighs no
 more than a line on it.
 """
@@ -41,10 +41,10 @@ more than a line on it.
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
-ONE_PLACE_PX = 3
+SMALLEST_SLIDE_PX = 3
 """Slides up to this are none: edges are fitted ten times better, and neighbouring ones look alike."""
 
-EXPLAINED = 0.87
+EXPLAINED_CORRELATION = 0.87
 """Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
 
 FEWEST_FRAMES, MOST_FRAMES = 3, 32
@@ -92,7 +92,7 @@ class FingerStrips:
         if not self.ready:
             return None
         strips = self._read(image, cam_T_grip, jaw_opening_m)
-        most = CLIP * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
+        most = CLIP_RMS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
         np.clip(strips, -most, most, out=strips)
         learnt = np.clip(self._mean, -most, most)
         # Gain and brightness are free: light changes.
@@ -100,11 +100,11 @@ class FingerStrips:
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
         alike = product / np.sqrt(np.maximum(energy, least) * float(np.square(learnt).sum()) + 1e-12)
-        unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED))
+        unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED_CORRELATION))
         here = float(unexplained[REACH_PX])
-        unexplained[REACH_PX - ONE_PLACE_PX : REACH_PX + ONE_PLACE_PX + 1] = 1.0
+        unexplained[REACH_PX - SMALLEST_SLIDE_PX : REACH_PX + SMALLEST_SLIDE_PX + 1] = 1.0
         best = int(np.argmin(unexplained))
-        independent = float(self._within.sum()) / (LINES * INDEPENDENT_PX)
+        independent = float(self._within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         odds = 0.5 * independent * math.log(here / float(unexplained[best]))
         if odds <= math.log(len(unexplained) / risk):
             return None
@@ -192,4 +192,4 @@ class FingerStrips:
         return edges[:, ::-1][edges == point].tolist()
 
 
-_ACROSS = ((np.arange(LINES) + 0.5) / LINES).tolist()
+_ACROSS = ((np.arange(STRIP_LINES) + 0.5) / STRIP_LINES).tolist()

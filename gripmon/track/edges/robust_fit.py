@@ -21,22 +21,22 @@ from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
 from gripmon.track.edges import kernel
 from gripmon.track.edges.kernel import (
-    CONVERGED,
-    FARTHEST_PX,
+    CONVERGED_SQUARED_STEP,
     FEWEST_AGREEING,
     FEWEST_EDGES,
     FEWEST_SPREAD,
     LARGEST_SPREAD,
-    NARROWING,
+    LARGEST_SPREAD_PX,
     SMALLEST_SPREAD_PX,
     SMALLEST_STIFFNESS,
     TUKEY,
+    WIDTH_DECAY,
 )
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Votes
+from gripmon.track.edges.profiles import Edgels
 
 
-class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class RobustFitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How edge candidates agree on one motion."""
 
     start_width_px: Annotated[
@@ -81,7 +81,7 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it (px of the zoomed image)."""
 
-AGAIN_PX = 0.4
+RESTART_WIDTH_PX = 0.4
 """Width of the robust weight at a start that is nearly right, px."""
 
 NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
@@ -101,7 +101,7 @@ class Prior:
 
 
 class Fit(NamedTuple):
-    """Where a robust fit ended, before it is judged; fields as in :class:`Consensus`."""
+    """Where a robust fit ended, before it is judged; fields as in :class:`RobustFit`."""
 
     xi: Array
     weight: Array
@@ -112,7 +112,7 @@ class Fit(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Consensus:
+class RobustFit:
     """The common motion of the edge candidates.
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in
@@ -135,25 +135,25 @@ class Consensus:
     share: float
 
 
-def agree(
-    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
-) -> Consensus:
+def fit_irls(
+    edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings, width_px: float | None = None
+) -> RobustFit:
     """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``width_px`` (if None, from the
     settings' ``start_width_px``) to what each candidate's own standard deviation and the measured scatter allow.
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
     if not COMPILES:
-        return agree_with_numpy(votes, prior, start, settings, width_px)
-    candidates, prediction = votes.candidates, votes.prediction
+        return fit_irls_with_numpy(edgels, prior, start, settings, width_px)
+    candidates, prediction = edgels.candidates, edgels.prediction
     solved, fitted = kernel.fit(
         candidates.sample,
         candidates.offset_px,
-        votes.weight,
+        edgels.weight,
         prediction.jacobian,
         prediction.layout.edge,
         prediction.ok,
-        votes.edge_spread_px,
+        edgels.edge_spread_px,
         prior.mean,
         prior.information,
         start,
@@ -166,22 +166,22 @@ def agree(
     )
     if not solved:
         raise FloatingPointError(NOT_SOLVED)
-    return Consensus(*fitted)
+    return RobustFit(*fitted)
 
 
-def agree_with_numpy(
-    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
-) -> Consensus:
-    """:func:`agree` where nothing compiles, and what the compiled one is held against."""
-    candidates, prediction = votes.candidates, votes.prediction
+def fit_irls_with_numpy(
+    edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings, width_px: float | None = None
+) -> RobustFit:
+    """:func:`fit_irls` where nothing compiles, and what the compiled one is held against."""
+    candidates, prediction = edgels.candidates, edgels.prediction
     width = settings.start_width_px if width_px is None else width_px
-    shared = votes.edge_spread_px**2
-    xi, spread, spread_px = start, 1.0, FARTHEST_PX
-    near = _near(votes, start, max(width, TUKEY * FARTHEST_PX))
+    shared = edgels.edge_spread_px**2
+    xi, spread, spread_px = start, 1.0, LARGEST_SPREAD_PX
+    near = _near(edgels, start, max(width, TUKEY * LARGEST_SPREAD_PX))
     rounds = ROUNDS if width_px is None else _ROUNDS_AGAIN
     for round_ in range(rounds):
         if round_:
-            width *= NARROWING
+            width *= WIDTH_DECAY
             spread, spread_px = _spread(near.residual(xi), near.sigma, settings.start_width_px)
         residual = near.residual(xi)
         reach = np.minimum(np.hypot(width, (TUKEY * spread) * near.sigma), max(width, TUKEY * spread_px))
@@ -191,41 +191,41 @@ def agree_with_numpy(
         weight /= (1.0 + shared * np.bincount(near.edge, weight, len(shared)))[near.edge]
         step, information = _step(near.jacobian, residual, weight, prior.mean - xi, prior.information)
         xi = xi + step
-        if round_ >= rounds - 3 and float(step @ information @ step) < CONVERGED:
+        if round_ >= rounds - 3 and float(step @ information @ step) < CONVERGED_SQUARED_STEP:
             break
     stiffness = _stiffness(weight, near.residual(xi), reach)
     every = np.zeros(len(candidates.sample))
     every[near.place] = weight
     residual = candidates.offset_px - xi @ prediction.jacobian_by_unknown[:, candidates.sample]
-    return _judge(votes, Fit(xi, every, residual, information, spread_px, stiffness), settings)
+    return _judge(edgels, Fit(xi, every, residual, information, spread_px, stiffness), settings)
 
 
-def agree_on_seen(
-    votes: Votes, prior: Prior, consensus: Consensus, settings: ConsensusSettings
-) -> tuple[Votes, Consensus]:
+def refit_visible(
+    edgels: Edgels, prior: Prior, consensus: RobustFit, settings: RobustFitSettings
+) -> tuple[Edgels, RobustFit]:
     """The fit again without the edges that chance supports as well: what lies near them is background."""
-    edges = votes.prediction.layout.edges
+    edges = edgels.prediction.layout.edges
     seen = consensus.edge_seen
     if seen[edges].all() or np.count_nonzero(seen) < FEWEST_EDGES:
-        return votes, consensus
-    edge = votes.prediction.layout.edge[votes.candidates.sample]
-    rest = replace(votes, weight=np.where(seen[edge], votes.weight, 0.0))
-    return rest, agree(rest, prior, consensus.xi, settings, AGAIN_PX)
+        return edgels, consensus
+    edge = edgels.prediction.layout.edge[edgels.candidates.sample]
+    rest = replace(edgels, weight=np.where(seen[edge], edgels.weight, 0.0))
+    return rest, fit_irls(rest, prior, consensus.xi, settings, RESTART_WIDTH_PX)
 
 
-def agree_from_grid(
-    votes: Votes, prior: Prior, starts: Array, settings: ConsensusSettings, refine: int = 6
-) -> Consensus:
+def fit_irls_from_grid(
+    edgels: Edgels, prior: Prior, starts: Array, settings: RobustFitSettings, refine: int = 6
+) -> RobustFit:
     """Best fit from many starts (g, m): all are scored by the candidates near them, the best few refined."""
-    candidates = votes.candidates
-    jacobian = votes.prediction.jacobian[candidates.sample].T
-    active = votes.weight > 0.0
+    candidates = edgels.candidates
+    jacobian = edgels.prediction.jacobian[candidates.sample].T
+    active = edgels.weight > 0.0
     distance = (candidates.offset_px - starts @ jacobian) * (1.0 / settings.start_width_px)
     np.square(distance, out=distance)
     np.subtract(1.0, distance, out=distance)
     np.maximum(distance, 0.0, out=distance)
     best = np.argsort(-(distance @ active.astype(float)), kind="stable")[:refine]
-    return max((agree(votes, prior, starts[i], settings) for i in best), key=lambda fit: fit.share)
+    return max((fit_irls(edgels, prior, starts[i], settings) for i in best), key=lambda fit: fit.share)
 
 
 def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> Array:
@@ -261,13 +261,13 @@ class _Near(NamedTuple):
         return np.asarray(self.offset - xi @ self.jacobian)
 
 
-def _near(votes: Votes, start: Array, reach_px: float) -> _Near:
+def _near(edgels: Edgels, start: Array, reach_px: float) -> _Near:
     """Candidates with a weight within ``reach_px`` of where ``start`` puts the edges."""
-    candidates, prediction = votes.candidates, votes.prediction
+    candidates, prediction = edgels.candidates, edgels.prediction
     moved = prediction.jacobian @ start
     far = np.abs(candidates.offset_px - moved[candidates.sample])
-    index = np.flatnonzero((far < reach_px) & (votes.weight > 0.0))
-    sample, weight = candidates.sample[index], votes.weight[index]
+    index = np.flatnonzero((far < reach_px) & (edgels.weight > 0.0))
+    sample, weight = candidates.sample[index], edgels.weight[index]
     return _Near(
         index,
         prediction.jacobian_by_unknown[:, sample],
@@ -331,20 +331,20 @@ def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
     size = np.abs(residual)
     near = np.flatnonzero(size < np.minimum(width, 4.0 * sigma + 0.3))
     if len(near) < FEWEST_SPREAD:
-        return 1.0, FARTHEST_PX
+        return 1.0, LARGEST_SPREAD_PX
     size = size[near]
     middle = len(size) // 2
     spread_px = 1.4826 * float(np.partition(size, middle)[middle])
     spread = 1.4826 * float(np.partition(size / sigma[near], middle)[middle])
-    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), FARTHEST_PX)
+    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), LARGEST_SPREAD_PX)
 
 
-def _judge(votes: Votes, fit: Fit, settings: ConsensusSettings) -> Consensus:
+def _judge(edgels: Edgels, fit: Fit, settings: RobustFitSettings) -> RobustFit:
     """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate
     anyway.
     """
-    candidates, prediction, residual = votes.candidates, votes.prediction, fit.residual_px
-    active = None if votes.weight.all() else votes.weight > 0.0
+    candidates, prediction, residual = edgels.candidates, edgels.prediction, fit.residual_px
+    active = None if edgels.weight.all() else edgels.weight > 0.0
     edges = len(prediction.line_origin)
     gate_px = GATE_PX * candidates.zoom
     edge_of = prediction.layout.edge
@@ -367,7 +367,7 @@ def _judge(votes: Votes, fit: Fit, settings: ConsensusSettings) -> Consensus:
     if prediction.pairs and np.count_nonzero(seen) >= FEWEST_EDGES:
         agreeing_pairs = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
         believed = int(np.count_nonzero(agreeing_pairs)) / prediction.pairs
-    return Consensus(
+    return RobustFit(
         fit.xi,
         fit.weight,
         residual,

@@ -8,22 +8,22 @@ from support.meters import JAW_SIGMA_M, box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
-from gripmon.track.edges.consensus import (
-    Consensus,
-    ConsensusSettings,
+from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.profiles import Candidates, Edgels, base_weights, profile_offsets_px
+from gripmon.track.edges.robust_fit import (
     Prior,
-    agree,
-    agree_from_grid,
+    RobustFit,
+    RobustFitSettings,
+    fit_irls,
+    fit_irls_from_grid,
     grid_of_starts,
     prior_information,
 )
-from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.track.edges.profiles import Candidates, Votes, base_weights, profile_offsets_px
-from gripmon.track.edges.uncertainty import CONTRADICTION, assess, without_one_edge
+from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, assess, without_one_edge
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()
-SETTINGS = ConsensusSettings()
-NO_FLOORS = ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0)
+SETTINGS = RobustFitSettings()
+NO_FLOORS = RobustFitSettings(point_floor_px=0.005, edge_floor_px=0.0)
 PRIOR = prior_information(JAW_SIGMA_M)
 REACH_PX = 4.25  # candidates are found this far along the profiles
 EDGES = len(GRIPPER.edge_ids)
@@ -77,19 +77,19 @@ def with_clutter(rng: np.random.Generator, missing: float, extra: float, sigma_p
 
 def votes_for(
     found: Candidates,
-    settings: ConsensusSettings = SETTINGS,
+    settings: RobustFitSettings = SETTINGS,
     polarity: np.ndarray = ANY,
     edge_spread_px: np.ndarray | None = None,
-) -> Votes:
+) -> Edgels:
     spread_px = np.full(EDGES, settings.edge_floor_px) if edge_spread_px is None else edge_spread_px
-    return Votes(found, PREDICTION, base_weights(found, PREDICTION, polarity, settings), spread_px, np.zeros(EDGES))
+    return Edgels(found, PREDICTION, base_weights(found, PREDICTION, polarity, settings), spread_px, np.zeros(EDGES))
 
 
-def fit(found: Candidates, settings: ConsensusSettings = SETTINGS, start: np.ndarray | None = None) -> Consensus:
-    return agree(votes_for(found, settings), REPORTED, np.zeros(7) if start is None else start, settings)
+def fit(found: Candidates, settings: RobustFitSettings = SETTINGS, start: np.ndarray | None = None) -> RobustFit:
+    return fit_irls(votes_for(found, settings), REPORTED, np.zeros(7) if start is None else start, settings)
 
 
-def miss_px(consensus: Consensus, xi: np.ndarray = XI) -> float:
+def miss_px(consensus: RobustFit, xi: np.ndarray = XI) -> float:
     """Largest distance between the fitted and the true edges."""
     return float(np.abs(PREDICTION.jacobian @ (consensus.xi - xi)).max())
 
@@ -155,11 +155,11 @@ def test_an_edge_of_the_background_instead_of_one_of_the_gripper_is_noticed(name
     """One edge has no contrast, and the background offers a parallel one.  The others tell: the fit leaves it alone,
     is repeated without it, or its covariance covers the error.
     """
-    votes = votes_for(with_background_edge(GRIPPER.edge_ids.index(name), beside_px, true_one_seen=False))
-    consensus = agree(votes, REPORTED, np.zeros(7), SETTINGS)
-    uncertainty = assess(votes, consensus, PRIOR)
-    if uncertainty.contradiction > CONTRADICTION:
-        rest = without_one_edge(votes, REPORTED, np.zeros(7), SETTINGS, uncertainty.contradiction)
+    edgels = votes_for(with_background_edge(GRIPPER.edge_ids.index(name), beside_px, true_one_seen=False))
+    consensus = fit_irls(edgels, REPORTED, np.zeros(7), SETTINGS)
+    uncertainty = assess(edgels, consensus, PRIOR)
+    if uncertainty.contradiction > CONTRADICTION_RATIO:
+        rest = without_one_edge(edgels, REPORTED, np.zeros(7), SETTINGS, uncertainty.contradiction)
         if rest is not None:
             _, consensus, uncertainty = rest
             assert not consensus.edge_seen[GRIPPER.edge_ids.index(name)]
@@ -170,9 +170,9 @@ def test_an_edge_of_the_background_instead_of_one_of_the_gripper_is_noticed(name
 
 def left_out(offset_px: np.ndarray) -> tuple[float, str | None]:
     """How much the edges contradict each other, and which one is left out for it."""
-    votes = votes_for(candidates(np.arange(SAMPLES), offset_px), NO_FLOORS)
-    contradiction = assess(votes, agree(votes, REPORTED, np.zeros(7), SETTINGS), PRIOR).contradiction
-    found = without_one_edge(votes, REPORTED, np.zeros(7), SETTINGS, contradiction)
+    edgels = votes_for(candidates(np.arange(SAMPLES), offset_px), NO_FLOORS)
+    contradiction = assess(edgels, fit_irls(edgels, REPORTED, np.zeros(7), SETTINGS), PRIOR).contradiction
+    found = without_one_edge(edgels, REPORTED, np.zeros(7), SETTINGS, contradiction)
     if found is None:
         return contradiction, None
     gone = [e for e in SAMPLED if not found[0].weight[PREDICTION.layout.edge == e].any()]
@@ -187,7 +187,7 @@ def test_the_one_edge_that_contradicts_all_others_is_left_out():
         offset_px = PREDICTION.jacobian @ XI + rng.normal(scale=0.1, size=SAMPLES)
         offset_px[PREDICTION.layout.edge == edge] += 0.25
         contradiction, name = left_out(offset_px)
-        if contradiction > CONTRADICTION:
+        if contradiction > CONTRADICTION_RATIO:
             trials += 1
             right += name == GRIPPER.edge_ids[edge]
             wrong += name not in (None, GRIPPER.edge_ids[edge])
@@ -201,7 +201,7 @@ def test_no_edge_is_left_out_where_all_of_them_contradict_each_other():
         of_stretch = rng.normal(scale=0.2, size=PREDICTION.layout.stretch.max() + 1)
         noise = rng.normal(scale=0.1, size=SAMPLES) + of_stretch[PREDICTION.layout.stretch]
         contradiction, name = left_out(PREDICTION.jacobian @ XI + noise)
-        assert contradiction > CONTRADICTION and name is None
+        assert contradiction > CONTRADICTION_RATIO and name is None
 
 
 def in_texture(rng: np.random.Generator, edge: int, true_share: float, texture: int) -> Candidates:
@@ -271,7 +271,7 @@ def test_clutter_alone_is_never_trusted():
             count = round(density * SAMPLES)
             found = candidates(rng.integers(0, SAMPLES, count), rng.uniform(-REACH_PX, REACH_PX, count))
             starts = grid_of_starts(PREDICTION, REACH_PX, SETTINGS.start_width_px)
-            best = agree_from_grid(votes_for(found), REPORTED, starts, SETTINGS)
+            best = fit_irls_from_grid(votes_for(found), REPORTED, starts, SETTINGS)
             assert fit(found).share < SETTINGS.trusted_share
             assert best.share < SETTINGS.found_share
 
@@ -292,7 +292,7 @@ def test_the_grid_finds_what_is_out_of_the_reach_of_the_start():
     seen = np.abs(offset_px) < 9.0
     found = candidates(np.flatnonzero(seen), offset_px[seen])
     starts = grid_of_starts(PREDICTION, 7.0, SETTINGS.start_width_px)
-    best = agree_from_grid(votes_for(found), REPORTED, starts, SETTINGS)
+    best = fit_irls_from_grid(votes_for(found), REPORTED, starts, SETTINGS)
     assert miss_px(best, far) < 0.4
     assert best.share > 0.8 > fit(found).share
 
@@ -326,7 +326,7 @@ def test_candidates_of_the_wrong_sign_do_not_count_even_where_they_lie_right():
     polarity = np.ones(EDGES, dtype=np.int8)
     offset_px = PREDICTION.jacobian @ XI
     found = candidates(np.arange(SAMPLES), offset_px, step=-40.0)
-    consensus = agree(votes_for(found, polarity=polarity), REPORTED, np.zeros(7), SETTINGS)
+    consensus = fit_irls(votes_for(found, polarity=polarity), REPORTED, np.zeros(7), SETTINGS)
     assert consensus.share == 0.0 and not consensus.supported.any()
 
 
@@ -335,8 +335,8 @@ def test_points_of_one_edge_together_are_worth_no_more_than_the_edge_itself():
     spread_px = np.full(EDGES, 0.03)
     spread_px[int(PREDICTION.layout.edge[-1])] = 0.3
     found = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), sigma_px=0.12)
-    settings = ConsensusSettings(point_floor_px=0.05)
-    consensus = agree(votes_for(found, settings, edge_spread_px=spread_px), REPORTED, np.zeros(7), settings)
+    settings = RobustFitSettings(point_floor_px=0.05)
+    consensus = fit_irls(votes_for(found, settings, edge_spread_px=spread_px), REPORTED, np.zeros(7), settings)
     for e in np.unique(PREDICTION.layout.edge):
         mine = PREDICTION.layout.edge[found.sample] == e
         variance = spread_px[e] ** 2 + (0.12**2 + 0.05**2) / np.count_nonzero(mine)
@@ -349,7 +349,8 @@ def test_the_prior_holds_the_jaw_at_what_is_reported():
     opened[6] = 4e-4
     found = true_candidates(np.random.default_rng(7), 0.05, opened)
     vague, sharp = (
-        agree(votes_for(found), Prior(np.zeros(7), prior_information(s)), np.zeros(7), SETTINGS) for s in (0.02, 1e-6)
+        fit_irls(votes_for(found), Prior(np.zeros(7), prior_information(s)), np.zeros(7), SETTINGS)
+        for s in (0.02, 1e-6)
     )
     assert vague.xi[6] == pytest.approx(4e-4, abs=5e-5)
     assert abs(sharp.xi[6]) < 1e-5
