@@ -12,7 +12,7 @@ from support.watched import pose_of, reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Frame, Origin, Verdict
+from gripmon.model.records import AlertKind, Frame, Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.teach.cad import gripper_from_cad
 from tools.benchmarks.meshes import MeshCamera, box_fingers, curved_fingers, rounded_fingers, wandering, write_meshes
@@ -137,3 +137,26 @@ def test_a_knock_along_rounded_fingers_behind_a_bar_is_never_valid_beyond_its_bo
             error = difference(pose_of(record.cam_T_grip), truth)
             assert np.linalg.norm(error[:3]) <= record.protection.position_m, k
     assert np.mean(valid[1:15]) > 0.9 and not any(valid[25:40]) and np.mean(valid[50:]) > 0.9
+
+
+def test_a_knock_of_curved_fingers_is_reported(tmp_path: Path):
+    """Their curves tell where they are along themselves: no end has to be seen for a knock to count as one."""
+    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip()
+    view = {"camera": camera, "cam_T_grip": pose, "length_m": 0.035}
+    meshes = curved_fingers()
+    gripper = gripper_from_cad(write_meshes(meshes, tmp_path), unit="mm", jaw_range_m=(0.0, 0.06), **view).gripper
+    monitor, pictures = Monitor(camera, gripper, MonitorSettings(), reference_of(pose)), MeshCamera(camera, meshes)
+    alerts = []
+    for k in range(60):
+        truth = pose.copy()
+        truth[:3, 3] += np.array([4e-4, 6e-4, 6e-4]) * (k >= 25)
+        record = monitor.process(
+            Frame(seq=k, stamp_ns=int(k / 30 * 1e9), image=pictures.picture(truth), jaw_opening_m=gripper.jaw_nominal_m)
+        )
+        alerts += [alert.kind for alert in record.alerts]
+        if record.verdict is Verdict.VALID:
+            assert record.cam_T_grip is not None and record.protection is not None
+            error = difference(pose_of(record.cam_T_grip), truth)
+            assert np.linalg.norm(error[:3]) <= record.protection.position_m
+        assert k < 35 or record.verdict is Verdict.VALID
+    assert alerts and alerts[0] in (AlertKind.STEP, AlertKind.DRIFT)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.drift import USUAL_SQUARE
+from gripmon.judge.policy import past_alert_limit
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
@@ -64,7 +65,7 @@ CORNERS_WHERE_EXPECTED = 3
 class Trust:
     """What one measurement is worth.
 
-    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such; ``displaced``: the
+    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none; ``displaced``: the
     pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
     ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis; None where there is
     none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
@@ -157,6 +158,8 @@ class Weigher:
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven else 1.0 if slid else MISREAD_PROBABILITY ** self.confirmations(measurement, ends, kept)
+        if displaced and not (proven or slid) and ends is not None:
+            proven = self._needs_no_ends(fits, cam_T_grip)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         if self.anchor is None:
@@ -237,6 +240,15 @@ class Weigher:
         unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
         knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
+
+    def _needs_no_ends(self, fits: Refits, cam_T_grip: Array) -> bool:
+        """Whether a pose (4, 4) is as certain as it has to be though all that was taken for the fingers' ends is
+        something else: curved fingers tell by themselves where they are along themselves.
+        """
+        hypotheses, policy = fits.hypotheses, self._policy
+        prior = hypotheses.prior.copy()
+        prior[hypotheses.ends] = 1.0
+        return past_alert_limit(protection_of(fits.doubts(cam_T_grip, prior), policy.integrity_risk), policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The bound by what the first frames differ from the reference, ``away`` (6,)."""
