@@ -65,10 +65,10 @@ CORNERS_WHERE_EXPECTED = 3
 class Trust:
     """What one measurement is worth.
 
-    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none; ``displaced``: the
-    pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
-    ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis; None where there is
-    none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
+    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
+    ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
+    explains that, too.  ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis;
+    None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
     """
 
     protection: Protection
