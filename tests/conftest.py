@@ -63,7 +63,7 @@ TOOLS = Path(__file__).resolve().parent.parent / "tools"
 
 @pytest.fixture
 def tools_importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The packages in ``tools``, also in processes that a test starts; each test imports them anew."""
+    """The packages in ``tools``, also in processes that a test starts; each test imports them again."""
     monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
     monkeypatch.syspath_prepend(str(TOOLS))
     yield
@@ -74,7 +74,7 @@ def tools_importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def endpoint() -> str:
-    """An address on loopback that nobody listens at."""
+    """An address on loopback that no one listens at."""
     return free_endpoint()
 
 
@@ -96,6 +96,6 @@ def loop(publisher: Published) -> Iterator[Loop]:
 
 @pytest.fixture
 def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
-    """Somebody else on the network, connected to that monitor."""
+    """Someone else on the network, connected to that monitor."""
     with plain_session(connect=endpoint) as opened:
         yield opened

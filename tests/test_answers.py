@@ -1,4 +1,4 @@
-"""Replies to an asker that doesn't read hold up nobody: neither the loop, nor Zenoh's threads, nor other replies."""
+"""Replies to an asker that doesn't read hold up no one: neither the loop, nor Zenoh's threads, nor other replies."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_when_too_many_wait_the_others_are_told_so(stalled: StalledQuery):
 
 
 def test_a_flood_of_commands_is_answered_to_the_last_one():
-    """Nobody carries anything out: some wait until their time is over, all others hear that it is busy."""
+    """No one carries anything out: some wait until their time is over, all others hear that it is busy."""
     endpoint = free_endpoint()
     publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     answered: list[str] = []

@@ -245,7 +245,7 @@ def test_random_frames_of_any_kind_never_raise():
         record = monitor.process(Frame(i, frames[0].stamp_ns + i * 33_000_000, image, jaw_opening_m=0.034))
         assert_sound(record)
         if kind < 5:
-            assert record.source is Origin.HELD, "noise is no gripper"
+            assert record.source is Origin.HELD, "noise is not a gripper"
 
 
 def test_ten_bits_in_sixteen_are_measured_as_the_same_picture_in_eight():

@@ -1,4 +1,4 @@
-"""An inexact reference is no drift: its error is taken out of the first frames, within what its covariance allows."""
+"""An inexact reference is not a drift: its error is taken out of the first frames, as far as its covariance allows."""
 
 from __future__ import annotations
 

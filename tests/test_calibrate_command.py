@@ -155,9 +155,9 @@ REFUSALS = {
     "the same image twice": ((0, 1, 0), TEXT, (), 2, "is the same image as"),
     "target in millimetres": (range(3), "chequerboard:9x6:20", (), 2, "--target: 'chequerboard:9x6:20'"),
     "no such dictionary": (range(3), "charuco:8x6:0.03:0.02:DICT_0", (), 2, "there is no dictionary DICT_0"),
-    "no such parameter": (range(3), TEXT, ("--fix", "f"), 2, "--fix f: is no parameter of the model; fx_px"),
+    "no such parameter": (range(3), TEXT, ("--fix", "f"), 2, "--fix f: is not a parameter of the model; fx_px"),
     "no value to hold a focal length at": (range(3), TEXT, ("--fix", "fx_px"), 2, "fx_px=VALUE (px), above 0"),
-    "a value that is none": (range(3), TEXT, ("--fix", "cx_px=middle"), 2, "is no number; cx_px=VALUE"),
+    "a value that is none": (range(3), TEXT, ("--fix", "cx_px=middle"), 2, "is not a number; cx_px=VALUE"),
     "a picture of no kind": (range(3), TEXT, ("--picture", "x.txt"), 2, "--picture x.txt: has no known ending"),
 }
 

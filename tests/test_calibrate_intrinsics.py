@@ -168,7 +168,7 @@ def test_what_is_fixed_stays():
     camera = result.camera
     assert (camera.cx_px, camera.cy_px) == (383.5, 287.5) and camera.fx_px == camera.fy_px
     assert camera.coefficients[2:] == (0.0, 0.0)
-    with pytest.raises(CalibrationError, match=r"focal is no parameter of paper; one of fx_px.* or aspect"):
+    with pytest.raises(CalibrationError, match=r"focal is not a parameter of paper; one of fx_px.* or aspect"):
         calibrate(views, "paper", fixed={"focal": None})
 
 

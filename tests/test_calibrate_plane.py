@@ -227,7 +227,7 @@ def one(name: str) -> dict[str, object]:
         (["p0.png", *INFER], 2, "--infer: needs rough corners"),
         (["p0.png", *INFER[:-2], "--corners", "outline.yaml"], 2, "--gripper-out FILE.yaml"),
         (["p0.png", *INFER[:-1], "he.yaml", "--corners", "outline.yaml"], 2, "--out and --gripper-out: both are"),
-        (["p0.png", *INFER, "--corners", "rough.yaml"], 2, "corners.L_in_near: is no name of a fingertip's"),
+        (["p0.png", *INFER, "--corners", "rough.yaml"], 2, "corners.L_in_near: is not a name of a fingertip's"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0.04:0.06"], 3, "jaws stand 0.0340 m open"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "60"], 2, "'60' isn't a range; MIN:MAX"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0:60"], 2, "millimetres?"),

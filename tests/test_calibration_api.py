@@ -66,10 +66,10 @@ def test_images_without_the_target_are_no_result_with_a_reason_each():
 @pytest.mark.parametrize(
     ("fixed", "why"),
     [
-        ({"kappa_per_px2": 0.0}, "is no parameter of the model"),
+        ({"kappa_per_px2": 0.0}, "is not a parameter of the model"),
         ({"fx_px": None}, "above 0"),
         ({"aspect": 1.0}, "takes no value"),
-        ({"cx_px": float("nan")}, "is no number"),
+        ({"cx_px": float("nan")}, "is not a number"),
         ({"aspect": None, "fy_px": 900.0}, "one of them"),
     ],
 )

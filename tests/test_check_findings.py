@@ -47,7 +47,7 @@ def checked(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[s
     [
         ({"kind": "live", "device": "wrist.avi"}, "source.device: 'wrist.avi' has no known form; an index (0), "),
         ({"kind": "live", "device": "0"}, "source.device: '0' is text; an index is a number without quotes"),
-        ({"kind": "live", "device": -1}, "source.device: -1 is no index; 0 for the first camera"),
+        ({"kind": "live", "device": -1}, "source.device: -1 is not an index; 0 for the first camera"),
         ({"kind": "folder", "path": "SEQUENCE"}, "camera.width_px: 768 x 576 px; 0.png is 1 x 1; the calibration that"),
         ({"kind": "folder", "path": "NOTHING"}, "source.path: no image in "),
     ],

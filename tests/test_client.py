@@ -149,7 +149,7 @@ def test_bad_names_are_refused(names: tuple[str, str | None]):
 
 
 def test_a_bad_endpoint_is_refused():
-    with pytest.raises(PublishError, match=r"^connect: 'nonsense' is no endpoint; protocol/address, e.g. tcp/"):
+    with pytest.raises(PublishError, match=r"^connect: 'nonsense' is not an endpoint; protocol/address, e.g. tcp/"):
         Client("arm", connect=["nonsense"])
 
 

@@ -165,6 +165,6 @@ def test_who_waits_for_a_transform_hears_when_its_age_is_known():
     assert [entry.arrival_s for entry in waiter.got] == [pytest.approx(100.2)]  # the newest alone
     inbox.take(WRIST, message, 100.3, sent(100 * S, 100 * S))
     assert len(waiter.got) == 2
-    for late_s in (0.0, 0.9 * HELD_BACK_S, 1.1 * HELD_BACK_S):  # of another clock, that nobody answers for
+    for late_s in (0.0, 0.9 * HELD_BACK_S, 1.1 * HELD_BACK_S):  # of another clock, that no one answers for
         inbox.take(WRIST, message, 101.0 + late_s, Sent(clock(0, "another"), 0))
     assert len(waiter.got) == 3 and reading(inbox).why is Unusable.AGE_UNKNOWN

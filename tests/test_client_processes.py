@@ -86,7 +86,7 @@ def test_a_client_that_comes_first_finds_a_monitor_that_is_killed_and_started_ag
             wait_until(lambda: client.latest().usable and client.latest().seq > 100, "a hundred frames")
         refused(client, Unusable.GONE)
         with remote_monitor(listen=[endpoint], fps=2.0):
-            assert usable(client).seq < 100  # its numbers begin anew
+            assert usable(client).seq < 100  # its numbers begin again
         assert client.unreadable == 0
 
 
@@ -183,7 +183,7 @@ def test_asyncio_gets_readings_and_the_end_and_a_cancelled_wait_loses_nothing(en
             readings = aiter(client)
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.05):
-                    await anext(readings)  # nobody is there yet
+                    await anext(readings)  # no one is there yet
             started: list[Reading] = []
             monitor = remote_monitor(listen=[endpoint])
             process = await asyncio.to_thread(monitor.__enter__)

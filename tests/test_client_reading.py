@@ -117,7 +117,7 @@ def test_with_clocks_that_agree_a_stamp_of_the_future_is_refused():
         wall_ns = stamp_ns - round(1e9 * ahead_s)
         got = reading(inbox, Policy(clocks_agree=True), 100.05, wall_ns)
         assert got.usable is usable and (got.transform is not None) is usable
-        assert reading(inbox, Policy(), 100.05, wall_ns).usable  # nobody says that they agree
+        assert reading(inbox, Policy(), 100.05, wall_ns).usable  # no one says that they agree
         if not usable:
             assert got.why is Unusable.CLOCKS
             assert got.reason == (

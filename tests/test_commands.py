@@ -107,7 +107,7 @@ def test_an_answer_that_comes_too_late_goes_nowhere(endpoint: str):
 
 
 def test_too_many_at_once_are_told_to_wait(publisher: Published, endpoint: str):
-    """Nobody takes them: those that don't fit are answered at once, those that wait when the monitor stops."""
+    """No one takes them: those that don't fit are answered at once, those that wait when the monitor stops."""
     with plain_session(connect=endpoint) as session:
         replies = [session.get(f"{CMD}/undo", timeout=20.0) for _ in range(20)]
         busy = []

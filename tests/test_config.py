@@ -224,7 +224,7 @@ GRIPPER_FAULTS = [
     (r"corner: true}", "cornr: true}", "points.L_in_near.cornr", "did you mean 'corner'"),
     (r"xyz_m: \[-0.017, -0.008, 0.0\]", "xyz_m: [-0.017, -0.008]", "points.L_in_near.xyz_m", "3 values"),
     (r"from: L_in_near, to", "frm: L_in_near, to", "edges.L_tip_in.frm", "did you mean 'from'"),
-    (r"from: L_in_near, to", "from: nobody, to", "edges.L_tip_in.from", "there is no point"),
+    (r"from: L_in_near, to", "from: no one, to", "edges.L_tip_in.from", "there is no point"),
     (r"^name: .*", "name: a\nname: b", "line 5", "twice"),
     (
         r"motion: {axis: .*}",

@@ -57,7 +57,7 @@ def test_corners_and_pose_of_a_clean_image_are_those_of_the_truth(lens: LensSett
 
 @pytest.mark.parametrize("direction", range(6))
 def test_a_motion_within_the_profiles_reach_is_measured_as_well_as_none(direction: int):
-    """Two pixels along each unknown: after linearising anew nothing is left of where the measurement began."""
+    """Two pixels along each unknown: after linearising again nothing is left of where the measurement began."""
     xi = np.zeros(6)
     xi[direction] = 2.5e-4 if direction < 2 else 1.2e-3 if direction == 2 else 0.01
     still, shifted = measure(picture(PLAIN)), measure(picture(PLAIN), moved(nominal_cam_T_grip(), xi))
@@ -67,7 +67,7 @@ def test_a_motion_within_the_profiles_reach_is_measured_as_well_as_none(directio
 
 
 def test_corners_off_the_prediction_are_measured_as_well_as_on_it():
-    """Less than what calls for linearising anew: the lines' offsets and slopes carry the corner all the way."""
+    """Less than what calls for linearising again: the lines' offsets and slopes carry the corner all the way."""
     truth, on_it = simulated(PLAIN).truth(0), measure(picture(PLAIN)).corners.uv_px
     for xi in ([5e-5, 0, 0, 0, 0, 0], [0, -5e-5, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1.2e-3], [3e-5, 3e-5, 0, 0, 0, -6e-4]):
         expected = moved(nominal_cam_T_grip(), np.array(xi))
@@ -249,7 +249,7 @@ def test_a_coloured_edge_is_measured_in_its_luma():
 
 
 def brighter_sides(image: np.ndarray) -> dict[str, str]:
-    """For every sampled edge the side that is brighter for somebody who walks it in the image, read off the image."""
+    """For every sampled edge the side that is brighter for someone who walks it in the image, read off the image."""
     gripper, camera, pose = box_gripper(), make_camera(PAPER_LENS), nominal_cam_T_grip()
     points = gripper.points_grip_m(0.034) @ pose[:3, :3].T + pose[:3, 3]
     sides = {}

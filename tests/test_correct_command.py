@@ -226,7 +226,7 @@ def test_nothing_measured_is_exit_code_3_and_leaves_no_file(tmp_path: Path, caps
     (tmp_path / "folder").mkdir()
     for path, expected, says in (
         (held, 3, "nothing was measured"),
-        (rubbish, 3, "is no rerun recording"),
+        (rubbish, 3, "is not a rerun recording"),
         (tmp_path / "folder", 2, "holds no .rrd file"),
     ):
         out = tmp_path / "c.jsonl"

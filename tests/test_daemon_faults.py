@@ -64,7 +64,7 @@ def test_a_broken_output_does_not_take_the_monitor_with_it(fails: str, caplog: p
         assert bench.run() == 0
     assert len(bench.monitor.frames) == 100
     said = [text for text in caplog.messages if text.startswith("output raised: ") and "the line is cut" in text]
-    assert len(said) == 1, "an alert, once, in the log where nobody else hears of it"
+    assert len(said) == 1, "an alert, once, in the log where no one else hears of it"
     if fails != "everything":
         assert bench.alerts == [(AlertKind.OUTPUT, Cause.UNKNOWN)]
 

@@ -85,7 +85,7 @@ def test_all_that_was_recorded_is_exported_once(recordings: Path, tmp_path: Path
     before = contents(out)
     files = sorted(recordings.glob("*.rrd"))
     assert main(["export", *map(str, reversed(files)), str(recordings), "--out", str(out)]) == 0
-    for file in files:  # the others' rows stay, nobody misses them, and the newest may be empty yet
+    for file in files:  # the others' rows stay, no one misses them, and the newest may be empty yet
         assert main(["export", str(file), "--out", str(out)]) == 0
     assert capsys.readouterr().err == ""
     assert contents(out) == before
@@ -128,7 +128,7 @@ def test_the_estimates_of_a_run_are_exported_too(tmp_path: Path, capsys: pytest.
         (["nowhere.rrd", "--out", "fleet"], 2, "nowhere.rrd: there is no such file; recordings of gripmon run"),
         (["none", "--out", "fleet"], 2, "none: no .rrd file in it; recordings of gripmon run"),
         (["rubbish.rrd", "--out", "rubbish.rrd"], 2, "--out rubbish.rrd: can't be made (File exists)"),
-        (["rubbish.rrd", "--out", "fleet"], 3, "export: rubbish.rrd: is no rerun recording"),
+        (["rubbish.rrd", "--out", "fleet"], 3, "export: rubbish.rrd: is not a rerun recording"),
     ],
 )
 def test_what_cannot_be_is_one_line(

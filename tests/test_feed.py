@@ -131,7 +131,7 @@ def test_nothing_to_send_is_a_failure(heard: Heard, folder: Path, capsys: pytest
             "feed: nowhere.mp4: there is no such folder or file; a folder of images, a video",
         ),
         (["{folder}", "--robot", "a/b"], "robot name 'a/b' can't be part of a Zenoh key"),
-        (["{folder}", "--robot", "arm", "--connect", "localhost"], "feed: --connect: 'localhost' is no endpoint; "),
+        (["{folder}", "--robot", "arm", "--connect", "localhost"], "feed: --connect: 'localhost' is not an endpoint; "),
         (["{folder}", "--robot", "arm", "--zenoh-config", "/nowhere.json5"], "feed: --zenoh-config: no file /nowhere"),
         (
             ["{folder}", "--robot", "arm", "--zenoh-config", "x.json5", "--connect", "tcp/127.0.0.1:1"],

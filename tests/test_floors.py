@@ -159,5 +159,5 @@ def test_package_list_matches_the_tree():
 
 
 def test_files_that_are_begun_first_are_there():
-    """A name that was left behind by a renamed file would do nothing, and nobody would notice."""
+    """A name that was left behind by a renamed file would do nothing, and no one would notice."""
     assert [name for name in LONGEST if not (ROOT / "tests" / f"{name}.py").exists()] == []

@@ -28,7 +28,7 @@ KNOCKED = {
     "policy": {"limit_m": 0.001, "settle_frames": 4, "confirm_frames": 1},
     "recalibration": {"frames": 4, "sure_sigma_m": 0.001, "largest_sigma_m": 0.001},
 }
-"""Settings by which a camera that is knocked to and fro is calibrated anew each time."""
+"""Settings by which a camera that is knocked to and fro is calibrated again each time."""
 
 
 @pytest.fixture

@@ -237,7 +237,7 @@ def test_a_round_finger_without_a_view_asks_for_it(tmp_path: Path, capsys: pytes
     ("name", "content", "said"),
     [
         ("a.stl", "nonsense", "a.stl: has no triangles"),
-        ("a.step", "", "is no format of CAD that is read here"),
+        ("a.step", "", "is not a format of CAD that is read here"),
         ("a.urdf", "<robot", "can't be read as URDF"),
         ("a.urdf", "<robot name='x'><link name='a'/></robot>", "no link has a geometry"),
         ("a.urdf", "<robot xmlns:xacro='x'><xacro:macro name='y'/></robot>", "holds xacro macros; expand it first"),

@@ -40,7 +40,8 @@ def test_what_is_no_file_among_images_becomes_a_frame_with_a_fault(tmp_path: Pat
     frames = [source.read(), source.read()]
     assert frames[0] is not None and frames[0].fault is None
     assert frames[1] is not None and frames[1].image is None
-    expected = "the file is missing" if kind == "socketless link" else "the file can't be read: it is no regular file"
+    unreadable = "the file can't be read: it is not a regular file"
+    expected = "the file is missing" if kind == "socketless link" else unreadable
     assert frames[1].fault == expected
 
 
@@ -57,7 +58,8 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path):
 def test_a_table_that_is_a_pipe_is_refused(tmp_path: Path):
     folder_with(tmp_path)
     os.mkfifo(tmp_path / "timestamps.csv")
-    with pytest.raises(SourceError, match=r"timestamps.csv: can't be read \(it is no regular file\); a table in UTF-8"):
+    said = r"timestamps.csv: can't be read \(it is not a regular file\); a table in UTF-8"
+    with pytest.raises(SourceError, match=said):
         FolderSource(FolderSettings(path="."), tmp_path)
 
 

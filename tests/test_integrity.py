@@ -291,7 +291,7 @@ def test_with_nothing_wrong_errors_exceed_the_bound_no_more_often_than_stated(ri
 @pytest.mark.parametrize("risk", [1e-3, 3e-4])
 def test_one_wrong_edge_exceeds_the_bound_as_seldom_as_its_prior_allows(risk: float):
     """Times its prior, its errors beyond the bound are within the risk, from a bias that hides in the noise to one that
-    nobody can miss.
+    no one can miss.
     """
     hypotheses, trials = of_two_fingers(), 300
     allowed = risk / WRONG_EDGE

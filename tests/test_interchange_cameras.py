@@ -239,34 +239,34 @@ def test_a_camchain_of_several_cameras_needs_to_be_told_which():
     with pytest.raises(InterchangeError, match="holds 2 cameras; --camera cam0 or cam1"):
         read_camera(data, "chain", "kalibr")
     assert read_camera(data, "chain", "kalibr", which="cam1").fx_px == 500.5
-    with pytest.raises(InterchangeError, match="cam7: is no camera of this file; cam0 or cam1"):
+    with pytest.raises(InterchangeError, match="cam7: is not a camera of this file; cam0 or cam1"):
         read_camera(data, "chain", "kalibr", which="cam7")
 
 
 BAD = [
-    ("ros", ("plumb_bob", "thin_prism_fisheye"), "distortion_model: 'thin_prism_fisheye' is no model"),
+    ("ros", ("plumb_bob", "thin_prism_fisheye"), "distortion_model: 'thin_prism_fisheye' is not a model"),
     ("ros", ("plumb_bob", "equidistant"), "distortion_coefficients: holds 5 values; of equidistant 4"),
     ("ros", ("image_width: 640\n", ""), "image_width: is missing"),
     ("ros", ("image_width: 640\n", "image_width: 640\nimage_width: 641\n"), "line 2: the key 'image_width' is"),
     ("ros", ("580.46715,    0. ", "580.46715,    2.5 "), "camera_matrix: .* has a skew"),
-    ("ros", ("0.134462", "much"), r"distortion_coefficients\[0\]: 'much' is no number"),
-    ("ros", ("0.134462", ".nan"), r"distortion_coefficients\[0\]: nan is no number"),
-    ("ros", ("0.134462", "true"), r"distortion_coefficients\[0\]: True is no number"),
+    ("ros", ("0.134462", "much"), r"distortion_coefficients\[0\]: 'much' is not a number"),
+    ("ros", ("0.134462", ".nan"), r"distortion_coefficients\[0\]: nan is not a number"),
+    ("ros", ("0.134462", "true"), r"distortion_coefficients\[0\]: True is not a number"),
     ("ros", ("0.134462", "-9.0"), "no camera that can be used: coefficients"),
-    ("ros", ("image_width: 640", "image_width: 640.5"), "image_width: 640.5 is no whole number"),
+    ("ros", ("image_width: 640", "image_width: 640.5"), "image_width: 640.5 is not a whole number"),
     ("ros", ("  data: [580.46715", "  date: [580.46715"), "camera_matrix.data: is missing"),
-    ("kalibr", ("pinhole", "omni"), "cam0.camera_model: 'omni' is no model of gripmon's; pinhole"),
-    ("kalibr", ("equidistant", "fov"), "cam0.distortion_model: 'fov' is no model"),
+    ("kalibr", ("pinhole", "omni"), "cam0.camera_model: 'omni' is not a model of gripmon's; pinhole"),
+    ("kalibr", ("equidistant", "fov"), "cam0.distortion_model: 'fov' is not a model"),
     ("kalibr", ("[752, 480]", "[752]"), "cam0.resolution: holds 1 values"),
     ("kalibr", ("461.629, ", ""), r"cam0.intrinsics: holds 3 values; \[fu, fv, pu, pv\]"),
     ("kalibr", ("cam0:", "camera:"), "cam0: is missing"),
     ("opencv", ("cameraMatrix", "other"), "camera_matrix: is missing"),
     ("opencv", ("<cols>5</cols>", "<cols>5"), "OpenCV can't read it"),
     ("opencv", ("1280 720", "1280"), "cameraResolution: "),
-    ("mrcal", ("OPENCV4", "CAHVOR"), "'LENSMODEL_CAHVOR' is no model of gripmon's; LENSMODEL_PINHOLE or"),
+    ("mrcal", ("OPENCV4", "CAHVOR"), "'LENSMODEL_CAHVOR' is not a model of gripmon's; LENSMODEL_PINHOLE or"),
     ("mrcal", ("OPENCV4", "OPENCV8"), "intrinsics: holds 8 values; 12 numbers for LENSMODEL_OPENCV8"),
     ("mrcal", ("'imagersize'", "'size'"), "imagersize: is missing"),
-    ("mrcal", ("2e-2", "__import__('os').getcwd()"), "is no Python literal"),
+    ("mrcal", ("2e-2", "__import__('os').getcwd()"), "is not a Python literal"),
 ]  # fmt: skip
 
 

@@ -52,7 +52,7 @@ def test_a_peer_misses_each_endpoint_by_itself(router: RouterProcess, endpoint: 
     nobody, own = free_endpoint(), free_endpoint()
     link = Link(PublishSettings(listen=(own,), connect=(endpoint, nobody)))
     try:
-        with plain_session(connect=own):  # somebody who comes in is nobody of those who are called
+        with plain_session(connect=own):  # someone who comes in is no one of those who are called
             wait_until(lambda: link.fault() == f"no connection to {nobody}, trying again", "the one that is missing")
     finally:
         link.close()
@@ -86,7 +86,7 @@ def test_which_far_end_is_which_endpoint(locator: str, endpoint: str, expected: 
 
 
 def test_daemon_and_client_outlive_their_router(router: RouterProcess, endpoint: str):
-    """Killed, not stopped, and twice: transforms come again, from the same processes, and nobody has complained."""
+    """Killed, not stopped, and twice: transforms come again, from the same processes, and no one has complained."""
     command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "routed"]
     environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
     daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)

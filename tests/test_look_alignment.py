@@ -106,7 +106,7 @@ def test_a_gripper_that_stands_still_stands_still_within_what_is_claimed():
 
 
 def test_a_motion_is_measured_whole():
-    """0.2 mm and a tenth of a degree, through pixels that were projected anew."""
+    """0.2 mm and a tenth of a degree, through pixels that were projected again."""
     tilt = Tilt(start_s=10.2, time_s=0.0, tcp_shift_m=(2e-4, -1e-4), translation_m=(0.0, 0.0, 2e-4))
     simulation = filmed(mount=(tilt,))
     errors, _ = errors_um(simulation, learnt(simulation), range(24, 36))

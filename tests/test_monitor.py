@@ -127,7 +127,7 @@ def test_a_creep_is_noticed_with_its_cause_before_it_is_large():
     alerts = [alert for record in seen.records for alert in record.alerts]
     assert [alert.event for alert in alerts] == [AlertEvent.RAISED] + [AlertEvent.UPDATED] * (len(alerts) - 1)
     assert len({alert.alert_id for alert in alerts}) == 1
-    assert {alert.kind for alert in alerts} <= {AlertKind.DRIFT, AlertKind.CREEP}, "it is no step"
+    assert {alert.kind for alert in alerts} <= {AlertKind.DRIFT, AlertKind.CREEP}, "it is not a step"
     assert {alert.cause for alert in alerts} <= {Cause.CAMERA_MOUNT, Cause.UNKNOWN}
     assert alerts[-1].cause is Cause.CAMERA_MOUNT
     seq = seen.alerts()[0][0]
@@ -230,7 +230,7 @@ def test_a_start_from_a_wrong_calibration_ends_at_the_right_one():
     settings = MonitorSettings(recalibration=RecalibrationSettings(sure_sigma_m=1e-4))
     seen = watch(frames, truths, new_monitor(settings, cam_T_grip=wrong))
     assert seen.records[0].state is State.ACQUIRING
-    assert AlertKind.STEP not in [kind for _, kind in seen.alerts()], "where it was before nobody saw"
+    assert AlertKind.STEP not in [kind for _, kind in seen.alerts()], "where it was before no one saw"
     assert seen.records[-1].revision == 2
     assert np.abs(seen.errors()[5:, :2]).max() < 3e-5
 

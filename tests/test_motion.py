@@ -92,7 +92,7 @@ def test_a_creep_is_called_one_and_has_its_rate(seed: int, mm_per_min: float):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("amplitude_m", [5e-5, 1e-4, 3e-4])
 def test_once_a_vibration_is_known_its_swings_are_no_steps(seed: int, amplitude_m: float):
-    """The first of them may look like one: nobody can know it then."""
+    """The first of them may look like one: no one can know it then."""
     stream = quiet_stream(seed)
     t = np.arange(1200) / FPS
     during = stream.feed(along_x(amplitude_m * np.sin(2.0 * np.pi * 11.0 * t), 1200))

@@ -154,7 +154,7 @@ def test_a_driver_that_is_killed_is_missed_and_welcome_again(sequence: Path, tmp
 
 @pytest.mark.slow("9 s; a driver that is killed and comes back is in the default run")
 def test_a_router_may_restart_in_the_middle(sequence: Path, tmp_path: Path):
-    """Driver and daemon are its clients.  Nobody is helped: both find it again."""
+    """Driver and daemon are its clients.  No one is helped: both find it again."""
     endpoint = free_endpoint()
     config = network_config(sequence, f"{{mode: client, connect: [{endpoint}]}}", name="client")
     with running(plain_config(tmp_path, endpoint), endpoint) as router, network_daemon(config, tmp_path) as daemon:

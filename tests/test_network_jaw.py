@@ -229,7 +229,7 @@ def test_good_ones_for_some_seconds_end_the_words_but_not_the_count(
     clock[0] += link.CALM_S
     assert seen.fault() == "" and seen.count == 20
     seen.add("too short")
-    assert seen.fault() == "1 malformed frame on a/b: too short", "counted anew after the calm"
+    assert seen.fault() == "1 malformed frame on a/b: too short", "counted again after the calm"
     clock[0] += 2.0 * link.CALM_S
     assert seen.fault(), "silence is no good sign"
     assert len(caplog.records) == 1, "one occasion, said once"

@@ -20,7 +20,7 @@ FRAMES = 64
 
 @pytest.fixture(scope="module")
 def learnt() -> SequentialTest:
-    """A test that knows its noise and was just begun anew."""
+    """A test that knows its noise and was just begun again."""
     test, rng = SequentialTest(PLAIN), np.random.default_rng(0)
     for shift in white(rng, 1500, 1):
         test.add(shift, COVARIANCE[None])

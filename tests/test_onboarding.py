@@ -217,7 +217,10 @@ def test_edges_of_an_inferred_gripper_have_names_of_their_own():
 @pytest.mark.parametrize(
     ("points", "reason"),
     [
-        ({**SQUARE, "thumb": (1.0, 2.0)}, "corners.thumb: is no name of a fingertip's corner; one of left_inner_near"),
+        (
+            {**SQUARE, "thumb": (1.0, 2.0)},
+            "corners.thumb: is not a name of a fingertip's corner; one of left_inner_near",
+        ),
         (without("right_inner_far"), "corners.right_inner_far: is missing"),
         (without("left_outer_near"), "corners.left_inner_near: only one edge of its own is given; left_outer_near or"),
         (

@@ -282,7 +282,7 @@ def test_what_is_no_recording_of_ours(tmp_path: Path):
     nothing = tmp_path / "nothing"
     nothing.mkdir()
     assert refused(empty) == f"{empty}: is empty; not used"
-    assert refused(picture) == f"{picture}: is no rerun recording, whatever its name says; not used"
+    assert refused(picture) == f"{picture}: is not a rerun recording, whatever its name says; not used"
     assert refused(lone).startswith(f"{lone}: holds no frame records")
     assert "the application 'arm_viewer' that holds no frames of a monitor's; not used" in refused(foreign)
     assert refused(nothing).startswith(f"{nothing}: holds no .rrd file")

@@ -46,7 +46,7 @@ WRONG_JAW, REFOCUSED = explained(Cause.JAW_OPENING), explained(Cause.LENS)
 
 TABLES: dict[str, list[Row]] = {
     "a start: the second frame that agrees makes it valid": [*START, (seen(), TRACKING, VALID, [], False)],
-    "a start on a camera that was moved before: measured anew when it has stood still, whatever the test says": [
+    "a start on a camera that was moved before: measured again when it has stood still, whatever the test says": [
         (seen(4.5, jumped=True, present=False), ACQUIRING, SUSPECT, [], False),
         (seen(4.5, present=False), RECALIBRATING, VALID, [], False),
         (seen(4.5, present=False), RECALIBRATING, VALID, [], False),
@@ -158,7 +158,7 @@ TABLES: dict[str, list[Row]] = {
         (seen(turn_rad=0.021), RECALIBRATING, VALID, [(K.STEP, RAISED)], False),
         (seen(turn_rad=0.019), DRIFTING, VALID, [], False),
     ],
-    "past the limit, then it isn't seen: counted anew": [
+    "past the limit, then it isn't seen: counted again": [
         *START,
         *[(seen(4.5, present=False), RECALIBRATING, VALID, [], False)] * 3,
         (HIDDEN, OCCLUDED, SUSPECT, [(K.OCCLUDED, RAISED)], False),
@@ -175,7 +175,7 @@ TABLES: dict[str, list[Row]] = {
         (seen(), TRACKING, VALID, [], False),
         (seen(), TRACKING, VALID, [(K.GRIPPER, CLEARED)], False),
     ],
-    "a finger bent so much that it looks past the limit: never calibrated anew": [
+    "a finger bent so much that it looks past the limit: never calibrated again": [
         *START,
         (seen(4.5, explanation=BENT), DRIFTING, SUSPECT, [(K.GRIPPER, RAISED)], False),
         *[(seen(4.5, explanation=BENT), DRIFTING, SUSPECT, [], False)] * 20,

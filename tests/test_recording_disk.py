@@ -1,4 +1,4 @@
-"""Disks that are full, read-only or don't answer: the loop goes on, somebody is told, and recording comes back."""
+"""Disks that are full, read-only or don't answer: the loop goes on, someone is told, and recording comes back."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_full_disk(small_disk: Path) -> None:
     offer_and_wait(writer, 0, 20)
     first = writer.path
     assert first is not None
-    ballast = small_disk / "somebody-elses"
+    ballast = small_disk / "someone-elses"
     _fill(ballast)
     lost = 0
     while writer.failure is None:  # until its pages are full, too

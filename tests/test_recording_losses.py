@@ -79,7 +79,7 @@ def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: p
 
 
 def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_path: Path) -> None:
-    """Before the alert nobody misses them."""
+    """Before the alert no one misses them."""
     writer = recorder(tmp_path, image_rate_hz=0.0, queue_images=4)
     process = stopped(writer)
     for i in range(30):

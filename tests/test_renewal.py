@@ -114,7 +114,7 @@ def test_what_was_rejected_is_not_proposed_again_where_the_camera_stays():
     assert cell.still() == [(K.PROPOSED, RAISED)]
     cell.say(CommandName.REJECT)
     cell.renewal.want()
-    assert cell.still() == [(K.PROPOSED, RAISED)], "unless somebody wants it"
+    assert cell.still() == [(K.PROPOSED, RAISED)], "unless someone wants it"
 
 
 @pytest.mark.parametrize("name", [CommandName.ACCEPT, CommandName.RESET, CommandName.UNDO])

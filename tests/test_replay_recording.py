@@ -194,7 +194,7 @@ def test_a_damaged_recording_is_replayed_as_far_as_it_is_whole(
 
 
 def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """The camera is pulled aside by more than a millimetre: with a limit of half of that it is measured anew."""
+    """The camera is pulled aside by more than a millimetre: with a limit of half of that it is measured again."""
     recording = tmp_path / "then.rrd"
     first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
     then = replayed(sequence, tmp_path / "then.jsonl", *first)
@@ -301,7 +301,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
     cases = [
         ([tmp_path / "old-0001.rrd"], 2, "holds no configuration; the one to replay with"),
         ([tmp_path / "other.rrd"], 3, "is a recording of the application 'somebody_else'"),
-        ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
+        ([tmp_path / "picture.rrd"], 3, "is not a rerun recording, whatever its name says"),
         ([tmp_path / "nothing.rrd"], 3, "is empty"),
         ([tmp_path / "none.rrd"], 2, "there is no such file; recordings of gripmon run"),
         ([tmp_path / "old-0001.rrd", sequence], 2, "isn't an .rrd file; one input, or several .rrd files of one run"),

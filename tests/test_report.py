@@ -318,7 +318,7 @@ def test_a_long_run_is_short_on_the_page_and_loses_no_outlier():
 
 @pytest.mark.parametrize("seed", range(24))
 def test_whatever_a_run_holds_there_is_a_report(seed: int):
-    """Frames with holes, wild clocks, covariances of zero, references nobody has, alerts in any order."""
+    """Frames with holes, wild clocks, covariances of zero, references no one has, alerts in any order."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 120)) if seed % 3 else int(rng.integers(1, 6))
     shifts_m = np.cumsum(rng.normal(size=(n, 3)) * (0.0, 1e-6, 1e-3)[seed % 3], axis=0)

@@ -167,7 +167,7 @@ def test_numbers_that_yaml_takes_for_text_are_numbers_also_in_nested_lists(tmp_p
     samples, places = rows_of(path)
     assert pose_of(samples[0], places[0])[:3, 3] == pytest.approx([1e-3, -0.25, 3.0])
     assert pose_of(samples[1], places[1])[:3, 3] == pytest.approx([1e-3, 2.0, -0.1])
-    with pytest.raises(ValueError, match="sample 3: base_T_ee is no transform"):
+    with pytest.raises(ValueError, match="sample 3: base_T_ee is not a transform"):
         pose_of(samples[2], places[2])
     with pytest.raises(ValueError, match=r"translation_m is \['x', 0, 0\]; 3 numbers"):
         pose_of({"base_T_ee": {"translation_m": ["x", 0, 0], "rotation_xyzw": [0, 0, 0, 1]}}, "sample 1")

@@ -309,7 +309,7 @@ def test_the_grid_shifts_turns_and_scales_the_image_by_what_it_says():
 
 
 def test_polarity_discards_candidates_of_the_wrong_sign():
-    """The positive sign is "brighter to the right of somebody walking along the edge"."""
+    """The positive sign is "brighter to the right of someone walking along the edge"."""
     edge = int(PREDICTION.layout.edge[0])
     polarity = ANY.copy()
     polarity[edge] = 1

@@ -1,4 +1,4 @@
-"""The monitor as a ROS 2 node, met by plain Zenoh sessions; its settings; and that nobody suffers when it fails."""
+"""The monitor as a ROS 2 node, met by plain Zenoh sessions; its settings; and that no one suffers when it fails."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ def test_a_camera_is_fed_through_the_rules(site: Site, tmp_path: Path):
 
 
 def test_a_second_cameras_pulses_and_spots_pass_the_rules(site: Site):
-    """The robot tells a pulse, the monitor hears it, a controller reads the spot; nobody else may say either."""
+    """The robot tells a pulse, the monitor hears it, a controller reads the spot; no one else may say either."""
     link = Link(PublishSettings(zenoh_config="monitor.json5"), site.folder)
     second = ZenohSpotPublisher(link, "arm", "second")
     pulses = ZenohPulses(link, second.keys["pulse"])
@@ -247,7 +247,7 @@ def test_a_robot_reads_nothing(site: Site):
 
 @pytest.fixture
 def stranger(site: Site, tmp_path: Path) -> Path:
-    """The controller's file beside certificates that somebody else has made."""
+    """The controller's file beside certificates that someone else has made."""
     shutil.copy(site.file("controller"), tmp_path)
     assert main(["certificates", "--out", str(tmp_path / "certificates")]) == 0
     return tmp_path

@@ -46,7 +46,7 @@ def test_shipped_files_stay_on_this_machine_or_speak_tls(folder: Path, name: str
     places = endpoints(said(config, "listen/endpoints")) + endpoints(said(config, "connect/endpoints"))
     assert places
     assert [p for p in places if not (p.startswith("tls/") or p.startswith(LOOPBACK))] == []
-    assert all("127.0.0.1" in p for p in places)  # nobody else's address is shipped
+    assert all("127.0.0.1" in p for p in places)  # no one else's address is shipped
     assert said(config, "scouting/multicast/enabled") is False
     if any(p.startswith("tls/") for p in places):
         assert said(config, "transport/link/protocols") == ["tls"]
@@ -157,7 +157,7 @@ def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, c
         (["ca"], None, "can't be a name"),
         (["x"], "ca.pem", "can't be read"),
         (["x"], "ca-key.pem", "can't be read"),
-        (["one"], "one.pem", "one.pem is no certificate: "),
+        (["one"], "one.pem", "one.pem is not a certificate: "),
     ],
 )
 def test_bad_requests_for_certificates(

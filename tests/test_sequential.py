@@ -328,7 +328,7 @@ def test_the_contract_is_in_days_whatever_the_frame_rate():
     fast.set_frames_per_s(1000.0)
     pairs = zip(feed(slow, shifts), feed(fast, shifts), strict=True)
     assert all(f.excess[0] < s.excess[0] for s, f in list(pairs)[3:])
-    fast.set_frames_per_s(1.0)  # measured anew in the middle of the stream
+    fast.set_frames_per_s(1.0)  # measured again in the middle of the stream
     more = white(rng, 300, 1)
     pairs = [(s.excess[0], f.excess[0]) for s, f in zip(feed(slow, more), feed(fast, more), strict=True)]
     np.testing.assert_allclose(*zip(*pairs[260:], strict=True), rtol=1e-4)  # what was learnt is taken over now and then

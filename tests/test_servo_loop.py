@@ -241,7 +241,7 @@ def test_a_real_monitor_over_zenoh_brings_the_arm_to_the_object(tmp_path: Path):
     assert all(target.met for target in reached)
     text = report.as_text({"commit": "c", "date": "d", "cpu": "p", "cpus": 2}, [run], every, reached)
     assert "NOT MET" not in text and "4.5 mm, then a hand, 1 runs" in text
-    # Past policy.limit_m the reference is measured anew, and the arm is under way by both.
+    # Past policy.limit_m the reference is measured again, and the arm is under way by both.
     assert set(run.revision) == {0, 1} and "before the fingers closed: 1 of 1" in text
     values = json.loads(json.dumps(report.as_values({}, every, reached)))
     assert [each["source"] for each in values["rows"]] == list(runs.SOURCES)

@@ -97,7 +97,7 @@ def test_breaches_are_counted_from_joints_and_verdicts_alone(verdicts, places, c
     ("options", "said"),
     [
         (["--runs", "0"], "'0'; a whole number, 1 to 1000"),
-        (["--seed", "-1"], "'-1' is no seed"),
+        (["--seed", "-1"], "'-1' is not a seed"),
         (["--fps", "5"], "'5'; a number from 10 to 200"),
         (["--fps", "nan"], "'nan'; a number from 10 to 200"),
         (["--json", "/nowhere/at/all.json"], "--json /nowhere/at/all.json: can't be written"),

@@ -340,7 +340,7 @@ def test_a_project_that_cant_be_read_or_written(tmp_path: Path, capsys: pytest.C
     (tmp_path / "file").write_text("")
     assert main(["setup", str(tmp_path / "file"), "--step", "camera"]) == 2
     assert main(["setup", str(tmp_path), "--step", "nose"]) == 2
-    assert "is no step; one of camera, target" in capsys.readouterr().err
+    assert "is not a step; one of camera, target" in capsys.readouterr().err
     assert main(["setup", str(tmp_path), "--step", "run"]) == 2
     assert "gripmon run config.yaml --out run" in capsys.readouterr().err
     assert main(["setup", str(tmp_path), "--step", "intrinsics"]) == 2

@@ -41,7 +41,7 @@ Walked = tuple[Path, dict[str, Any]]
 
 
 def gone(folder: Path, driver: Any, go: Callable[[Walker, Callable[[str], object]], None]) -> Walked:
-    """Somebody goes a whole way; the page after each step."""
+    """Someone goes a whole way; the page after each step."""
     wait_for_default_port()
     seen: dict[str, Any] = {}
     with page(folder, command=("setup",)) as running:
@@ -195,7 +195,7 @@ def test_bad_input_is_one_line_and_nothing_is_lost(user: new_user.NewUser, drive
         visitor.done("camera")
         visitor.go("target")
         for values, words in (
-            ({"target": "squares:3x3:1"}, "is no target"),
+            ({"target": "squares:3x3:1"}, "is not a target"),
             ({"target": "chequerboard:9x6:25"}, "millimetres?"),
             ({"target": "circles:12x10:0.008:0.004", "paper": "a9"}, "is no paper"),
             ({"paper": "50x60"}, "too small"),

@@ -330,7 +330,7 @@ def bump(size_m: float, ring: bool) -> np.ndarray:
 @pytest.mark.parametrize("size_m", [5e-5, 1e-4, 5e-4, 4.5e-3])
 @pytest.mark.parametrize("ring", [False, True], ids=["step", "ring-down"])
 def test_after_a_step_the_average_is_no_worse_than_the_frames(size_m: float, ring: bool):
-    """From its second frame on, nobody telling the average that anything happened."""
+    """From its second frame on, no one telling the average that anything happened."""
     covariance = spread()
     truth, smoothed, raw, nees = bump(size_m, ring), [], [], []
     for seed in range(40):

@@ -205,7 +205,7 @@ def test_table_beside_the_folder(tmp_path: Path):
         ("file,stamp_ns\n0.png,-1\n", "line 2: stamp_ns is -1"),
         ("file,stamp_ns\n0.png,99999999999999999999\n", "line 2: stamp_ns is 9"),
         ("file,stamp_ns\n0.png,1\n0.png,2\n", "line 3: 0.png is there twice"),
-        ("file,stamp_ns\n../0.png,1\n", "line 2: '../0.png' is no file name"),
+        ("file,stamp_ns\n../0.png,1\n", "line 2: '../0.png' is not a file name"),
         ("file,stamp_ns,jaw_opening_m\n0.png,1,wide\n", "line 2: jaw_opening_m is 'wide'; metres"),
         ("file,stamp_ns,jaw_opening_m\n0.png,1,34\n", "line 2: jaw_opening_m is '34'; metres"),
         ("file,stamp_ns,jaw_opening_m\n0.png,1,nan\n", "line 2: jaw_opening_m is 'nan'; metres"),

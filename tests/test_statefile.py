@@ -1,4 +1,4 @@
-"""The state file: whole or set aside, whoever damages it; and nobody else's."""
+"""The state file: whole or set aside, whoever damages it; and no one else's."""
 
 from __future__ import annotations
 

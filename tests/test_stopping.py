@@ -64,7 +64,7 @@ def test_a_background_job_that_ignores_ctrl_c_is_interrupted_as_well_while_it_st
 
 
 class NeverReady:
-    """Frames that nobody lives to see."""
+    """Frames that no one lives to see."""
 
     def frame(self, index: int) -> Frame:
         time.sleep(600.0)

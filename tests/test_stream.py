@@ -146,7 +146,7 @@ def test_a_coder_that_sends_nothing_for_what_stands_is_given_more_time(
 
 
 def test_whole_images_in_between_tell_how_long_a_coder_may_be_silent():
-    """Eight seconds of the same, and an image anew: so it goes on for a minute without a fault."""
+    """Eight seconds of the same, and an image again: so it goes on for a minute without a fault."""
     watch = StreamWatch()
     still = picture(0)
     stream = []

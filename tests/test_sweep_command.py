@@ -188,7 +188,7 @@ def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.
         (["--sweep", "--tilt", "ten"], "--tilt ten: isn't a range"),
         (["--sweep", "--tilt=-10"], "-10 degrees is out of bounds"),
         (["--sweep", "--fov", "200"], "200 degrees is out of bounds"),
-        (["--sweep", "--focal", "4"], "--focal: fx_px: 4 px is no focal length"),
+        (["--sweep", "--focal", "4"], "--focal: fx_px: 4 px is not a focal length"),
         (["--sweep", "--at", "384"], "--at 384: isn't a point of the image"),
         (["--sweep", "--at", "384,700"], "--at: lies at (384.0, 700.0) px, outside of the image"),
         (["--sweep", "--at", "nan,3"], "outside of the image"),

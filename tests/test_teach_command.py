@@ -288,7 +288,7 @@ def test_another_camera_gripper_or_reference_is_refused(
     assert line.startswith(f"{taught}: {said}")
     assert line.endswith("teach again (gripmon teach), or use what it was taught with")
     assert "taught" in fault(["replay", rig / "moved", "--config", path, "--out", rig / "x.jsonl"], capsys)
-    assert load_config(path, with_taught=False).taught is None, "to teach anew it is not in the way"
+    assert load_config(path, with_taught=False).taught is None, "to teach again it is not in the way"
 
 
 def test_another_lens_is_refused(rig: Path, taught: Path):

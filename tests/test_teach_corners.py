@@ -152,7 +152,7 @@ def test_a_photograph_of_a_box_without_jaw():
         assert np.linalg.norm(pose[:3, 3] - poses[0][:3, 3]) < 5e-4
         assert seen.keys() == corners[0].keys()
         assert max(np.linalg.norm(at - corners[0][name]) for name, at in seen.items()) < 0.2
-    # Four points that somebody clicked on: some mm and degrees.
+    # Four points that someone clicked on: some mm and degrees.
     xi = perturbation_between(config.cam_T_grip, poses[0])
     assert np.linalg.norm(xi[:3]) < 0.012 and np.linalg.norm(xi[3:]) < 0.05
 

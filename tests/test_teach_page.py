@@ -97,7 +97,7 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
         assert visitor.text("#save") == "Replace what is there"
         stamp = (tmp_path / "config.yaml").stat().st_ino
         visitor.click("#save")
-        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files anew")
+        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files again")
         assert (tmp_path / "config.yaml").stat().st_ino != stamp
         assert visitor.complaints() == []
         visitor.click("#done")

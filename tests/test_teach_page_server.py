@@ -340,7 +340,7 @@ def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_pat
             ({}, "corners.left_inner_near: is missing"),
             ({n: at for n, at in put.items() if "inner" in n}, "only one edge of its own is given"),
             (put | {"left_end_near": [1.0, 1.0]}, "corners.left_end_near: is there beside left_rise_near"),
-            (put | {"nose": [1.0, 1.0]}, "corners.nose: is no name"),
+            (put | {"nose": [1.0, 1.0]}, "corners.nose: is not a name"),
         ):
             status, answer = save(corners, replace=True)
             assert status == 200 and why in str(answer["refused"]) and not path.exists()

@@ -121,7 +121,7 @@ NEVER_FOUND = pytest.mark.xfail(
 
 @pytest.mark.parametrize("size_m", [-3e-3, -1e-3, 1e-3, 3e-3])
 def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_followed(size_m: float):
-    """The mount is knocked while a bar hides the tips: nobody can know by how much, until they are seen."""
+    """The mount is knocked while a bar hides the tips: no one can know by how much, until they are seen."""
     seen = watched(knocked_behind_a_bar(size_m))
     assert_nothing_misleads(seen)
     assert not valid(seen)[25:37].any()
@@ -304,7 +304,7 @@ def test_while_images_are_refused_the_bound_grows_with_time():
 
 
 def test_while_something_hides_the_gripper_a_held_transform_has_no_bound():
-    """The mount is knocked meanwhile, as nobody can see."""
+    """The mount is knocked meanwhile, as no one can see."""
     plate = Prop(size_m=(0.3, 0.002, 0.2), centre_m=(0.0, -0.025, 0.0), look=PLAIN, start_s=BEGINS_S)
     seen = watched(scene(36, props=(plate,), mount=(along_fingers(5e-3, 24.4 / FPS),)))
     held = [i for i, r in enumerate(seen.records) if r.state is State.OCCLUDED and r.cam_T_grip is not None]

@@ -106,7 +106,7 @@ def test_measurements_that_contradict_the_others_are_told_apart():
     agree = agreeing([(true + wrong)[k] for k in order], [A] * 17)
     assert (agree == (order < 10)).all()
     assert agreeing([NOMINAL], [A]).tolist() == [True]
-    # A wrong one that is as uncertain as it is wrong contradicts nobody.
+    # A wrong one that is as uncertain as it is wrong contradicts no one.
     assert agreeing([NOMINAL, NOMINAL, perturb(NOMINAL, 30.0 * SIGMAS)], [A, A, 900.0 * A]).all()
 
 
@@ -183,7 +183,7 @@ def test_cameras_that_cannot_be_compared_are_refused():
     small = PaperLens(width_px=320, height_px=240, fx_px=300.0, fy_px=300.0, cx_px=160.0, cy_px=120.0)
     with pytest.raises(CalibrationError, match="640 x 480 px and of 320 x 240 px; one camera in one size"):
         compare_cameras(GivenCamera(BROWN.settings(PARAMETERS)), GivenCamera(small))
-    with pytest.raises(CalibrationError, match="kappa_per_px2 is no parameter of this camera"):
+    with pytest.raises(CalibrationError, match="kappa_per_px2 is not a parameter of this camera"):
         compare_cameras(
             GivenCamera(BROWN.settings(PARAMETERS), ("kappa_per_px2",), np.eye(1)),
             GivenCamera(BROWN.settings(PARAMETERS)),

@@ -1,4 +1,4 @@
-"""The whole way of a new user, by the commands that the README names: a camera and a gripper of which nobody has a file
+"""The whole way of a new user, by the commands that the README names: a camera and a gripper of which no one has a file
 become a monitor that notices a knock.  Commands and pages write every file: the tests write none.  Truth comes from
 the simulator.
 """

@@ -63,9 +63,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     cause_probability: Annotated[float | None, _is("of that cause, 0 to 1; null: it was not weighed")] = None
     part: Annotated[str | None, _is("the finger that the cause is about")] = None
     causes: Annotated[tuple[CauseWeight, ...], _is("all that were weighed")] = ()
-    moved: Annotated[Displacement | None, _is("by how much the event itself moved the TCP; null: it is no motion")] = (
-        None
-    )
+    moved: Annotated[Displacement | None, _is("by how much the event itself moved the TCP; null: not a motion")] = None
     moved_in_s: Annotated[float | None, _is("time for 95 % of that; 0: at once")] = None
     rate_m_per_min: Annotated[float | None, _is("of a creep, by its last alert")] = None
     alert_id: Annotated[str, _is("of the alert; empty: of none")] = ""
@@ -287,7 +285,7 @@ def date(stamp_ns: int) -> str:
 
 
 def period(start_ns: int, end_ns: int) -> str:
-    """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is no date."""
+    """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is not a date."""
     times = f"{clock_time(start_ns, 0)} to {clock_time(end_ns, 0)}"
     if 0 <= start_ns < _FIRST_YEAR_NS:
         return f"{times} by a clock that began with the images, or with 1970"

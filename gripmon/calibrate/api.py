@@ -137,11 +137,11 @@ def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
     for name, value in fixed.items():
         fault = None
         if name not in (*known, "aspect"):
-            fault = f"is no parameter of the model; {', '.join(known)} or aspect"
+            fault = f"is not a parameter of the model; {', '.join(known)} or aspect"
         elif name == "aspect" and value is not None:
             fault = "takes no value: pixels are square"
         elif value is not None and not math.isfinite(value):
-            fault = f"is no number; {name}=VALUE"
+            fault = f"is not a number; {name}=VALUE"
         elif name in ("fx_px", "fy_px") and (value is None or value <= 0.0):
             fault = f"at what isn't said; {name}=VALUE (px), above 0"
         if fault is not None:

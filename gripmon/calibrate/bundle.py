@@ -37,7 +37,7 @@ LARGEST_ITERATIONS = 200
 OUTLIER = 5.0
 """Normalised residual, in robust standard deviations, beyond which a point is left out at the end."""
 STRANGE = 0.5
-"""Part of a view's points that fit, below which it is no view of the same target by the same camera."""
+"""Part of a view's points that fit, below which it is not a view of the same target by the same camera."""
 PARALLEL = float(np.cos(np.radians(3.0)))
 ROUNDS = 12
 """Rounds of weights, and of the offsets of discs' centres, at most."""
@@ -460,7 +460,7 @@ class GivenCamera:
         names = parameter_names(model_of(self.lens))
         unknown = [name for name in self.parameters if name not in names]
         if unknown:
-            raise CalibrationError(f"{unknown[0]} is no parameter of this camera; one of {', '.join(names)}")
+            raise CalibrationError(f"{unknown[0]} is not a parameter of this camera; one of {', '.join(names)}")
         out = np.zeros((len(names), len(self.parameters)))
         out[[names.index(name) for name in self.parameters], np.arange(len(self.parameters))] = 1.0
         if "fx_px" in self.parameters and "fy_px" not in self.parameters:

@@ -55,13 +55,13 @@ class FileValues:
     def number(self, key: str, value: Any) -> float:
         number = as_number(value)
         if number is None:
-            raise self.fault(key, f"{_shown(value)} is no number", "an ordinary number")
+            raise self.fault(key, f"{_shown(value)} is not a number", "an ordinary number")
         return number
 
     def pixels(self, key: str, value: Any) -> int:
         number = self.number(key, value)
         if number != int(number):
-            raise self.fault(key, f"{_shown(value)} is no whole number", "a number of pixels")
+            raise self.fault(key, f"{_shown(value)} is not a whole number", "a number of pixels")
         return int(number)
 
     def numbers(self, key: str, counts: tuple[int, ...], right: str) -> tuple[float, ...]:
@@ -81,7 +81,7 @@ class FileValues:
     def choice(self, key: str, value: Any, names: Mapping[str, Any], right: str) -> Any:
         """What one of several names stands for."""
         if value not in names:
-            raise self.fault(key, f"{_shown(value)} is no model of gripmon's", right)
+            raise self.fault(key, f"{_shown(value)} is not a model of gripmon's", right)
         return names[value]
 
     def pinhole(self, key: str) -> Pinhole:
@@ -233,7 +233,7 @@ def read_kalibr(data: bytes, file: str, which: str | None = None) -> LensSetting
         raise values.fault("", f"holds {len(cameras)} cameras", f"--camera {' or '.join(cameras)}")
     key = which or cameras[0]
     if key not in cameras:
-        raise values.fault(key, "is no camera of this file", " or ".join(cameras))
+        raise values.fault(key, "is not a camera of this file", " or ".join(cameras))
     camera = values.below(key)
     camera.choice("camera_model", camera.value("camera_model", "pinhole"), {"pinhole": None}, "pinhole")
     models = "radtan, equidistant or none"
@@ -272,7 +272,7 @@ def read_mrcal(data: bytes, file: str) -> LensSettings:
     try:
         content = ast.literal_eval(data.decode("utf-8-sig").strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
-        raise InterchangeError(file, "", "is no Python literal", _MRCAL) from None
+        raise InterchangeError(file, "", "is not a Python literal", _MRCAL) from None
     if not isinstance(content, dict):
         raise InterchangeError(file, "", f"holds {_shown(content)}", _MRCAL)
     values = FileValues(file, content, _MRCAL)

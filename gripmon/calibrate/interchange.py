@@ -37,7 +37,7 @@ from gripmon.model.records import Array, Transform
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0
-"""A fit that is farther off than this is no calibration."""
+"""A fit that is farther off than this is not a calibration."""
 _BROWN_COUNTS = {"ros": (4, 5, 8, 12), "kalibr": (4,), "opencv": (4, 5, 8, 12), "mrcal": (4, 5, 8, 12)}
 _FITTED_COUNTS = {"ros": (5, 8), "kalibr": (4,), "opencv": (5, 8), "mrcal": (5, 8)}
 _FISHEYE = ("ros", "kalibr", "opencv")

@@ -287,7 +287,8 @@ def _free(model: ModelName, fixed: frozenset[str]) -> tuple[tuple[str, ...], Arr
     names = parameter_names(model)
     unknown = fixed - set(names) - {"aspect"}
     if unknown:
-        raise CalibrationError(f"{sorted(unknown)[0]} is no parameter of {model}; one of {', '.join(names)} or aspect")
+        known = f"{', '.join(names)} or aspect"
+        raise CalibrationError(f"{sorted(unknown)[0]} is not a parameter of {model}; one of {known}")
     columns, kept = [], []
     for i, name in enumerate(names):
         if name in fixed or (name == "fy_px" and "aspect" in fixed):
@@ -379,7 +380,7 @@ class IntrinsicsResult:
 
 
 def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
-    """Refuse what is no calibration: :class:`CalibrationError`."""
+    """Refuse what is not a calibration: :class:`CalibrationError`."""
     if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
         raise CalibrationError(
             f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "

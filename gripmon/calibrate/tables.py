@@ -50,7 +50,7 @@ def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list
     """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
-        raise InputError(f"{path}: is no table; a .csv, .yaml or .json file")
+        raise InputError(f"{path}: is not a table; a .csv, .yaml or .json file")
     if suffix == ".csv":
         return _csv_rows(path, right)
     if suffix == ".json":
@@ -62,7 +62,7 @@ def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list
         values = read_mapping(str(path), _text(path, right).encode(), _SAMPLES)
     samples = values.get("samples") if isinstance(values, dict) else values
     if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
-        raise InputError(f"{path}: samples is no list of samples; {_SAMPLES}")
+        raise InputError(f"{path}: samples is not a list of samples; {_SAMPLES}")
     return samples, [f"sample {k + 1}" for k in range(len(samples))]
 
 
@@ -145,7 +145,7 @@ def _nested(value: Any, place: str) -> Array:
         rotation = _list(value["rotation_xyzw"], 4, f"{place}: base_T_ee.rotation_xyzw")
         return make_transform(_from_quaternion(rotation, place), np.array(position))
     if not isinstance(value, list) or len(value) != 4:
-        raise ValueError(f"{place}: base_T_ee is no transform; translation_m and rotation_xyzw, or 4 x 4 numbers")
+        raise ValueError(f"{place}: base_T_ee is not a transform; translation_m and rotation_xyzw, or 4 x 4 numbers")
     lines = [_list(line, 4, f"{place}: a row of base_T_ee") for line in value]
     return checked_transform(np.array(lines), place)
 

@@ -46,7 +46,7 @@ def _length(text: str) -> tuple[float, float]:
         )
     found = positive_number(value), positive_number(sigma)
     if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is no distance at a wrist (millimetres?); metres")
+        raise argparse.ArgumentTypeError(f"{value} m is not a distance at a wrist (millimetres?); metres")
     if found[1] > 0.5 * found[0]:
         raise argparse.ArgumentTypeError(
             f"'{text}': a standard deviation of more than half of it says nothing; smaller"

@@ -28,7 +28,7 @@ _EXAMPLES = """\
   gripmon run configs/live_camera.yaml
   gripmon run configs/demo.yaml --duration 60 --out results
 
-  gripmon run configs/live_camera.yaml --fresh-state     begin anew; the kept state is set aside
+  gripmon run configs/live_camera.yaml --fresh-state     begin again; the kept state is set aside
   gripmon send undo --robot arm1                         back to the reference before
   gripmon run configs/live_camera.yaml --view web        watch it live in a browser, on this machine
 

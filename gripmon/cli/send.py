@@ -55,7 +55,7 @@ exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
 def send(arguments: Arguments) -> int:
     """Tell a running monitor something, and print its answer.
 
-      recalibrate       measure the reference anew from what the camera sees
+      recalibrate       measure the reference again from what the camera sees
       accept [ID]       take the proposed reference
       reject [ID]       forget the proposed reference
       undo [ID]         go back to the reference before, or to the one named: a new revision with that
@@ -102,7 +102,7 @@ def _misuse(arguments: Arguments) -> str:
     if name != "snapshot" and arguments.out is not None:
         return f"{name} writes nothing; leave --out out"
     if name in ("state", "snapshot") and arguments.request is not None:
-        return f"{name} changes nothing and is answered anew each time; leave --request out"
+        return f"{name} changes nothing and is answered again each time; leave --request out"
     return ""
 
 

@@ -50,7 +50,7 @@ def watch(arguments: Arguments) -> None:
     the open alerts: !! is for errors, ! for warnings, i for notes, each with their number, so that
     "!!1 !1" is one error and one warning; after them the text of the worst one.
 
-    On a terminal the table is drawn anew with every period. Elsewhere one line is printed whenever a
+    On a terminal the table is drawn again with every period. Elsewhere one line is printed whenever a
     monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
 
     With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and

@@ -105,7 +105,7 @@ def transform_message(payload: bytes) -> FrameRecord:
     smoothed, bounds = record.smoothed, record.protection
     for pose in (record.cam_T_grip, smoothed):
         if pose is not None and not abs(math.hypot(*pose.rotation_xyzw) - 1.0) < _UNIT_TOLERANCE:
-            raise MessageRefused("a transform that is no pose")
+            raise MessageRefused("a transform that is not a pose")
     for covariance in (record.covariance, None if smoothed is None else smoothed.covariance):
         if covariance is not None and min(covariance[::7]) < 0.0:
             raise MessageRefused("a covariance with a variance below 0")

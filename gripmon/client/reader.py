@@ -40,8 +40,8 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 class NotCarriedOut(Exception):
     """A command got no answer of the monitor itself: none is there, or it had no time for it; ``fault`` says which.
 
-    A refusal is no exception but an answer: ``CommandReply.done`` is false.  Sent again with the same ``request_id`` it
-    is not carried out twice.
+    A refusal is not an exception but an answer: ``CommandReply.done`` is false.  Sent again with the same
+    ``request_id`` it is not carried out twice.
     """
 
     def __init__(self, text: str, fault: CommandFault | None = None, request_id: str = "") -> None:

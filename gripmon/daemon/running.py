@@ -30,7 +30,7 @@ from gripmon.model.records import Alert
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.record.write import Recorder
 
-_UNHURRIED_S = 10.0  # for the recording, when nobody asked for a stop
+_UNHURRIED_S = 10.0  # for the recording, when no one asked for a stop
 _SHORTEST_CLOSE_S = 0.5
 _SWITCH_INTERVAL_S = 0.0005
 

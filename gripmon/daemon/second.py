@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
 _PULSES_A_TURN = 16
 _NOT_HERE = (
-    "this is a second camera, which measures no reference of its own; to calibrate it anew: gripmon calibrate laser"
+    "this is a second camera, which measures no reference of its own; to calibrate it again: gripmon calibrate laser"
 )
 
 
@@ -101,7 +101,7 @@ class SecondCamera(Loop):
 
     def _between(self) -> None:
         now_s = time.monotonic()
-        for _ in range(_PULSES_A_TURN):  # so that nobody can keep frames waiting by sending pulses
+        for _ in range(_PULSES_A_TURN):  # so that no one can keep frames waiting by sending pulses
             told = None if self._feed is None else self._feed.poll()
             if told is None:
                 break

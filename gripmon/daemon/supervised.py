@@ -260,7 +260,7 @@ class Loop(ABC):
             self._deliver("alert's recording", self._recorder.alert, message)
 
     def _not_alone(self) -> str:
-        """What to say while other monitors have this name, else empty: nobody can tell then whose transform is right,
+        """What to say while other monitors have this name, else empty: no one can tell then whose transform is right,
         so that none is published.
         """
         nobody: tuple[str, ...] = ()
@@ -338,7 +338,7 @@ class Loop(ABC):
         )
 
     def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
-        """What somebody reports; one who fails at that is no reason to stop."""
+        """What someone reports; one who fails at that is no reason to stop."""
         try:
             return report()
         except Exception as error:  # noqa: BLE001  said

@@ -1,7 +1,7 @@
 """Metrics for Prometheus: what the state message says, counts of alerts and verdicts, and the latency's distribution.
 
 The loop's thread only adds to a few counters (:class:`Tally`); a thread of the HTTP server makes metrics of them when
-somebody asks.  The text format comes from ``prometheus-client``, an optional dependency (``gripmon[metrics]``) that is
+someone asks.  The text format comes from ``prometheus-client``, an optional dependency (``gripmon[metrics]``) that is
 imported when the server starts.
 """
 
@@ -141,7 +141,7 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = 10.0  # s, for somebody who connects and asks nothing
+    timeout = 10.0  # s, for someone who connects and asks nothing
 
     def log_message(self, format: str, *values: object) -> None:
         """Not a line for each question."""

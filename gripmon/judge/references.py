@@ -206,7 +206,7 @@ class ReferenceBook:
         )
 
     def _append(self, reference: ReferenceRecord) -> ReferenceRecord:
-        """Into force, but kept before: a crash must not take back what somebody rests on, nor free its revision."""
+        """Into force, but kept before: a crash must not take back what someone rests on, nor free its revision."""
         references = (*self._references, reference)
         if len(references) > KEPT:
             references = (references[0], *references[2:])
@@ -242,10 +242,10 @@ def state_fault(state: MonitorState) -> str:
     if fault:
         return fault
     if state.cam_T_grip is not None and not _is_pose(state.cam_T_grip):
-        return "the last transform is no pose"
+        return "the last transform is not a pose"
     error = state.reference_error
     if error is not None and not (len(error) == 6 and np.isfinite(error).all()):
-        return "the error of the configured reference is no six finite numbers"
+        return "the error of the configured reference is not six finite numbers"
     if len({alert.topic for alert in state.alerts}) != len(state.alerts):
         return "two open alerts on one topic"
     if state.alerts_raised < len(state.alerts):
@@ -282,7 +282,7 @@ def chain_fault(
         if after.restores is not None:
             restored = known.get(after.restores)
             if (restored is None and not has_gap) or (restored is not None and restored.restores):
-                return f"{after.reference_id} restores {after.restores}, which is no earlier reference"
+                return f"{after.reference_id} restores {after.restores}, which is not an earlier reference"
     return _numbers_fault(every if numbers_of is None else numbers_of)
 
 

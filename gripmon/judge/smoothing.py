@@ -9,7 +9,7 @@ the identification of variances and adaptive Kalman filtering", 1970), axis by a
   reported variance stays in the average's.  More scatter than reported is vibration, which the average must not hide;
 - how fast the average itself walks: the process noise.
 
-A pose that leaves the average twice in a row starts it anew; while frames lie farther from the average than noise
+A pose that leaves the average twice in a row starts it again; while frames lie farther from the average than noise
 explains, the transform follows the frames instead.
 """
 
@@ -34,7 +34,7 @@ freedom).
 """
 
 SETTLING, SETTLING_GATE = 20, 14.0
-"""So many frames after a start a frame that is surprising by less starts the average anew, and at once: what has just
+"""So many frames after a start a frame that is surprising by less starts the average again, and at once: what has just
 moved may swing.  A needless start costs little then."""
 
 SMALLEST_VARIANCE_RATIO = 0.4
@@ -69,7 +69,7 @@ WALK_BOUNDS = (1e-3, 10.0)
 """Learnt process noise (variance) over that of the settings: least and most."""
 
 KEPT_FRAMES = 64
-"""Newest frames from which the average can start anew at the onset of a step."""
+"""Newest frames from which the average can start again at the onset of a step."""
 
 
 class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -127,7 +127,7 @@ class QuietTime:
         self._since_s += elapsed_s
 
     def interrupt(self) -> None:
-        """The average was started anew, or time isn't quiet: no way goes on across this."""
+        """The average was started again, or time isn't quiet: no way goes on across this."""
         self._start_T = None
 
     def add(self, share: Array, ripe: Array, mean_T: Array, variance: Array) -> None:
@@ -296,13 +296,13 @@ class PoseAverage:
         self._stays: Array = np.ones(6)
 
     def forget(self) -> None:
-        """Start anew with the next measurement; what quiet time has taught stays."""
+        """Start again with the next measurement; what quiet time has taught stays."""
         self.cam_T_grip = None
         self._newest.clear()
         self.learnt.interrupt()
 
     def step(self, frames: int) -> None:
-        """The pose has stepped, and the newest ``frames`` measurements were made after that: start anew from them."""
+        """The pose has stepped, and the newest ``frames`` measurements were made after that: start again from them."""
         since = list(self._newest)[-min(frames, KEPT_FRAMES) :] if frames > 0 else []
         self.forget()
         for cam_T_grip, covariance in since:

@@ -146,7 +146,7 @@ def unpack(data: bytes) -> Kept:
             raise ValueError(f"it has format {version}, and this version of gripmon reads format {FORMAT}")
         read = msgspec.json.decode(content, type=_Read)
     except _UNREADABLE as error:
-        raise ValueError(f"its content is no state: {error}") from None
+        raise ValueError(f"its content is not a state: {error}") from None
     kept = Kept(read.format, read.owner, MonitorState(**msgspec.structs.asdict(read.state)))
     if fault := state_fault(kept.state):
         raise ValueError(f"its content contradicts itself: {fault}")
@@ -240,7 +240,7 @@ class StateFile:
         """Write into the lock's file whose it is, and the newest revision, which a damaged state no longer tells."""
         revision = b"" if self._newest_revision is None else b" %d" % self._newest_revision
         note = b"%d%s\n" % (os.getpid(), revision)
-        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only nobody can say whose
+        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only no one can say whose
             os.pwrite(descriptor, note, 0)
             os.ftruncate(descriptor, len(note))
 
@@ -288,7 +288,7 @@ class StateFile:
         )
 
     def _bytes(self) -> bytes:
-        """The file's content.  A pipe or a folder is no state file, and a pipe would be waited for."""
+        """The file's content.  A pipe or a folder is not a state file, and a pipe would be waited for."""
         mode = self._path.stat().st_mode
         if not stat.S_ISREG(mode):
             kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"

@@ -348,4 +348,4 @@ def _root(lens: GivenCamera) -> Array:
     try:
         return whitening(np.asarray(lens.covariance))
     except np.linalg.LinAlgError:
-        raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
+        raise CalibrationError("the camera's covariance is not a covariance (not positive definite)") from None

@@ -125,7 +125,7 @@ def _touches_border(blob: _Blob, shape: tuple[int, ...]) -> bool:
 
 
 def _measured(scene: _Scene, blob: _Blob) -> Spot | None:
-    """Centroid of what stands out; None for what is no spot, or not seen whole."""
+    """Centroid of what stands out; None for what is not a spot, or not seen whole."""
     signal, noise = scene.signal, scene.noise
     window, inside = blob.window, blob.inside
     top, left = window[0].start, window[1].start

@@ -181,12 +181,12 @@ def _check_finite(key: str, values: tuple[float, ...]) -> None:
 def _check_pinhole(settings: PinholeSettings) -> None:
     for key in ("width_px", "height_px"):
         if not 16 <= getattr(settings, key) <= 20000:
-            raise ValueError(f"{key}: {getattr(settings, key)} is no image size; right would be 16 to 20000 px")
+            raise ValueError(f"{key}: {getattr(settings, key)} is not an image size; right would be 16 to 20000 px")
     for key in ("fx_px", "fy_px"):
         value, most = getattr(settings, key), _MAX_FOCAL_WIDTHS * settings.width_px
         if not _MIN_FOCAL_PX <= value <= most:
             raise ValueError(
-                f"{key}: {value:g} px is no focal length for an image {settings.width_px} px wide (metres, mm or "
+                f"{key}: {value:g} px is not a focal length for an image {settings.width_px} px wide (metres, mm or "
                 f"a ratio?); right would be the focal length over the pixel pitch, {_MIN_FOCAL_PX:g} to {most:g} px"
             )
     if not 1.0 / _MAX_ASPECT <= settings.fy_px / settings.fx_px <= _MAX_ASPECT:

@@ -82,7 +82,7 @@ def rotation_from_xyzw(quaternion: tuple[float, float, float, float]) -> Array:
     x, y, z, w = quaternion
     n = x * x + y * y + z * z + w * w
     if not n > 0.0:
-        raise ValueError("a quaternion of length zero is no rotation")
+        raise ValueError("a quaternion of length zero is not a rotation")
     s = 2.0 / n
     return np.array(
         [

@@ -63,7 +63,7 @@ def parse_target(text: str) -> Target:
     kind, *parts = text.split(":")
     kind = "chequerboard" if kind == "checkerboard" else kind
     if kind not in _FORMS:
-        raise TargetError(f"'{kind}' is no target; {' or '.join(_FORMS.values())}")
+        raise TargetError(f"'{kind}' is not a target; {' or '.join(_FORMS.values())}")
     right = _FORMS[kind]
     lengths = {"chequerboard": (2, 2), "charuco": (3, 4), "circles": (3, 3)}[kind]
     if not lengths[0] <= len(parts) <= lengths[1]:

@@ -71,7 +71,7 @@ class CauseAnalysis:
         self._calm = calm
 
     def interrupted(self) -> None:
-        """No frames came for long: somebody may have exchanged the camera meanwhile, until all has been calm again."""
+        """No frames came for long: someone may have exchanged the camera meanwhile, until all has been calm again."""
         self._do(lambda judge: judge.interrupted())
         self._calm = min(self._calm, LULL_FRAMES + 1)
 

@@ -250,7 +250,7 @@ class Monitor:
         return alerts
 
     def learn(self) -> None:
-        """Learn from the newest frame what nothing waits for, in some 2 ms; :meth:`process` does it first if nobody
+        """Learn from the newest frame what nothing waits for, in some 2 ms; :meth:`process` does it first if no one
         has.
         """
         self._trust.learn()
@@ -303,7 +303,7 @@ class Monitor:
         self, frame: Frame, measurement: Measurement, before_T: Array, drift: Drift, doubtful: bool
     ) -> Evidence:
         assert self._covariance is not None and self._standing is not None
-        # Motion that the profiles can follow from frame to frame is no jump.
+        # Motion that the profiles can follow from frame to frame is not a jump.
         looked_far = measurement.effort is not Effort.NARROW
         reach_px = self._settings.corners.sampling.reach_px
         jumped = looked_far and self._tracker.moved_px(measurement, before_T) > reach_px
@@ -378,7 +378,7 @@ class Monitor:
         if self.reference is not before:
             self._begin()
         wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
-        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # nobody reads a look
+        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # no one reads a look
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:

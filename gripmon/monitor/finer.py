@@ -19,7 +19,7 @@ DIFFERENT = 0.5
 """Share of a finger's blocks that look otherwise than at first, from which it looks different: grasps hide a half."""
 
 DIFFERENT_S = 300.0
-"""For how long it does, or the look contradicts the edges, until that is told and the look learnt anew, s: robots hold
+"""For how long it does, or the look contradicts the edges, until that is told and the look learnt again, s: robots hold
 what they grasp for seconds or a minute.
 """
 
@@ -106,7 +106,7 @@ class FinerLook:
         names = [f"finger {name}" for name, now in zip(self._names, long[:-1].tolist(), strict=True) if now]
         text = f"the gripper looks different: {', '.join(names)}, for {now_s - self._since_s[long].min():.0f} s"
         if long[-1]:
-            text = "the gripper's look contradicts its edges, which count alone while it is learnt anew"
+            text = "the gripper's look contradicts its edges, which count alone while it is learnt again"
             self._alignment.forget()
             self._fusion.forget()
         self._due.append(Alert(AlertKind.GRIPPER, Cause.UNKNOWN, Severity.WARNING, text))

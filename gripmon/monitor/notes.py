@@ -12,7 +12,7 @@ from gripmon.monitor.settings import MonitorSettings
 
 
 class NoteTaker:
-    """Gathers notes; the limits, which change slowly, only when the test has reckoned them anew."""
+    """Gathers notes; the limits, which change slowly, only when the test has reckoned them again."""
 
     def __init__(self, settings: MonitorSettings):
         self._policy, self._tolerated = settings.policy, _six(settings.drift.tolerated)

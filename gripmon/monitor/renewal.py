@@ -1,4 +1,4 @@
-"""The reference renewed: measured anew past the limit, accepted by an operator, or taken back by one."""
+"""The reference renewed: measured again past the limit, accepted by an operator, or taken back by one."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class Renewal:
         )
 
     def moved(self) -> None:
-        """The camera doesn't stand still, or needs no new reference: begin to collect anew."""
+        """The camera doesn't stand still, or needs no new reference: begin to collect again."""
         if self._collects:
             self._recalibrator.forget()
             self._collects = False
 
     def collect(self, frame: Frame, standing: Standing, judgement: Judgement) -> bool:
         """Past the limit, or when an operator wants it, collect a frame whose pose is believed: whether there are
-        enough to measure the reference anew.
+        enough to measure the reference again.
         """
         if judgement.state is not State.RECALIBRATING and not self.wanted:
             self.moved()
@@ -131,7 +131,7 @@ class Renewal:
         cause = explanation.probable.cause
         if self.wanted and cause in NO_REFERENCE:
             self.wanted = False
-            text = f"not calibrated anew, as an operator wanted: {explanation.text or cause}"
+            text = f"not calibrated again, as an operator wanted: {explanation.text or cause}"
             return self._policy.refused(text, explanation, now_s, stamp_ns)
         again = self._unkept is not None and self._unkept is self.book.proposal and now_s >= self._keep_again_s
         known = (None if again else self.book.proposal, self._rejected)
@@ -146,7 +146,7 @@ class Renewal:
             if self.book.proposal is not None:
                 self.book.reject()  # of another place, and no longer told of
             why = "as an operator wanted" if asked else "though past the limit"
-            return self._policy.refused(f"not calibrated anew, {why}: {outcome.text}", explanation, now_s, stamp_ns)
+            return self._policy.refused(f"not calibrated again, {why}: {outcome.text}", explanation, now_s, stamp_ns)
         moved = (
             f"the TCP has moved by {1e3 * math.hypot(*drift.tcp_shift_m):.2f} mm, turned by "
             f"{math.degrees(drift.rotation_rad):.2f} degrees"
@@ -165,7 +165,7 @@ class Renewal:
             return self._not_kept(draft, str(refusal), asked, explanation, now_s, stamp_ns)
         self._rejected = self._unkept = None
         text = (
-            f"{moved}; it was calibrated anew from {outcome.inputs.frames} frames, corners "
+            f"{moved}; it was calibrated again from {outcome.inputs.frames} frames, corners "
             f"{', '.join(outcome.inputs.corners)}: revision {self.book.current.revision}"
         )
         done = Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)

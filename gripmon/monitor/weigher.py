@@ -192,11 +192,11 @@ class Weigher:
         rows = self._about(trust.fits.edges)[1]
         if self.anchor is not None:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
-            # A knock is no vibration, but what rings after it is.
+            # A knock is not a vibration, but what rings after it is.
             noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
             self.swing = self.swing + (np.minimum(square, DISPLACED_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
         elif trust.displaced:
-            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
+            # Knocked while no one watched, or marks on the fingers, or a wrong model: a person has to say.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
@@ -270,7 +270,7 @@ class Weigher:
 
     def _refitted(self, measurement: Measurement, now_s: float, wander: Array) -> tuple[Refits, Anchored]:
         """The fits of a measurement, alone and with the anchor after a way with the variances ``wander`` (6,).  A frame
-        is weighed anew when its ends were looked at, and for another pose that it allows.
+        is weighed again when its ends were looked at, and for another pose that it allows.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected

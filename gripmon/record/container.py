@@ -119,7 +119,7 @@ class RrdFile:
     def spans(self) -> Iterator[Span]:
         """All whole messages in the order of the file, about a megabyte at a time.
 
-        Ends at the file's end or at the first place that is no message, which goes to ``faults``.
+        Ends at the file's end or at the first place that is not a message, which goes to ``faults``.
         """
         with self.path.open("rb") as file:
             begin = end = _FILE_HEADER_BYTES
@@ -168,7 +168,7 @@ class RrdFile:
         if self.size == 0:
             raise UnreadableFileError("is empty")
         if header[: len(MAGIC)] != MAGIC:
-            raise UnreadableFileError("is no rerun recording, whatever its name says")
+            raise UnreadableFileError("is not a rerun recording, whatever its name says")
         if len(header) < _FILE_HEADER_BYTES:
             raise UnreadableFileError("is cut short within its header")
         written, ours = tuple(header[4:7]), _rerun_version()
@@ -331,7 +331,7 @@ def texts_of(batch: Any, component: str) -> list[str]:
 
 def _fields(message: bytes) -> dict[int, Any]:
     """As much of protobuf (developers.google.com, Encoding) as a few fields take: number -> int or bytes, of a repeated
-    field the first.  Raises ValueError for what is no message.
+    field the first.  Raises ValueError for what is not a message.
     """
     found: dict[int, Any] = {}
     offset = 0

@@ -337,7 +337,7 @@ def _file_name(value: str) -> str:
 
 def frame_rows(frames: FrameTable, recording_id: str, file_number: int) -> pa.Table:
     """The table ``frames``, a row a frame, in the given order.  NaN, and -1 where a number isn't known, become null."""
-    with np.errstate(invalid="ignore"):  # what is no covariance has no deviation
+    with np.errstate(invalid="ignore"):  # what is not a covariance has no deviation
         sigma_m = np.sqrt(np.diagonal(frames.covariance, axis1=1, axis2=2)[:, :3])
     axes = [f"{axis}_m" for axis in _AXES]
     poses = (("cam_T_grip", frames.cam_T_grip, _POSE), ("smoothed", frames.smoothed, _POSE),

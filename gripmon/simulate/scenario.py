@@ -70,7 +70,7 @@ class Vibration(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Tilt(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="tilt"):
-    """Somebody loosens the mount and turns it: a smooth change within ``time_s`` (0: at once)."""
+    """Someone loosens the mount and turns it: a smooth change within ``time_s`` (0: at once)."""
 
     start_s: Time = 1.0
     time_s: Annotated[float, Meta(ge=0.0, le=1e7, description="how long the change takes (s)")] = 0.5

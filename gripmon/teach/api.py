@@ -237,7 +237,7 @@ _HEADER = """\
 # It belongs to exactly this camera, gripper file, reference and edge settings, and is refused with any others.
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
-#                       sight, positive to the right of somebody who walks along it in the image (m); sigma_m: its
+#                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its
 #                       standard deviation
 #   edges.*.depth_m     how much deeper it lies, along the line of sight; follows from the shape of a bevel (m)
 #   edges.*.crease      true: between two visible faces; false: an outline

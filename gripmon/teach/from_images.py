@@ -2,7 +2,7 @@
 
 The images show outlines and inner edges in pixels (:mod:`~gripmon.teach.image_outline`), perspective and the jaws'
 motion their places in space up to one length (:mod:`~gripmon.teach.finger_depth`, :mod:`~gripmon.teach.image_motion`),
-which somebody gives, a calibration knows, or the openings in metres tell.
+which someone gives, a calibration knows, or the openings in metres tell.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def gripper_from_images(
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
     except GripperError as error:
-        raise NoResultError(f"what the images show is no gripper that can be tracked: {error}") from None
+        raise NoResultError(f"what the images show is not a gripper that can be tracked: {error}") from None
     if pose is None:
         cam_T_grip = make_transform(placed.rotation, placed.tcp * scale[0])
         covariance = _covariance(made.fx_px, placed, scale, seen)

@@ -165,7 +165,7 @@ class HandEyeOnPlate:
         try:
             return Gripper(inferred_model(name, outline, points_m, jaw_range_m, jaw_opening_m, provenance))
         except GripperError as error:
-            raise CalibrationError(f"what the corners show is no gripper: {error}") from None
+            raise CalibrationError(f"what the corners show is not a gripper: {error}") from None
 
     def document(self, gripper: Gripper, provenance: Provenance) -> HandEyeCalibration:
         """What a file holds of it."""

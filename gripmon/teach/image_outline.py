@@ -167,7 +167,7 @@ def _fingers(
         seen.append(FingerSeen(mask, tuple(own), tuple(inner), _outwards(mask)))
     if len(seen) > MOST_PARTS:
         raise NoResultError(
-            f"{len(seen)} separate parts stay the same, which is no gripper: the camera or the jaws moved between the "
+            f"{len(seen)} separate parts stay the same: not a gripper; the camera or the jaws moved between the "
             "images, or they show too few backgrounds"
         )
     if not seen:
@@ -190,7 +190,7 @@ def _outwards(mask: NDArray[np.bool_]) -> Array:
         root = centre.copy()
         nearest = int(gaps.argmin())
         root[nearest % 2] = 0.0 if nearest < 2 else last[nearest % 2]
-    # The outermost hundredth: one pixel is no tip.
+    # The outermost hundredth: one pixel is not a tip.
     away = np.linalg.norm(points - root, axis=1)
     tip = points[away >= np.quantile(away, 0.99)].mean(axis=0)
     return np.asarray((tip - root) / np.linalg.norm(tip - root))

@@ -26,7 +26,7 @@ in none of a million pixels (chi-squared)."""
 MOST_STILL_SHARE = 0.9
 """Of the image: a gripper that hides more than this of a wrist camera's view leaves no background to be told from."""
 FEWEST_STILL_SHARE = 0.005
-"""Of the image: less is no fingertip that could be tracked (0.5 % of 640 x 480 px is 40 x 38 px)."""
+"""Of the image: less is not a fingertip that could be tracked (0.5 % of 640 x 480 px is 40 x 38 px)."""
 ALIKE_SHARE = 0.8
 """Part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
 _STEP = 3

@@ -62,7 +62,9 @@ def outlines_of(rough: Mapping[str, tuple[float, float]]) -> Outline:
     known = [f"{finger}_{kind}_{side}" for finger in FINGERS for kind in POINTS for side in SIDES]
     strange = [name for name in rough if name not in known]
     if strange:
-        raise CalibrationError(f"corners.{strange[0]}: is no name of a fingertip's corner; one of {', '.join(known)}")
+        raise CalibrationError(
+            f"corners.{strange[0]}: is not a name of a fingertip's corner; one of {', '.join(known)}"
+        )
     missing = [name for name in INNERMOST if name not in rough]
     if missing:
         raise CalibrationError(f"corners.{missing[0]}: is missing; the four innermost corners {', '.join(INNERMOST)}")

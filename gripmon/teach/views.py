@@ -82,7 +82,7 @@ class Viewer:
     """Measures teaching images with one camera, gripper and reference.
 
     ``crease`` (e,) which edges lie between two visible faces at the reference, ``inside`` (e,) on which side of an edge
-    its finger lies (1: to the right of somebody who walks along it, -1: to the left), ``turned`` (i, e) by what angle
+    its finger lies (1: to the right of someone who walks along it, -1: to the left), ``turned`` (i, e) by what angle
     the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold (rad).
     """
 

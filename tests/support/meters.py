@@ -73,7 +73,7 @@ def measure(
 
 @lru_cache(maxsize=64)
 def picture(scenario: Scenario, index: int = 0, seed: int = 1, lens: LensSettings = PAPER_LENS) -> np.ndarray:
-    """A rendered image that nobody may change, of the sharp box fingers at the nominal pose."""
+    """A rendered image that no one may change, of the sharp box fingers at the nominal pose."""
     image = simulated(scenario, seed, lens).render(index)
     image.flags.writeable = False
     return image

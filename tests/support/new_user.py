@@ -32,7 +32,7 @@ class NewUser:
     corners_px: dict[str, Array]
 
     def rough_px(self, rng: np.random.Generator, off_px: float) -> dict[str, Array]:
-        """Where somebody puts the corners."""
+        """Where someone puts the corners."""
         return {name: at + rng.uniform(-off_px, off_px, 2) for name, at in self.corners_px.items()}
 
 

@@ -111,7 +111,7 @@ def true_name(name: str) -> str:
 
 
 def rough(points: dict[str, np.ndarray], seed: int, off_px: float = 5.0) -> dict[str, tuple[float, float]]:
-    """Somebody's guess: up to so many pixels off in u and v."""
+    """Someone's guess: up to so many pixels off in u and v."""
     rng = np.random.default_rng(seed)
     return {
         name: (float(u), float(v))

@@ -57,7 +57,7 @@ def good_note(**more: Any) -> dict[str, Any]:
 
 
 def frames(seed: int, count: int) -> Iterator[Rubbish]:
-    """Frames by no camera.  A few are good by chance: a flipped bit in a JPEG, a field that nobody reads."""
+    """Frames by no camera.  A few are good by chance: a flipped bit in a JPEG, a field that no one reads."""
     rng = random.Random(seed)
     kinds: list[Callable[[random.Random], Rubbish]] = [
         lambda r: Rubbish(r.randbytes(r.randrange(200)), r.choice(ENCODINGS), r.choice([None, b"", b"{}"])),
@@ -102,7 +102,7 @@ def jaws(seed: int, count: int) -> Iterator[bytes]:
 
 
 def _is_opening(payload: bytes) -> bool:
-    """By chance it is one: a random byte "0", or a good message with a field that nobody minds."""
+    """By chance it is one: a random byte "0", or a good message with a field that no one minds."""
     try:
         value = json.loads(payload)
     except (ValueError, RecursionError):

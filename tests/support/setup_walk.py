@@ -274,7 +274,7 @@ def main() -> None:
     driver = browser()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # Paths as somebody types them beside the project.
+        # Paths as someone types them beside the project.
         user = replace(new_user.make(folder), folder=Path(".."))
         shown = {step: f"setup_{step}" for step in ("plate", "corners", "check", "run")}
         _draw(driver, folder / "arm1", lambda visitor, at: walk(visitor, user, at), **shown)

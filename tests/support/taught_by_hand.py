@@ -1,4 +1,4 @@
-"""A simulated camera and gripper of which nobody has a configuration yet, as ``gripmon teach --page`` meets them."""
+"""A simulated camera and gripper of which no one has a configuration yet, as ``gripmon teach --page`` meets them."""
 
 from __future__ import annotations
 

@@ -294,7 +294,7 @@ def _replaced(rng: Rng, rig: Rig) -> Trial:
         read_noise_dn=float(rng.uniform(0.5, 4.0)),
         psf_sigma_px=float(rng.uniform(0.5, 0.9)),
     )
-    away_ns = int(1e9 * _log_uniform(rng, 10.0, 1000.0))  # nobody exchanges a camera within a frame
+    away_ns = int(1e9 * _log_uniform(rng, 10.0, 1000.0))  # no one exchanges a camera within a frame
 
     def frames() -> Iterator[Frame]:
         before, after = rig.simulator(), rig.simulator(lens, pose, sensor=sensor)

@@ -120,7 +120,7 @@ def count_alarms(
 ) -> dict[str, Alarms]:
     """Every chart on the same ``frames`` of each of ``streams`` streams in which the camera doesn't move.
 
-    After an alarm the stream's chart begins anew; alarms that follow one another within a second are one alert, as in
+    After an alarm the stream's chart begins again; alarms that follow one another within a second are one alert, as in
     the monitor.
     """
     counts = dict.fromkeys(charts, 0)

@@ -76,7 +76,7 @@ def measure(size: tuple[int, int, int], frame_format: str, *, shared: bool, fram
         command += [str(number) for number in (*size, frames, _FPS)]
         driver = subprocess.Popen(command)
         sizes: list[int] = []
-        subscribers: list[Any] = []  # one that nobody holds is undeclared
+        subscribers: list[Any] = []  # one that no one holds is undeclared
         link.attach(lambda session: subscribers.append(session.declare_subscriber(_KEY, _noting(sizes))))
         try:
             took_ms = _take(camera, driver)[_LEFT_OUT:]

@@ -194,7 +194,7 @@ def _short(value: float) -> float:
 
 def _settings(watched: Watched) -> MonitorSettings:
     """As an integrator sets them up: an alert limit that the view can't keep in most frames is raised to three
-    times what ``check`` foretells.
+    times what ``check`` predicts.
     """
     known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
     settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)

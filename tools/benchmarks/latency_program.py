@@ -65,7 +65,7 @@ class _Maker:
 
 
 class _Live(harness.RingSource):
-    """A camera that waits for nobody, switched on when the loop first asks; notes the time of its frames, and the
+    """A camera that waits for no one, switched on when the loop first asks; notes the time of its frames, and the
     loop's use of its core.
     """
 

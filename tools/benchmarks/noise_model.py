@@ -1,7 +1,7 @@
 """Streams of the monitor's errors at estimator level, as on simulated images: ten million frames in minutes.
 
 In units of the reported covariance (``z = L^-1 error`` with ``covariance = L L'``) the error is a sum of a level, that
-of a background that stands still, drawn anew when the robot moves on to the next scene; and of parts, each a
+of a background that stands still, drawn again when the robot moves on to the next scene; and of parts, each a
 first-order vector autoregression with its own correlation time, times the size that the errors had in one of the
 measured scenes.  Their innovations are Student's, times a strength that comes in bursts.  The reported covariance is
 that of the same measured scene, times a scale that wanders; a vibration of the mount is added as what it is, a motion.
@@ -194,7 +194,7 @@ class Streams:
 
 
 class _Scenes:
-    """When each stream's scene changes, at random once in ``scene_frames`` frames, and what is drawn anew then."""
+    """When each stream's scene changes, at random once in ``scene_frames`` frames, and what is drawn again then."""
 
     def __init__(self, scene_frames: float, move_frames: int, count: int, rng: np.random.Generator) -> None:
         self._rate, self._count, self._rng = 1.0 / scene_frames, count, rng

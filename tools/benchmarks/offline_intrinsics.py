@@ -46,7 +46,7 @@ Points = list[tuple[Array, Array]]
 
 @dataclass
 class Fits:
-    """What somebody found in all sets of images: ``error`` (n, 4) of fx, fy, cx, cy (px); ``mapping_px`` (n,) root mean
+    """What someone found in all sets of images: ``error`` (n, 4) of fx, fy, cx, cy (px); ``mapping_px`` (n,) root mean
     square over the image between where the true camera and the found one show a point, the best turn of the camera
     allowed; ``nees`` of the reported covariance over the reported parameters, each (n,) over their number.
     """

@@ -24,7 +24,7 @@ from gripmon.simulate.scenario import Sensor
 from gripmon.teach.hand_eye import KnownGripper, UnknownGripper
 
 ROUGH_PX = 4.0
-"""Somebody clicks on corners; they are off by up to so much."""
+"""Someone clicks on corners; they are off by up to so much."""
 PRINT_M = 5e-5
 TILT_RAD = float(np.radians(0.1))
 GAP_M = 1e-4

@@ -28,7 +28,7 @@ _ITERATIONS = 5
 """Linearisations of an update from the reference, some degrees away: as many as change anything."""
 
 SETTINGS = MeasurementSettings(sampling=SamplingSettings(samples=960))
-"""A pair is no stream of frames: edges are sampled at every pixel, for which 960 profiles suffice."""
+"""A pair is not a stream of frames: edges are sampled at every pixel, for which 960 profiles suffice."""
 
 CLUTTER = Background(kind="speckle")
 _EVERYWHERE = Patience(when_doubtful=True, when_lost=True)

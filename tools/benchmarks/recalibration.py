@@ -137,7 +137,7 @@ def trial(seed: int, number: int) -> Outcome:
 
 
 def _without_answer(states: list[Any], state: Any) -> str:
-    """What a trial comes to in which nobody asked for a new reference, or no frames were fit for one."""
+    """What a trial comes to in which no one asked for a new reference, or no frames were fit for one."""
     last = Counter(states[len(states) // 2 :])
     if last[state.LOST] + last[state.OCCLUDED] + last[state.ACQUIRING] > 0.2 * last.total():
         return "lost"

@@ -17,7 +17,7 @@ from benchmarks.scene import FPS
 
 _DAEMON = Path(__file__).parent / "recorded_daemon.py"
 _START_WITHIN_S = 60.0
-_FRAMES = 100_000  # nobody gets that far
+_FRAMES = 100_000  # no one gets that far
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 Errors of frames and what they report are those of :mod:`benchmarks.noise_model`.  In quiet time the camera doesn't move
 (in ``rough`` its mount vibrates, and the error is that against where it is at the time).  Then the camera steps, is
 knocked so that it rings down as in the simulator's ``bump``, or creeps, along camera y at the TCP by turning about its
-bracket; nobody tells the average.  Raw errors are those of the same frames.
+bracket; no one tells the average.  Raw errors are those of the same frames.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from benchmarks import options
 
 _DESCRIPTION = """\
 Root mean square error of the TCP, raw and smoothed, and the normalised error squared (NEES, 6 if the covariance is
-honest): in quiet time, after steps and knocks, and in creep, nobody telling the average that anything happened."""
+honest): in quiet time, after steps and knocks, and in creep, no one telling the average that anything happened."""
 
 _LEARNING_FRAMES = 3600
 _EVENT_FRAMES = 180

@@ -1,7 +1,7 @@
 """A subscriber that stalls, in a process of its own: ENDPOINT KEY… MODE.  Says ``ready``; ends when its input does.
 
 ``block``: its callback never returns, in Zenoh's own thread, so that nothing more is read from the network while the
-connection stays alive.  ``free``: it reads, until somebody stops the process.
+connection stays alive.  ``free``: it reads, until someone stops the process.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ _DESCRIPTION = """\
 Lets many monitors talk through one router (gripmon router) into one reader of everything and one alert log
 (gripmon watch --alerts), all on this machine, and prints what arrives, what is lost, how late, and what each
 monitor costs router and readers. Then the same with gripmon watch in place of the reader: a table needs no
-transforms, and where nobody wants them they aren't even sent.
+transforms, and where no one wants them they aren't even sent.
 
 The monitors are real where this is about the network: each has a session, a publisher and messages as
 gripmon run has. They process no images: one record, measured on a picture of the demo, is said again with

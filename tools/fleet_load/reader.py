@@ -1,7 +1,7 @@
 """One who reads of all monitors at once: ENDPOINT LEAVES [FILE], the leaves e.g. ``transform,state,alive``.
 
 As a table of monitors does, it keeps the last message of each; with FILE it writes every message there, a line each, as
-an alert log does, and asks for those that came before it.  A line ``mark`` on the input begins anew; its end ends the
+an alert log does, and asks for those that came before it.  A line ``mark`` on the input begins again; its end ends the
 process.  The answer then is one line of JSON: messages and gaps of each kind, latencies in µs (median, 99 %), and how
 many monitors are there.
 """

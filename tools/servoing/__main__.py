@@ -81,7 +81,7 @@ def _count(text: str) -> int:
 
 def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"'{text}' is no seed; a whole number, 0 to {2**32 - 1}")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a seed; a whole number, 0 to {2**32 - 1}")
     return int(text)
 
 

@@ -19,7 +19,7 @@ class Action(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Limits:
-    """``max_age_s``: a transform that is older is no transform.  ``clearance_m``: how far the fingers may be off
+    """``max_age_s``: a transform that is older is not a transform.  ``clearance_m``: how far the fingers may be off
     without touching anything, to which three standard deviations of a suspect transform are held.
     """
 

@@ -1,4 +1,4 @@
-"""Images from a camera into a folder, taken by themselves or by a person, while somebody watches."""
+"""Images from a camera into a folder, taken by themselves or by a person, while someone watches."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ class Project:
         step = BY_NAME.get(name)
         if step is None:
             names = ", ".join(BY_NAME)
-            raise InputError(f"{name}: is no step; one of {names}", "step")
+            raise InputError(f"{name}: is not a step; one of {names}", "step")
         if step.kind in ("page", "run"):
             raise InputError(f"{name}: has a command of its own; {self._state(step).command}", "step")
         if step.kind == "form":

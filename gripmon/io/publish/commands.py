@@ -61,7 +61,7 @@ class PendingCommand:
         return len(self._askers)
 
     def join(self, query: zenoh.Query, key: str) -> bool:
-        """Add somebody who waits, or tell the answer that is there; False if it was given up and never carried out."""
+        """Add someone who waits, or tell the answer that is there; False if it was given up and never carried out."""
         with self._lock:
             if self._dropped:
                 return False

@@ -133,7 +133,7 @@ class Node:
     def declare(self, kind: EndpointKind, topic: str, type_name: str, qos: Qos = DEFAULT_QOS) -> str:
         """Show a publisher (``MP``) or subscription (``MS``) in the graph; returns its token.
 
-        A subscriber works without, but ``ros2 topic info`` doesn't know it, and nodes that publish only while somebody
+        A subscriber works without, but ``ros2 topic info`` doesn't know it, and nodes that publish only while someone
         listens wait for it.
         """
         ids = (self._id, next(_ids))
@@ -244,7 +244,7 @@ def decode_image(payload: bytes) -> tuple[int, Image]:
     if step < row_bytes:
         raise MessageError(IMAGE, "step", f"{step} bytes for rows of {width} px {message.encoding}: {row_bytes} bytes")
     if step % item_bytes:
-        raise MessageError(IMAGE, "step", f"{step} bytes is no multiple of a pixel's {item_bytes}")
+        raise MessageError(IMAGE, "step", f"{step} bytes is not a multiple of a pixel's {item_bytes}")
     if message.data.size != height * step:
         raise MessageError(
             IMAGE, "data", f"{message.data.size} bytes; height {height} times step {step} are {height * step}"
@@ -297,7 +297,7 @@ class JointOpening(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     def opening_m(self, positions: Mapping[str, float]) -> float | None:
         """The opening (m); None for a message about other joints only.
 
-        Raises :class:`MessageError` for one that has some of the joints only, or a position that is no finite number.
+        Raises :class:`MessageError` for one that has some of the joints only, or a position that is not finite.
         """
         there = [name for name in self.joints if name in positions]
         if not there:

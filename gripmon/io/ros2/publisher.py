@@ -117,7 +117,7 @@ class Messages:
 
 
 def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
-    """Stale without frames; else the worst of the verdict, what the state complains of, and the open alerts that nobody
+    """Stale without frames; else the worst of the verdict, what the state complains of, and the open alerts that no one
     has acknowledged.
     """
     if state.state is State.STALE:
@@ -202,7 +202,7 @@ class _Topics:
 
 
 class Ros2Publisher:
-    """Publishes one monitor's records as a node on a link that somebody else closes.
+    """Publishes one monitor's records as a node on a link that someone else closes.
 
     Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
     capture time; one that waited in the monitor does not.  Diagnostics go out with every state record (once a second

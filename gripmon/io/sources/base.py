@@ -32,7 +32,7 @@ class Source(Protocol):
       caller can stop, and can report that the camera is missing;
     * None: finished, and so is every later answer.
 
-    A source with ``live`` true is a camera in real time: ``read`` gives the newest frame, older ones that nobody asked
+    A source with ``live`` true is a camera in real time: ``read`` gives the newest frame, older ones that no one asked
     for in time are counted in ``dropped`` (their ``seq`` is missing).  Otherwise ``read`` gives every frame in order,
     at once, ``dropped`` stays 0 and ``connected`` true.  ``connected`` says whether the camera delivers at present.
 

@@ -134,7 +134,7 @@ def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
             raise SourceError(f"{where} has {len(cells)} values; {len(header)}: {','.join(header)}")
         name = cells[0].strip()
         if not name or Path(name).name != name:
-            raise SourceError(f"{where}: '{name}' is no file name; the plain name of a file in the folder")
+            raise SourceError(f"{where}: '{name}' is not a file name; the plain name of a file in the folder")
         if name in rows:
             raise SourceError(f"{where}: {name} is there twice; one row for each file")
         rows[name] = TableRow(_stamp(cells[1], where), _opening(cells[2], where) if len(cells) == 3 else None)

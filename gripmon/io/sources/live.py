@@ -306,7 +306,7 @@ def backend_number(settings: LiveSettings) -> int:
 def _backend_by_form(device: int | str) -> Backend:
     if isinstance(device, int):
         if device < 0:
-            raise SourceError(f"device: {device} is no index; 0 for the first camera")
+            raise SourceError(f"device: {device} is not an index; 0 for the first camera")
         return "any"
     if device.startswith("/dev/"):
         return "v4l2"

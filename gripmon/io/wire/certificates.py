@@ -81,7 +81,7 @@ def read(path: Path) -> Issued:
         names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         found = {type(each.value): each.value for each in certificate.extensions}
     except (ValueError, x509.DuplicateExtension) as error:
-        raise ValueError(f"{path} is no certificate: {error}; delete it and its key for new ones") from error
+        raise ValueError(f"{path} is not a certificate: {error}; delete it and its key for new ones") from error
     uses = found.get(x509.ExtendedKeyUsage, ())
     alternatives = found.get(x509.SubjectAlternativeName, ())
     hosts = [str(each.value) for each in alternatives if isinstance(each, (x509.DNSName, x509.IPAddress))]

@@ -116,7 +116,7 @@ class Link:
         if session is not None:
             try:
                 session.close()
-            except zenoh.ZError as error:  # somebody who was stopped holds up what is being sent
+            except zenoh.ZError as error:  # someone who was stopped holds up what is being sent
                 _log.warning("the Zenoh session could not be closed in order: %s", in_short(error))
 
     def _look(self, session: zenoh.Session) -> None:

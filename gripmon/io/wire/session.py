@@ -64,7 +64,7 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
             "period_increase_factor": 2,
         },
         "scouting/multicast/enabled": settings.multicast_scouting,
-        # Somebody's endless message must not fill the memory; an image of 20 megapixels passes.
+        # Someone's endless message must not fill the memory; an image of 20 megapixels passes.
         "transport/link/rx/max_message_size": 64 << 20,
         # Images gain by shared memory; transforms, 3 KiB, don't, and each sender costs its reader a pool of 16 MiB.
         "transport/shared_memory/transport_optimization/message_size_threshold": 64 << 10,
@@ -187,7 +187,7 @@ class Keys:
 def form_fault(endpoint: object) -> str:
     """What is wrong with an endpoint's form, and what would be right; empty if it can be one."""
     if not isinstance(endpoint, str) or not re.fullmatch(_ENDPOINT_PATTERN.rstrip("$"), endpoint):
-        return f"{endpoint!r} is no endpoint; protocol/address, e.g. {DEFAULT_ENDPOINT}"
+        return f"{endpoint!r} is not an endpoint; protocol/address, e.g. {DEFAULT_ENDPOINT}"
     return ""
 
 

@@ -118,7 +118,7 @@ def compare(
 
     openings_m = [start.jaw_opening_m]
     if baseline is not None and not reported and gripper.has_jaw:
-        # What was seen of an opening that nobody reports may be as wrong as the fingers are.
+        # What was seen of an opening that no one reports may be as wrong as the fingers are.
         openings_m.append(baseline.jaw_opening_m)
     # What even the freest model doesn't explain all pieces share as an error.
     edge = np.unique(evidence.edge, return_inverse=True)[1]

@@ -106,7 +106,7 @@ class CauseJudge:
         self._interrupted = False
 
     def interrupted(self) -> None:
-        """No frames came for long, before those that are added next: somebody may have exchanged the camera."""
+        """No frames came for long, before those that are added next: someone may have exchanged the camera."""
         self._interrupted = True
 
     @property

@@ -28,7 +28,7 @@ FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 """How far things move when they move: shift of the TCP, of a finger, of the opening; relative focal length."""
 
 JAW_UNREPORTED_SIGMA_M = 0.02
-"""What is known about an opening that nobody reports."""
+"""What is known about an opening that no one reports."""
 
 _MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.3, 0.1, 0.1
 
@@ -60,7 +60,7 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
     """The models that exist for this gripper, ``distance_m`` from the camera to the TCP.
 
     A gripper of one finger has none for a bent finger, which looks like a motion of the camera; without a jaw, or
-    where nobody reports its opening, there is none for a wrong report.  Nobody exchanges a camera without the stream
+    where no one reports its opening, there is none for a wrong report.  No one exchanges a camera without the stream
     being ``interrupted``.
     """
     fingers = len(gripper.finger_ids)

@@ -384,7 +384,7 @@ def refresh(
     to_reported: Array,
     from_reported: Array,
 ) -> bool:
-    """Covariances of means and of differences anew, and their whitening.
+    """Covariances of means and of differences again, and their whitening.
 
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``

@@ -178,7 +178,7 @@ class VibrationWatch:
         return self._found is not None and not self._learnt
 
     def forget(self) -> None:
-        """The camera has moved: the step is no vibration."""
+        """The camera has moved: the step is not a vibration."""
         self._shifts.clear()
         self._times_s.clear()
         self._found = None
@@ -218,7 +218,7 @@ class VibrationWatch:
 
 
 def _about_its_line(values: Array) -> Array:
-    """(..., n, 3) what is left of values (..., n, 3) that grow evenly: a creep is no vibration."""
+    """(..., n, 3) what is left of values (..., n, 3) that grow evenly: a creep is not a vibration."""
     count = values.shape[-2]
     index = np.arange(count) - 0.5 * (count - 1)
     slope = np.einsum("n,...ni->...i", index, values) / (index @ index)

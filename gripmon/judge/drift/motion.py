@@ -19,7 +19,7 @@ from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 class Baseline:
     """The error of a reference that is only roughly known, such as a configured one.
 
-    A calibration is off by some tenths of a millimetre from the start, which is no drift.  The mean shift of the first
+    A calibration is off by some tenths of a millimetre from the start: not a drift.  The mean shift of the first
     frames, without those that lie farthest out, is taken for that error if the reference's own uncertainty allows it,
     else nothing is.
     """
@@ -165,7 +165,7 @@ class MotionWatch:
         return self._last
 
     def learn(self) -> None:
-        """Learn from the newest frame what nothing waits for; :meth:`add` does it first if nobody has."""
+        """Learn from the newest frame what nothing waits for; :meth:`add` does it first if no one has."""
         self.test.learn()
 
     @property

@@ -39,7 +39,7 @@ SWEEPS = 8
 
 
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
-"""Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""
+"""Frames after which covariances are inverted and thresholds reckoned again, and after which scatter is learnt."""
 
 FREEDOM, FREEDOM_GROWTH = 9.0, 1.0 / 3.0
 """Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
@@ -117,7 +117,7 @@ class SequentialTest(ByArithmetic):
         self._reference: Array = np.zeros((streams, 6, 6))
         self._frames = self._since_restart = 0
         self.refreshes = 0
-        """How often covariances and thresholds were reckoned anew."""
+        """How often covariances and thresholds were reckoned again."""
         self._surge = np.ones((len(LENGTHS), streams))
         self._tail = np.full((len(LENGTHS), streams), STUDENT_TAIL)
         self._stale = True
@@ -140,7 +140,7 @@ class SequentialTest(ByArithmetic):
             self._frames_per_s, self._inflation, self._stale = frames_per_s, None, True
 
     def set_reference_covariance(self, covariance: Array) -> None:
-        """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is no drift."""
+        """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is not a drift."""
         self._reference = np.broadcast_to(covariance, (self._streams, 6, 6)).copy()
         self._stale = True
 

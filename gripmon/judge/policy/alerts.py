@@ -120,7 +120,7 @@ class AlertBook:
             if entry.alert.acknowledged or alert_id not in ("", entry.alert.alert_id):
                 continue
             seen = msgspec.structs.replace(entry.alert, event=AlertEvent.UPDATED, acknowledged=True)
-            self._open[topic] = replace(entry, alert=seen)  # what is over doesn't begin to be over anew
+            self._open[topic] = replace(entry, alert=seen)  # what is over doesn't begin to be over again
             self._changes += 1
             out.append(seen)
         return tuple(out)
@@ -130,7 +130,7 @@ class AlertBook:
         self._changes += 1
 
     def _new_id(self, topic: str, stamp_ns: int) -> str:
-        """Unique for this monitor, also when the numbering starts anew because its state was lost."""
+        """Unique for this monitor, also when the numbering starts again because its state was lost."""
         digest = hashlib.sha256(f"{topic} {stamp_ns}".encode()).hexdigest()[:6]
         return f"{self._raised}-{digest}"
 

@@ -31,7 +31,7 @@ from gripmon.model.records import (
 
 NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 """Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
-where it was, and is not calibrated anew.
+where it was, and is not calibrated again.
 """
 
 NO_REFERENCE = (*NOT_THE_CAMERA, Cause.CAMERA_REPLACED)
@@ -230,7 +230,7 @@ class Policy:
         return over + self.decided("there is a new reference", now_s)
 
     def not_recalibrated(self) -> None:
-        """The reference could not be measured anew: try again when the camera has stood still for as long again."""
+        """The reference could not be measured again: try again when the camera has stood still for as long again."""
         self._still = 0
 
     def refused(self, why: str, explanation: Explanation, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:

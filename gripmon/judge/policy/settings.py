@@ -28,7 +28,7 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             gt=0.0,
             le=1.0,
             description="shift of the TCP from which a drift is an error, and motion d of equation (14) past which the "
-            "reference is measured anew (m)",
+            "reference is measured again (m)",
         ),
     ] = 2.5e-3
     limit_rad: Annotated[
@@ -37,7 +37,7 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             gt=0.0,
             le=3.0,
             description="turn from which a drift is an error, and rotation delta of equation (14) past which the "
-            "reference is measured anew (rad)",
+            "reference is measured again (rad)",
         ),
     ] = 0.02
     update_alert_s: Annotated[

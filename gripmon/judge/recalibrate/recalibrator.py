@@ -84,7 +84,7 @@ class Refusal:
 class Proposal:
     """A new reference: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, and what it was made of.
 
-    ``needs_person``: why an operator has to accept it, None if nobody has to.  ``wait``: more frames may spare him.
+    ``needs_person``: why an operator has to accept it, None if no one has to.  ``wait``: more frames may spare him.
     """
 
     cam_T_grip: Array
@@ -125,7 +125,7 @@ class Recalibrator:
         self._since += 1
 
     def forget(self) -> None:
-        """The camera has moved, or may have: begin anew."""
+        """The camera has moved, or may have: begin again."""
         self._frames.clear()
         self._waiting = None
 

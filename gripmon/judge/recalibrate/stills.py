@@ -41,7 +41,7 @@ class StillFrame:
     """What one measured frame gives: the tracked ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error; the
     corners' places ``points_grip_m`` (c, 3) at the frame's jaw opening; ``usable`` (c,) those that were measured, at
     ``xy`` (c, 2) in ideal coordinates, with the joint covariance ``covariance_xy`` (2k, 2k) of the k usable ones; what
-    the ``edges`` say, None where nobody asked.
+    the ``edges`` say, None where no one asked.
     """
 
     seq: int

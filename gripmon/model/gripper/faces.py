@@ -14,7 +14,7 @@ LARGEST_WARP_M = 5e-4
 """A loop this far off its plane still counts as flat: as exactly as callipers measure."""
 
 LARGEST_SKEW = 0.1
-"""A loop farther off its plane, as a part of its extent, is no face: one of its points is wrong."""
+"""A loop farther off its plane, as a part of its extent, is not a face: one of its points is wrong."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,7 @@ class Frame:
 
     ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
     (truncated file, failed read); ``fault`` then says why in a few words, ``refusal`` in one.  ``jaw_opening_m`` is
-    what the robot reported for this frame, None if nobody did.  ``name`` is the file or stream that it came from.
+    what the robot reported for this frame, None if no one did.  ``name`` is the file or stream that it came from.
     ``arrived_ns``: when the capture was over or the frame came to this machine, by the monotonic clock (ns); None: now.
     """
 

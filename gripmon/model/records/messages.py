@@ -98,7 +98,7 @@ class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
 
     clock: Annotated[str, Meta(max_length=64, description="which clock; another one after every start of the monitor")]
     now_ns: Annotated[
-        int, Meta(ge=0, le=2**63 - 1, description="ns since no moment in particular; nobody sets it, it never jumps")
+        int, Meta(ge=0, le=2**63 - 1, description="ns since no moment in particular; no one sets it, it never jumps")
     ]
 
 

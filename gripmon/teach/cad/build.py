@@ -166,15 +166,15 @@ def _shapes(
 
 def _check(frame: str, approach: str | None, unit: str | None, length_m: float | None) -> None:
     if frame not in ("tcp", "cad"):
-        raise InputError(f"'{frame}' is no frame; tcp or cad", "frame")
+        raise InputError(f"'{frame}' is not a frame; tcp or cad", "frame")
     if approach is not None and approach not in AXES:
-        raise InputError(f"'{approach}' is no axis; one of {', '.join(AXES)}", "approach")
+        raise InputError(f"'{approach}' is not an axis; one of {', '.join(AXES)}", "approach")
     if frame == "cad" and length_m is not None:
         raise InputError(
             f"{length_m:g}: is measured from the tips backwards, along z; not with the CAD's own frame", "length"
         )
     if unit is not None and unit not in UNITS_M:
-        raise InputError(f"'{unit}' is no unit; one of {', '.join(UNITS_M)}", "unit")
+        raise InputError(f"'{unit}' is not an unit; one of {', '.join(UNITS_M)}", "unit")
 
 
 def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | None, progress: Progress) -> Parts:
@@ -184,7 +184,7 @@ def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | N
         raise InputError("from-cad: no file; a mesh or .cao for each finger, or a URDF")
     for path in paths:
         if path.suffix.lower() not in FORMATS:
-            raise InputError(f"{path}: is no format of CAD that is read here; one of {', '.join(FORMATS)}")
+            raise InputError(f"{path}: is not a format of CAD that is read here; one of {', '.join(FORMATS)}")
         if not path.is_file():
             raise InputError(f"{path}: there is no such file; one of {', '.join(FORMATS)}")
     if any(path.suffix.lower() == ".urdf" for path in paths):

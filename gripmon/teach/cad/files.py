@@ -53,7 +53,7 @@ def mesh_library(why: str) -> ModuleType:
 def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
     """A mesh in metres; ``unit`` is one of :data:`UNITS_M`.  ``size``: refuse one that can't be a gripper's.
 
-    Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit nobody gave:
+    Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit no one gave:
     none of these formats says it.
     """
     trimesh = mesh_library(str(path))

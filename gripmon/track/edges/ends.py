@@ -47,7 +47,9 @@ CONTINUATION_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
 
 CLEAR_OF_CURVE_PX = 2.0 * CONTINUATION_PX
-"""So far beside a continued side its curve is no continuation of it, with as much again for what it is off by, px."""
+"""So far beside a continued side its curve is not a continuation of it, with as much again for what it is off
+by, px.
+"""
 
 CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""

@@ -170,7 +170,7 @@ class FingerMeter(Settler):
     def _measured_at(self, image: Image, measurement: Measurement, place: _Place, finger: int) -> Measurement:
         """The measurement as if the gripper were where a finger shows, with the corners of that finger alone.
 
-        A corner is looked for beside where it is predicted: farther off it is predicted, and its edges are seen, anew.
+        A corner is looked for beside where it is predicted: farther off it is predicted, and its edges are seen, again.
         """
         prediction, xi = place.edgels.prediction, place.fit.xi
         if prediction.moved_px(xi) > self._settings.relinearise_px:

@@ -228,7 +228,7 @@ class FingertipMeter(FingerMeter):
                 best, chosen = other, zoom
         self._zoom_to(chosen)
         if best.consensus.share > 0.0:
-            # What is sampled there is chosen anew: it was for a place that may be poor.
+            # What is sampled there is chosen again: it was for a place that may be poor.
             self._prediction.pop(chosen, None)
             self._laid_out.pop(chosen, None)
         return best

@@ -130,7 +130,7 @@ class PredictedCorners:
 class Prediction:
     """The predicted edges at one pose; n samples, v visible edges, c corners.  All numbers of samples are finite.
 
-    ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking
+    ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of someone walking
     along the edge. ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform
     and, where the jaw opening is an unknown too, by the opening (px/m). In ideal coordinates: ``xy`` (n, 2) the places,
     ``way_xy`` (n, 2) the edge's direction there, ``along`` (n,) the place along the edge's line, ``gain`` (n,) the

@@ -85,7 +85,7 @@ def _whole_and_part(mapped: Any, n: int, size: float, whole: Any, part: Any) -> 
     far = size - 1.0 + 2.0 * BEYOND_PX
     for r in range(rows):
         for k in range(samples):
-            # Positive numbers are rounded down when their fraction is cut off; what is no number goes to the border.
+            # Positive numbers are rounded down when their fraction is cut off; what is not a number goes to the border.
             place = float(mapped[_at(r), _at(n), _at(k)]) + BEYOND_PX
             place = place if place > 0.0 else 0.0
             place = place if place < far else far
@@ -233,7 +233,7 @@ def find_candidates(
     for n in range(count):
         spoilt = 0
         for c in range(samples):
-            spoilt += profiles[n, c] - profiles[n, c] != 0.0  # what is no number, or has no end
+            spoilt += profiles[n, c] - profiles[n, c] != 0.0  # what is not a number, or has no end
         if spoilt or not ok[n]:
             continue
         response[:] = 0.0

@@ -139,7 +139,7 @@ def _cubic(place: NDArray[np.float32], size: int) -> tuple[list[NDArray[np.intp]
 
 def _pixels(image: Image) -> Image:
     """The image as (h, w, channels), with one of three types and without leave to write: each other combination would
-    be compiled anew.
+    be compiled again.
     """
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         image = image.astype(np.float32)

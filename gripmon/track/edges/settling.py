@@ -45,10 +45,10 @@ from gripmon.track.edges.taught import TaughtEdges
 from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, NormalEquations, Uncertainty, assess, without_one_edge
 
 RELAYOUT_PX = 6.0
-"""Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""
+"""Motion of the prediction after which the sampled parts of the edges are chosen again, px."""
 
 JAW_UNREPORTED_SIGMA_M = 0.02
-"""What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
+"""What is known about a jaw opening that no one reports, m: it changes by this much between frames at most."""
 
 ZOOMS = (1, 2, 4)
 """Factors on all lengths along the profiles, for images that are out of focus."""
@@ -69,7 +69,7 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     corners: CornerSettings = CornerSettings()
     search: SearchSettings = SearchSettings()
     relinearise_px: Annotated[
-        float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed anew (px)")
+        float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed again (px)")
     ] = 1.0
 
 

@@ -6,7 +6,7 @@ like is compared with like and the bias cancels; the method's own reference corn
 do the same ("Corners" of the self-viewing method).
 
 An edge's offset is a length across the line of sight, off the plane through the camera's centre and the model's edge
-(m), linear along the edge; positive to the right of somebody who walks along the edge in the image.  The reference
+(m), linear along the edge; positive to the right of someone who walks along the edge in the image.  The reference
 calibration is by definition the gripper's pose in the teaching images, so that what it is off by is in the offsets,
 too.  In the gripper frame an offset stays the same when the camera or the jaws move.  What it is along the line of
 sight (``depth_m``, positive away from the camera) images at one pose can't show; it follows from the shape of a bevel,
@@ -251,7 +251,7 @@ class TaughtEdges:
 
 def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tuple[Array, Array]:
     """Two unit vectors (e, 3) for every edge, gripper frame: off the plane through the camera's centre and the edge, to
-    the right of somebody who walks along it in the image; and in that plane, across the edge, away from the camera.
+    the right of someone who walks along it in the image; and in that plane, across the edge, away from the camera.
     """
     ends = points_grip_m[gripper.edge_points]
     sight = ends[:, 0] - invert(cam_T_grip)[:3, 3]

@@ -57,7 +57,7 @@ would show a gripper that never moves.
 
 UNLIKE = 2.0
 """Root mean square of a block's residuals, in standard deviations, from which it looks otherwise than learnt: noise
-gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is learnt anew: what covered it is gone.
+gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is learnt again: what covered it is gone.
 """
 
 RENEWED = 0.5
@@ -155,7 +155,7 @@ class LookAlignment:
         self.forget()
 
     def forget(self) -> None:
-        """Learn anew."""
+        """Learn again."""
         self.views = 0
         self._learnt: _Placed | None = None
         self._count: Array = np.zeros(0)

@@ -93,7 +93,7 @@ class GripperLook:
         self.forget()
 
     def forget(self) -> None:
-        """Learn anew: the gripper, its camera or what they look like from each other was changed."""
+        """Learn again: the gripper, its camera or what they look like from each other was changed."""
         self.views = 0
         self._laid_out: tuple[Array, float | None] | None = None
         self._last_s: float | None = None
@@ -222,7 +222,7 @@ class GripperLook:
         )
 
     def restore(self, record: LookRecord, reference_id: str) -> None:
-        """Go on with a kept look.  Raises :class:`LookRefused`, and begins anew, if it is of something else."""
+        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it is of something else."""
         self.forget()
         camera, gripper = self._digests()
         changed = [
@@ -235,7 +235,7 @@ class GripperLook:
             if was != now
         ]
         if changed:
-            raise LookRefused(f"the kept look is of another {' and '.join(changed)}; it is learnt anew")
+            raise LookRefused(f"the kept look is of another {' and '.join(changed)}; it is learnt again")
         laid_out = from_record(record.cam_T_grip), record.jaw_opening_m
         layout = lay_out(self._camera, self._gripper, *laid_out)
         count, slides = int(np.count_nonzero(~layout.guard)), len(self._slides_grip_m)
@@ -247,10 +247,10 @@ class GripperLook:
             (record.tried, "<f4", (slides,)),
         ]
         if any(len(data) != np.dtype(kind).itemsize * math.prod(shape) for data, kind, shape in parts):
-            raise LookRefused("the kept look has other patches than this version's; it is learnt anew")
+            raise LookRefused("the kept look has other patches than this version's; it is learnt again")
         mean, weight, hit, chance, tried = (np.frombuffer(data, kind).reshape(shape) for data, kind, shape in parts)
         if not all(np.isfinite(part).all() for part in (mean, weight, hit, chance, tried)):
-            raise LookRefused("the kept look holds values that are not finite; it is learnt anew")
+            raise LookRefused("the kept look holds values that are not finite; it is learnt again")
         self._begin(layout)
         self._laid_out, self.views = laid_out, record.views
         self._mean, self._weight = mean.astype(np.float32), weight.astype(float)

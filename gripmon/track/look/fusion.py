@@ -36,7 +36,7 @@ class LookFusion:
         self.forget()
 
     def forget(self) -> None:
-        """The look is learnt anew."""
+        """The look is learnt again."""
         self.backgrounds = 0
         self.contradicts = False
         """Whether look and edges contradicted each other before the newest background."""
@@ -52,7 +52,7 @@ class LookFusion:
         (6, 6) by which that changes while nothing moves; None where they contradict each other, and before a bias is
         known.
 
-        What errors of the edges outlast all backgrounds nobody knows: as a place, the result is to be trusted no more
+        What errors of the edges outlast all backgrounds no one knows: as a place, the result is to be trusted no more
         than the edges.
         """
         difference = perturbation_between(cam_T_grip, look.cam_T_grip)
