@@ -75,8 +75,7 @@ def _rough_corners(user: new_user.NewUser, driver: Any) -> None:
             urllib.request.urlopen(urllib.request.Request(f"{running.url}save", body, kind), timeout=DEADLINE_S).close()
             return
         visitor = Visitor(driver, running.url)
-        for name, at in clicks.items():
-            visitor.drag(name, *at)
+        visitor.put(clicks)
         visitor.click("#save")
         visitor.wait(lambda: "gripmon calibrate plane standing/0.png" in visitor.text("#saved"), "the next command")
         assert visitor.complaints() == []

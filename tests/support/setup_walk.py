@@ -5,7 +5,6 @@ as a program, the pictures of docs/tutorials/setup.md: ``cd tests && python -m s
 from __future__ import annotations
 
 import os
-import re
 import sys
 import tempfile
 import time
@@ -87,10 +86,6 @@ class Walker(Visitor):
         bad = "return document.querySelector('#status').dataset.kind === 'bad'"
         self.wait(lambda: self.script(bad) and all(word in self.text("#status") for word in words), " ".join(words))
         assert "\n" not in self.text("#status") and "Traceback" not in self.text("#status")
-
-    def select(self, corner: str) -> None:
-        """One of the corners in the list beside the image."""
-        self.click(f"#corners tr[data-corner={corner}]")
 
     def on_page(self, selector: str) -> None:
         self.wait(lambda: self.script("return Boolean(document.querySelector(arguments[0]))", selector), selector)
@@ -223,11 +218,7 @@ def _by_hand(
     visitor.on_page("#stage")
     visitor.wait(lambda: visitor.script("return document.body.dataset.ready === 'true'"), "the page to begin")
     visitor.settle()
-    # Beside an inner corner, once that is put, its next one shows.
-    for corner, (u, v) in sorted(corners.items(), key=lambda each: ("_inner_" not in each[0], each[0])):
-        if "_inner_" not in corner:
-            visitor.select(re.sub("_(outer|end|rise)_", "_inner_", corner))
-        visitor.drag(corner, u, v)
+    visitor.put(corners)
     if opening_mm:
         typed = "const i = document.querySelector('#opening'); i.value = arguments[0];"
         visitor.script(f"{typed} i.dispatchEvent(new Event('change'))", opening_mm)

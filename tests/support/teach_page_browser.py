@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,6 +134,13 @@ class Visitor:
         chain = ActionChains(self.driver, duration=60).move_to_element(handle).click_and_hold()
         chain.move_by_offset(round((u - now_u) * scale), round((v - now_v) * scale)).release().perform()
         self.settle()
+
+    def put(self, corners: Mapping[str, Sequence[float]]) -> None:
+        """Drag rough corners to about (u, v), the inner ones first: of the others those beside the chosen one show."""
+        for corner, (u, v) in sorted(corners.items(), key=lambda each: ("_inner_" not in each[0], each[0])):
+            if "_inner_" not in corner:
+                self.click(f"#corners tr[data-corner={re.sub('_(outer|end|rise)_', '_inner_', corner)}]")
+            self.drag(corner, u, v)
 
     def keys(self, *keys: str, control: bool = False, shift: bool = False) -> None:
         """Type, with the image in focus."""
