@@ -118,7 +118,7 @@ def test_quaternion_order_is_x_y_z_w():
 
 @pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
 def test_a_quaternion_that_is_no_rotation_is_refused(quaternion: tuple[float, float, float, float]):
-    with pytest.raises(ValueError, match="no rotation"):
+    with pytest.raises(ValueError, match="not a rotation"):
         geometry.rotation_from_xyzw(quaternion)
 
 

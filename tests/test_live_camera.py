@@ -207,7 +207,7 @@ def test_a_process_ends_at_once_while_the_camera_hangs_in_the_driver():
     ("settings", "complaint"),
     [
         (LiveSettings(device="video.mp4"), "has no known form"),
-        (LiveSettings(device=-1), "no index"),
+        (LiveSettings(device=-1), "not an index"),
         (LiveSettings(device="0"), "without quotes"),
         (LiveSettings(device=""), "has no known form"),
     ],

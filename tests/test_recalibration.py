@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
-from support.still_frames import CHANGING, LASTING_SHARE, REFERENCE_T, TRUE_T, Scene, image, moved, reference
+from support.still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
 from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool
@@ -233,7 +233,7 @@ REFUSALS = {
     RefusalReason.CONTRADICTED: lambda: (all_moved(Scene().frames(20)), SURE),
     RefusalReason.AMBIGUOUS: lambda: (far_plane(), SURE),
     RefusalReason.FINGERS: lambda: (Scene(bend_m=(1e-4, 1e-4, 0.0)).frames(20), SURE),
-    RefusalReason.UNCERTAIN: lambda: (Scene(lasting=900.0 * LASTING_SHARE, corner_px=0.5).frames(20), SURE),
+    RefusalReason.UNCERTAIN: lambda: (Scene(lasting=900.0 * LASTING, corner_px=0.5).frames(20), SURE),
 }
 
 
@@ -305,15 +305,15 @@ def test_more_frames_are_waited_for_only_where_they_help():
         scene = Scene(lasting=lasting, changing=changing, corner_px=0.2)
         return proposal(scene.frames(frames), RecalibrationSettings(sure_sigma_m=5e-5, most_frames=60))
 
-    assert waits(1e-2 * LASTING_SHARE, 60.0 * CHANGING).wait
-    late = waits(1e-2 * LASTING_SHARE, 60.0 * CHANGING, 60)
+    assert waits(1e-2 * LASTING, 60.0 * CHANGING).wait
+    late = waits(1e-2 * LASTING, 60.0 * CHANGING, 60)
     assert not late.wait and late.needs_person is None
-    steady = waits(60.0 * LASTING_SHARE, 1e-2 * CHANGING)
+    steady = waits(60.0 * LASTING, 1e-2 * CHANGING)
     assert not steady.wait and steady.needs_person is not None, "what doesn't scatter isn't averaged away"
 
 
 def test_what_waits_is_looked_at_again_after_some_frames():
-    scene = Scene(lasting=1e-2 * LASTING_SHARE, changing=60.0 * CHANGING, corner_px=0.2)
+    scene = Scene(lasting=1e-2 * LASTING, changing=60.0 * CHANGING, corner_px=0.2)
     recalibrator = Recalibrator(RecalibrationSettings(sure_sigma_m=5e-5), scene.gripper, np.eye(6) * 1e-14)
     answers = []
     for frame in scene.frames(60):

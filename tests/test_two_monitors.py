@@ -158,7 +158,7 @@ def test_a_command_reaches_the_one_that_is_named_and_no_other(two: tuple[Publish
         for each in two:
             reply = client.send(CommandName.UNDO, monitor_id=each.monitor_id)
             assert reply.done and reply.monitor_id == each.monitor_id
-        with pytest.raises(NotCarriedOut, match=f"arm/{camera} is not no one, but "):
+        with pytest.raises(NotCarriedOut, match=f"arm/{camera} is not nobody, but "):
             client.send(CommandName.UNDO, monitor_id="nobody")
         key = CMD.replace("wrist", camera)
         unnamed = answers(plain, f"{key}/reset")

@@ -32,7 +32,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "predict": ((FingertipMeter, "_predicted"), (FingertipMeter, "_predict"), (FingertipMeter, "_lay_out")),
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
-        (gripmon.track.edges.settling, "agree"),
+        (gripmon.track.edges.settling, "fit_irls"),
         (gripmon.track.edges.settling, "assess"),
         (FingertipMeter, "measure"),
     ),
@@ -50,7 +50,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
         (PoseAverage, "add"),
         (Policy, "measured"),
     ),
-    "make the record": ((Monitor, "_record"),),
+    "make the record": ((gripmon.monitor.core, "measured_record"),),
     "encode and publish": ((ZenohPublisher, "transform"),),
     "learn the gripper's look, after publishing": ((Integrity, "learn"),),
     "the rest of the loop": ((Daemon, "_handle"),),
