@@ -13,7 +13,7 @@ import pytest
 import zenoh
 from support.commanded import Loop, reply_to
 from support.long_files import LONGEST
-from support.loopback import free_endpoint, plain_session
+from support.loopback import free_endpoint, give_default_port_back, plain_session
 from support.published import Published
 
 from gripmon.io.wire import PublishSettings
@@ -40,6 +40,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             raise pytest.UsageError(f'{item.nodeid}: @pytest.mark.slow("<seconds> s; what guards the same in less")')
     rank = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+@pytest.fixture(autouse=True)
+def _default_port_is_given_back() -> Iterator[None]:
+    yield
+    give_default_port_back()
 
 
 @pytest.fixture(autouse=True)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import random
 import socket
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
 
 import pytest
 import zenoh
@@ -157,17 +162,43 @@ DEFAULT_PORT = 7447
 """Where a configuration that no one has edited listens."""
 
 
-def wait_for_default_port(deadline_s: float = 120.0) -> None:
-    """Until no other program listens where a configuration that no one has edited will; skips the test if one stays."""
+_held_port: list[IO[str]] = []
+
+
+def wait_for_default_port(deadline_s: float = 600.0) -> None:
+    """Until no other program listens where a configuration that no one has edited will, and no other test is about to:
+    it is this process's until :func:`give_default_port_back`.  Skips the test if it doesn't become free.
+    """
     deadline = time.monotonic() + deadline_s
+    if not _held_port:
+        lock = (Path(tempfile.gettempdir()) / f"gripmon-tests-{DEFAULT_PORT}.lock").open("w")
+        while not _locked(lock):
+            _wait_or_skip(deadline)
+        _held_port.append(lock)
     while True:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
+            with contextlib.suppress(OSError):
                 probe.bind(("127.0.0.1", DEFAULT_PORT))
-            except OSError:
-                if time.monotonic() > deadline:
-                    pytest.skip(f"another program listens on port {DEFAULT_PORT}")
-                time.sleep(0.2)
-            else:
                 return
+        _wait_or_skip(deadline)
+
+
+def give_default_port_back() -> None:
+    """Other tests may have it; nothing if it isn't this process's."""
+    while _held_port:
+        _held_port.pop().close()
+
+
+def _locked(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _wait_or_skip(deadline: float) -> None:
+    if time.monotonic() > deadline:
+        pytest.skip(f"another program listens on port {DEFAULT_PORT}")
+    time.sleep(0.2)
