@@ -145,3 +145,25 @@ def test_a_process_that_has_everything_and_is_only_slow_is_left_to_finish(
     (path,) = tmp_path.glob("*.rrd")
     assert Recorded(path).seqs() == list(range(20))
     os.waitpid(process, 0)
+
+
+def test_a_process_that_ends_while_it_is_written_to_still_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pipe towards it may break before its last report is read."""
+    from gripmon.record import process
+
+    ends = (
+        "import os, sys, msgspec; from gripmon.record.recorder import Status; "
+        "os.write(int(sys.argv[2]), msgspec.json.encode(Status(failure='recording failed: no disk')) + b'\\n')"
+    )
+    writer = recorder(tmp_path)
+    writer.close()
+    monkeypatch.setattr(process, "_BOOTSTRAP", ends)
+    ring = process.ImageRing(64, 48, 1)
+    worker = process.WorkerProcess(writer._scene, ring)
+    assert worker._process.wait(60.0) == 0
+    worker.send(b"more")
+    assert worker.gone and worker.status.failure == "recording failed: no disk"
+    worker.discard()
+    ring.close()

@@ -160,6 +160,7 @@ class WorkerProcess:
             except BlockingIOError:
                 return
             except BrokenPipeError:
+                self.read_reports()  # the last one says why it ended
                 self.gone = True
 
     def read_reports(self) -> None:
