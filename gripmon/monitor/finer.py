@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, AlertKind, Array, Cause, Frame, Image, Protection, Severity
+from gripmon.model.records import Alert, AlertKind, Array, Cause, Frame, Image, Severity
+from gripmon.monitor.refits import reaching
 from gripmon.monitor.standing import Standing
 from gripmon.track.look import GripperLook, LookAlignment, LookFusion, LookMotion, another_background
 
@@ -56,13 +57,8 @@ class FinerLook:
         self._pending = frame.image.copy(), pose, opening_m, now_s, motion
         if refined is None:
             return standing
-        bound, away = standing.protection, perturbation_between(standing.cam_T_grip, pose)
-        wider = Protection(
-            bound.position_m + float(np.linalg.norm(away[:3])),
-            bound.rotation_rad + float(np.linalg.norm(away[3:])),
-            bound.risk,
-            bound.hypothesis,
-        )
+        away = perturbation_between(standing.cam_T_grip, pose)
+        wider = reaching(standing.protection, away, standing.protection.hypothesis)
         return replace(standing, cam_T_grip=pose, protection=wider, of_change=refined[1] + self._floor)
 
     def learn(self) -> None:

@@ -130,6 +130,16 @@ class Refits:
         return pose, anchored.fits.covariance[number] + self._floor
 
 
+def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:
+    """A bound on the error of one pose as one of another, ``away`` (6,) from it."""
+    return Protection(
+        bound.position_m + float(np.linalg.norm(away[:3])),
+        bound.rotation_rad + float(np.linalg.norm(away[3:])),
+        bound.risk,
+        hypothesis,
+    )
+
+
 def larger(one: Protection, other: Protection) -> Protection:
     """The larger one of two bounds, for position and for rotation."""
     first, second = (one, other) if one.position_m >= other.position_m else (other, one)

@@ -17,6 +17,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Alert, Array, Frame, Image, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.finer import FinerLook
+from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
@@ -281,11 +282,6 @@ class Integrity:
 
 def _reaching(standing: Standing, other_T: Array) -> Standing:
     """The same where the gripper may as well be at another pose (4, 4)."""
-    away, bound = perturbation_between(standing.cam_T_grip, other_T), standing.protection
-    farther = Protection(
-        bound.position_m + float(np.linalg.norm(away[:3])),
-        bound.rotation_rad + float(np.linalg.norm(away[3:])),
-        bound.risk,
-        "the fingers' ends are seen elsewhere, too",
-    )
-    return replace(standing, protection=farther, believed=False)
+    away = perturbation_between(standing.cam_T_grip, other_T)
+    bound = reaching(standing.protection, away, "the fingers' ends are seen elsewhere, too")
+    return replace(standing, protection=bound, believed=False)

@@ -28,6 +28,7 @@ from gripmon.monitor.refits import (
     Refits,
     larger,
     protection_of,
+    reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -255,12 +256,8 @@ class Weigher:
         risk = self._policy.integrity_risk
         covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
         position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
-        return Protection(
-            position_m + float(np.linalg.norm(away[:3])),
-            rotation_rad + float(np.linalg.norm(away[3:])),
-            risk,
-            "at the start it wasn't where the reference has it: knocked before, or the model is off",
-        )
+        why = "at the start it wasn't where the reference has it: knocked before, or the model is off"
+        return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""

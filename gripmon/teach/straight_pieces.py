@@ -44,14 +44,6 @@ _MOST_POINTS = 1500
 
 
 @dataclass(frozen=True)
-class Piece:
-    """A straight piece of an outline between two vertices, indices into those of its chain."""
-
-    start: int
-    end: int
-
-
-@dataclass(frozen=True)
 class Chain:
     """Vertices (v, 2) in the image in turn, ``closed`` or from end to end.  ``folds_px`` (f, v, 2) the same without a
     tenth of the images each; ``corner`` (v,): two pieces meet in it; ``rms_px`` (pieces,) scatter about each piece,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state
+from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state, opening_between
 from gripmon.io.wire import Link
 from gripmon.io.wire.link import Malformed
 from gripmon.laser.matching import ReportedPulse, of_message
@@ -26,11 +26,6 @@ LARGEST_OPENING_M = 0.5
 
 BEYOND_TRAVEL_M = 1e-3
 """So far beyond its travel a gripper may report to be; the monitor refuses frames with more."""
-
-LONGEST_STEP_S = 0.1
-"""Between reports farther apart the jaw stood still, and moved only so long before the later one: a robot may report
-only while the jaws move.
-"""
 
 MOST_REPORTS = 2048
 """Reports kept for images that are older than the newest one: two seconds at 1 kHz."""
@@ -86,9 +81,7 @@ class StampedOpenings:
         if after in (0, len(self._reports)):
             return self._reports[min(after, len(self._reports) - 1)][0].opening_m
         (first, _), (last, _) = self._reports[after - 1 : after + 1]
-        left_ns = last.stamp_ns - stamp_ns
-        share = min(left_ns / min(last.stamp_ns - first.stamp_ns, 1e9 * LONGEST_STEP_S), 1.0)
-        return last.opening_m + share * (first.opening_m - last.opening_m)
+        return opening_between((first.stamp_ns, first.opening_m), (last.stamp_ns, last.opening_m), stamp_ns)
 
 
 class _Input:

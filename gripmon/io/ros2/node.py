@@ -282,6 +282,21 @@ def decode_joint_state(payload: bytes) -> tuple[int, dict[str, float]]:
     return _stamp_ns(JOINT_STATE, message.header.stamp), dict(pairs)
 
 
+LONGEST_STEP_S = 0.1
+"""Between reports of an opening farther apart the jaw stood still, and moved only so long before the later one: a robot
+may report only while the jaws move.
+"""
+
+
+def opening_between(first: tuple[int, float], last: tuple[int, float], wanted_ns: int) -> float:
+    """The opening (m) at a time between two reports, stamps (ns) with openings (m): linear, but see
+    :data:`LONGEST_STEP_S`.
+    """
+    (first_ns, first_m), (last_ns, last_m) = first, last
+    share = min((last_ns - wanted_ns) / min(last_ns - first_ns, 1e9 * LONGEST_STEP_S), 1.0)
+    return last_m + share * (first_m - last_m)
+
+
 class JointOpening(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How far the jaws are open, from the positions of joints: ``offset_m + scale · (sum of the joints)``."""
 

@@ -10,16 +10,13 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.io.ros2.node import opening_between
 from gripmon.io.sources.base import SourceError
 from gripmon.model.records import Array, Image
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-LONGEST_STEP_S = 0.1
-"""Between reports of an opening farther apart the jaw stood still, and moved only so long before the later one: as on
-the network (:data:`gripmon.io.publish.inputs.LONGEST_STEP_S`), since robots may report only while the jaws move.
-"""
 EXTRA = "pip install -e '.[datasets]' in gripmon's checkout"
 
 
@@ -84,15 +81,14 @@ def short(error: BaseException) -> str:
 
 
 def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int) -> float:
-    """The opening (m) at a time, of reports (n,) in order of time: linear between two, but see
-    :data:`LONGEST_STEP_S`; beyond the first and the last one nothing is made up: as they say.
+    """The opening (m) at a time, of reports (n,) in order of time: :func:`opening_between` two; beyond the first and last
+    one nothing is made up: as they say.
     """
     after = int(np.searchsorted(stamps_ns, wanted_ns))
     if after in (0, len(stamps_ns)):
         return float(openings_m[min(after, len(stamps_ns) - 1)])
-    step_ns = min(int(stamps_ns[after] - stamps_ns[after - 1]), round(1e9 * LONGEST_STEP_S))
-    share = min(int(stamps_ns[after] - wanted_ns) / step_ns, 1.0)
-    return float(openings_m[after] + share * (openings_m[after - 1] - openings_m[after]))
+    first, last = ((int(stamps_ns[n]), float(openings_m[n])) for n in (after - 1, after))
+    return opening_between(first, last, wanted_ns)
 
 
 def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
