@@ -81,8 +81,8 @@ def short(error: BaseException) -> str:
 
 
 def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int) -> float:
-    """The opening (m) at a time, of reports (n,) in order of time: :func:`opening_between` two; beyond the first and last
-    one nothing is made up: as they say.
+    """The opening (m) at a time, of reports (n,) in order of time: :func:`opening_between` two; beyond the first
+    and last one nothing is made up: as they say.
     """
     after = int(np.searchsorted(stamps_ns, wanted_ns))
     if after in (0, len(stamps_ns)):
