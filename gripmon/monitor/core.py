@@ -167,7 +167,7 @@ class Monitor:
             alerts_raised=self._policy.alerts.raised,
             cam_T_grip=to_record(self._trust.last_known(self._cam_T_grip)) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
-            look=self._trust.look.state(self.reference.reference_id),
+            look=self._trust.look_state(self.reference),
         )
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -392,6 +392,7 @@ class Monitor:
             self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
         self._baseline_weighed = False
         self._watch.reset(covariance)
+        self._trust.refer(self.reference)
         if book.in_force != book.configured:
             self._trust.rebase(self.reference)
         self._analysis.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))

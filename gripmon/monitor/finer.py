@@ -4,17 +4,40 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, AlertKind, Array, Cause, Frame, Image, Severity
+from gripmon.model.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    FinerLookRecord,
+    Frame,
+    Image,
+    LookNote,
+    LookVersion,
+    ReferenceRecord,
+    Severity,
+)
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.standing import Standing
-from gripmon.track.look import GripperLook, LookAlignment, LookFusion, LookMotion, another_background
+from gripmon.track.look import (
+    BLOCK_PX,
+    GripperLook,
+    LookAlignment,
+    LookFusion,
+    LookMotion,
+    LookRefused,
+    another_background,
+)
 
 DIFFERENT = 0.5
 """Share of a finger's blocks that look otherwise than at first, from which it looks different: grasps hide a half."""
@@ -25,20 +48,75 @@ what they grasp for seconds or a minute.
 """
 
 
+class _Pending(NamedTuple):
+    """A frame that may be learnt: its image, pose (4, 4), opening, times, and what the look measured in it."""
+
+    image: Image
+    cam_T_grip: Array
+    jaw_opening_m: float | None
+    now_s: float
+    stamp_ns: int
+    motion: LookMotion | None
+
+
 class FinerLook:
     """Refines one monitor's poses.  ``look`` tells one background from another; ``floor`` (6, 6): the systematic part
-    of the edges' covariance.
+    of the edges' covariance; ``edges``: digest of what was taught of them.
     """
 
-    def __init__(self, camera: Camera, gripper: Gripper, look: GripperLook, floor: Array):
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        look: GripperLook,
+        floor: Array,
+        reference: ReferenceRecord,
+        edges: str = "",
+    ):
         self._names, self._has_jaw = gripper.finger_ids, gripper.has_jaw
-        self._look, self._floor = look, floor
+        self._look, self._floor, self._edges = look, floor, edges
+        self._reference = reference
         self._alignment = LookAlignment(camera, gripper)
         self._fusion = LookFusion(float(np.linalg.norm(gripper.points_grip_m(None), axis=1).mean()))
-        self._pending: tuple[Image, Array, float | None, float, LookMotion | None] | None = None
+        self._pending: _Pending | None = None
         self._behind: NDArray[np.float32] | None = None
         self._since_s = np.full(len(self._names) + 1, np.inf)  # each finger, and all of it
+        self._since_ns: list[int | None] = [None] * len(self._since_s)
         self._due: list[Alert] = []
+        self._number, self._origin, self._reported = 1, "start", False
+        self.version: LookVersion | None = None
+        """Of the look that is learnt; None before its first frame."""
+
+    def refer(self, reference: ReferenceRecord) -> None:
+        """The reference in force: what is learnt against the edges stays, a new version names it."""
+        self._reference = reference
+
+    def state(self) -> FinerLookRecord | None:
+        """What survives a restart, some 150 kB as JSON; None before the first frame that was learnt."""
+        pixels = self._alignment.state()
+        if pixels is None or self.version is None:
+            return None
+        return FinerLookRecord(self._edges, self.version, pixels, self._fusion.state(), tuple(self._since_ns))
+
+    def restore(self, record: FinerLookRecord) -> None:
+        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it isn't of this gripper, or was
+        learnt against other edges.
+        """
+        if record.edges != self._edges:
+            raise LookRefused("the kept look was learnt against edges that were taught otherwise; it is learnt again")
+        if len(record.different_since_ns) != len(self._since_ns):
+            raise LookRefused("the kept look is of another number of fingers; it is learnt again")
+        try:
+            self._alignment.restore(record.pixels)
+            if record.bias is not None:
+                self._fusion.restore(record.bias)
+        except LookRefused:
+            self._alignment.forget()
+            raise
+        self.version, self._number, self._reported = record.version, record.version.number, False
+        # For how long it has looked so without anyone watching is not known: that is counted from here.
+        self._since_ns = list(record.different_since_ns)
+        self._since_s = np.array([np.inf if since is None else 0.0 for since in self._since_ns])
 
     def refine(self, frame: Frame, standing: Standing, now_s: float) -> Standing:
         """The same with the pose as edges and look have it together, and bounds that are by as much wider as that is
@@ -54,7 +132,7 @@ class FinerLook:
             refined = self._fusion.fuse(standing.cam_T_grip, of_background, motion)
         pose = standing.cam_T_grip if refined is None else refined[0]
         # A copy: learning can wait, and the caller may read the next image into the same memory.
-        self._pending = frame.image.copy(), pose, opening_m, now_s, motion
+        self._pending = _Pending(frame.image.copy(), pose, opening_m, now_s, frame.stamp_ns, motion)
         if refined is None:
             return standing
         away = perturbation_between(standing.cam_T_grip, pose)
@@ -66,16 +144,30 @@ class FinerLook:
         pending, self._pending = self._pending, None
         if pending is None:
             return
-        image, cam_T_grip, opening_m, now_s, motion = pending
-        behind = self._look.behind(image, cam_T_grip, opening_m)
+        where = pending.image, pending.cam_T_grip, pending.jaw_opening_m
+        behind = self._look.behind(*where)
         before, self._behind = self._behind, behind
         if before is not None and len(before) == len(behind) and not another_background(behind, before):
             self._behind = before
             return
-        if motion is not None:
+        if pending.motion is not None:
             self._fusion.learn()
-        self._alignment.learn(image, cam_T_grip, opening_m)
-        self._tell(self._alignment.renewed > DIFFERENT, now_s)
+        self._alignment.learn(*where)
+        self._count(pending.stamp_ns)
+        self._tell(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
+
+    def _count(self, stamp_ns: int) -> None:
+        """The version that the frame belongs to; once it measures, that is told."""
+        if not self._alignment.views:
+            return
+        if self.version is None:
+            reference = self._reference.reference_id, self._reference.revision
+            self.version = LookVersion(self._number, self._origin, *reference, stamp_ns, stamp_ns)
+        self.version = msgspec.structs.replace(self.version, last_stamp_ns=stamp_ns)
+        if self._alignment.ready and not self._reported:
+            self._reported = True
+            begun = f"version {self._number}, learnt before {self._alignment.views} backgrounds"
+            self._report(Severity.INFO, f"the gripper's look refines the edges: {begun}", None)
 
     def _opening(self, frame: Frame, standing: Standing) -> tuple[float | None, float]:
         """The jaw's opening with its standard deviation, m: as earlier frames showed it, which errs alike in all."""
@@ -91,20 +183,42 @@ class FinerLook:
         due, self._due = self._due, []
         return due
 
-    def _tell(self, different: NDArray[np.bool_], now_s: float) -> None:
+    def _tell(self, different: NDArray[np.bool_], now_s: float, stamp_ns: int) -> None:
         """Fingers (f,) that look different, and a look that contradicts the edges, once they have for long enough."""
-        self._since_s = np.where(
-            np.append(different, self._fusion.contradicts), np.minimum(self._since_s, now_s), np.inf
-        )
+        wrong = np.append(different, self._fusion.contradicts)
+        self._since_s = np.where(wrong, np.minimum(self._since_s, now_s), np.inf)
+        self._since_ns = [
+            (stamp_ns if since is None else since) if now else None
+            for now, since in zip(wrong.tolist(), self._since_ns, strict=True)
+        ]
         long = now_s - self._since_s >= DIFFERENT_S
         if not long.any():
             return
+        since_ns = min(
+            since for since, now in zip(self._since_ns, long.tolist(), strict=True) if now and since is not None
+        )
         names = [f"finger {name}" for name, now in zip(self._names, long[:-1].tolist(), strict=True) if now]
-        text = f"the gripper looks different: {', '.join(names)}, for {now_s - self._since_s[long].min():.0f} s"
+        text = f"the gripper looks different: {', '.join(names)}, since {_clock(since_ns)}"
+        self._origin = f"{', '.join(names)} looked different"
         if long[-1]:
             text = "the gripper's look contradicts its edges, which count alone while it is learnt again"
+            self._origin = "it contradicted the edges"
+        self._report(Severity.WARNING, text, since_ns)
+        if long[-1]:
             self._alignment.forget()
             self._fusion.forget()
-        self._due.append(Alert(AlertKind.GRIPPER, Cause.UNKNOWN, Severity.WARNING, text))
         self._alignment.renew()
+        self._number, self.version, self._reported = self._number + 1, None, False
         self._since_s[:] = np.inf
+        self._since_ns = [None] * len(self._since_ns)
+
+    def _report(self, severity: Severity, text: str, since_ns: int | None) -> None:
+        assert self.version is not None
+        middle_px, other = self._alignment.places_px()
+        places = tuple((u, v) for u, v in np.rint(middle_px).astype(int).tolist())
+        note = LookNote(self.version, self._alignment.views, BLOCK_PX, places, tuple(other.tolist()))
+        self._due.append(Alert(AlertKind.LOOK, Cause.UNKNOWN, severity, text, since_ns=since_ns, look=note))
+
+
+def _clock(stamp_ns: int) -> str:
+    return f"{datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -37,6 +37,8 @@ class Tracker:
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
         """By how much the model may have each finger out of its place; teaching measures that."""
+        self.taught_digest = "" if taught is None else taught.digest
+        """Of what was taught; empty: nothing was."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # where it was seen last
         self._usual_share = USUAL_SHARE
         # Of their own, since they may run beside a measurement.

@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, Array, Frame, Image, MonitorState, Protection, ReferenceRecord
+from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.finer import FinerLook
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
@@ -59,7 +60,9 @@ class Integrity:
         self._weigher = Weigher(tracker, gripper, settings, reference)
         self._look = GripperLook(camera, gripper, tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z)
         self._strips = FingerStrips(camera, gripper, tracker.along)
-        self._finer = FinerLook(camera, gripper, self._look, tracker.floor) if settings.look.enabled else None
+        self._finer = None
+        if settings.look.enabled:
+            self._finer = FinerLook(camera, gripper, self._look, tracker.floor, reference, tracker.taught_digest)
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
@@ -67,15 +70,21 @@ class Integrity:
         self._elsewhere = 0
         self._believed = False
 
-    @property
-    def look(self) -> GripperLook:
-        """The gripper's own look, the second witness."""
-        return self._look
+    def look_state(self, reference: ReferenceRecord) -> LookRecord | None:
+        """What survives a restart of the gripper's own look; None before it is learnt."""
+        record = self._look.state(reference.reference_id)
+        finer = None if self._finer is None else self._finer.state()
+        return record if record is None or finer is None else msgspec.structs.replace(record, finer=finer)
 
     @property
     def swing(self) -> Array:
         """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         return self._weigher.swing
+
+    def refer(self, reference: ReferenceRecord) -> None:
+        """The reference in force."""
+        if self._finer is not None:
+            self._finer.refer(reference)
 
     def rebase(self, reference: ReferenceRecord) -> None:
         """There is a new reference."""
@@ -87,6 +96,8 @@ class Integrity:
         if state is not None and state.look is not None:
             try:
                 self._look.restore(state.look, reference.reference_id)
+                if self._finer is not None and state.look.finer is not msgspec.UNSET:
+                    self._finer.restore(state.look.finer)
             except LookRefused as refused:
                 self.look_refused = str(refused)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from gripmon.model.records.looks import LookNote
 from gripmon.model.records.values import OpenEnum
 
 
@@ -60,6 +61,7 @@ class AlertKind(OpenEnum):
     RECORDING = "recording"
     OUTPUT = "output"
     SEVERAL = "several_monitors"
+    LOOK = "look"
 
 
 class AlertEvent(enum.StrEnum):
@@ -104,8 +106,17 @@ class Alert(msgspec.Struct, frozen=True):
     time_left_s: Annotated[
         float | None, Meta(description="until a creep reaches the limit, s; null for all else, or away from it")
     ] = None
-    since_ns: Annotated[int | None, Meta(description="when it was raised, Unix ns; null for what is only noted")] = None
+    since_ns: Annotated[
+        int | None,
+        Meta(
+            description="when it was raised, or since when the gripper looks different, Unix ns; null for all else "
+            "that is only noted"
+        ),
+    ] = None
     acknowledged: Annotated[bool, Meta(description="an operator has taken note of it")] = False
+    look: Annotated[
+        LookNote | msgspec.UnsetType, Meta(description="which look, and where; left out for all other kinds")
+    ] = msgspec.UNSET
 
 
 class OpenAlert(msgspec.Struct, frozen=True):

@@ -1,12 +1,14 @@
 """The gripper's own learned look: a second witness of where it is, and a finer measure of how it moves."""
 
-from gripmon.track.look.agreement import LookAgreement
+from gripmon.track.look.agreement import LookAgreement, LookRefused
 from gripmon.track.look.alignment import LookAlignment, LookMotion, warm_up
-from gripmon.track.look.core import GripperLook, LookRefused, another_background
+from gripmon.track.look.blocks import BLOCK_PX
+from gripmon.track.look.core import GripperLook, another_background
 from gripmon.track.look.fusion import LookFusion
 from gripmon.track.look.strips import FingerStrips
 
 __all__ = [
+    "BLOCK_PX",
     "FingerStrips",
     "GripperLook",
     "LookAgreement",

@@ -12,20 +12,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from types import ModuleType
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.compiled import COMPILES
-from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image
+from gripmon.model.poses import to_record
+from gripmon.model.records import Array, Image, LookPixels
 from gripmon.track.look import kernel, plain
-from gripmon.track.look.layout import BORDER_PX, finger_depths_m
-
-BLOCK_PX = 8
-"""Side of a block, px; its outermost pixels only serve for gradients."""
+from gripmon.track.look.agreement import LookRefused
+from gripmon.track.look.blocks import BLOCK_PX, INNER, blocks_in, gradients, jacobian_of, most_telling
+from gripmon.track.look.placed import LINEAR_PX, Placed, motion_between, moved
 
 LEARNT_BLOCKS, MEASURED_BLOCKS = 128, 32
 """Of which the most telling ones are measured, a thousand pixels; twice as many scatter by a tenth less."""
@@ -38,9 +37,6 @@ MOST_VIEWS = 256
 
 CHOOSE_EVERY = 16
 """Learnt frames after which blocks are chosen again."""
-
-LINEAR_PX = 0.5
-"""Motion up to which pixels are taken to move linearly, px: over 500 px the rest is (0.5 / 500)² 500 = 0.0005 px."""
 
 CLOSE_PX = 0.1
 """Step of the alignment up to which the image isn't read again, px: central differences are a fifth too small."""
@@ -67,6 +63,9 @@ GREY_BGR = np.array([0.114, 0.587, 0.299])
 
 ARITHMETIC: ModuleType = kernel if COMPILES else plain
 
+_KINDS = ("<u2", "<f4", "<f4", "<f4", "<f4", "<u2")
+"""How places, means, variances, first means, counts and unlike frames are kept."""
+
 
 @dataclass(frozen=True, slots=True)
 class LookMotion:
@@ -80,73 +79,6 @@ class LookMotion:
     agree: Array
 
 
-class _Placed:
-    """Pixels (p, n) of fingers, projected where the gripper is; again only when it has moved."""
-
-    def __init__(self, camera: Camera, gripper: Gripper, points_grip_m: Array, finger: NDArray[np.intp]):
-        """``points_grip_m`` (p, n, 3) at the jaw's nominal opening."""
-        self._camera, self._gripper = camera, gripper
-        self._points_grip_m, self._finger = points_grip_m, finger
-        self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
-        self._at: tuple[Array, float | None] | None = None
-        self.base_px: Array = np.zeros((0, 0, 2))
-        self.flow: Array = np.zeros((0, 0, 2, 7))
-
-    def offsets_m(self, jaw_opening_m: float | None) -> Array:
-        """(f, 3) of each finger from where it is at the nominal opening."""
-        now, then = (self._gripper.points_grip_m(o) for o in (jaw_opening_m, self._gripper.jaw_nominal_m))
-        return np.asarray(now[self._first] - then[self._first])
-
-    def motion_to(self, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
-        """(7,) motion, gripper axes, from where the pixels are projected; they are projected there if it is far."""
-        if self._at is not None:
-            motion = motion_between(self._at[0], cam_T_grip, self._at[1], jaw_opening_m)
-            if self.moved_px(motion) <= LINEAR_PX:
-                return motion
-        self._project(cam_T_grip, jaw_opening_m)
-        return np.zeros(7)
-
-    def moved_px(self, motion: Array) -> float:
-        """How far a motion (7,) takes the first pixel of any patch; infinite before there is a projection."""
-        return float(np.abs(self.flow[:, 0] @ motion).max(initial=0.0)) if self._at is not None else np.inf
-
-    def _project(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
-        self._at = cam_T_grip.copy(), jaw_opening_m
-        shape = self._points_grip_m.shape[:2]
-        points = (self._points_grip_m + self.offsets_m(jaw_opening_m)[self._finger][:, None]).reshape(-1, 3)
-        rotation = cam_T_grip[:3, :3]
-        uv_px, d_uv = self._camera.project_with_jacobian(points @ rotation.T + cam_T_grip[:3, 3])
-        d_grip = d_uv @ rotation
-        flow = np.empty((len(points), 2, 7))
-        flow[..., :3] = d_grip
-        for row in range(2):
-            flow[:, row, 3:6] = np.cross(points, d_grip[:, row])
-        per_m = self._per_opening(jaw_opening_m)[self._finger].repeat(shape[1], axis=0)
-        flow[..., 6] = np.einsum("nij,nj->ni", d_grip, per_m)
-        self.base_px, self.flow = uv_px.reshape(*shape, 2), flow.reshape(*shape, 2, 7)
-
-    def _per_opening(self, jaw_opening_m: float | None) -> Array:
-        """(f, 3) way of each finger for each metre that the jaw opens."""
-        if jaw_opening_m is None or not self._gripper.has_jaw:
-            return np.zeros((len(self._first), 3))
-        low = max(jaw_opening_m - 1e-5, self._gripper.jaw_min_m)
-        high = min(jaw_opening_m + 1e-5, self._gripper.jaw_max_m)
-        return (self.offsets_m(high) - self.offsets_m(low)) / (high - low)
-
-
-def motion_between(from_T: Array, to_T: Array, from_m: float | None, to_m: float | None) -> Array:
-    """(7,): shift and turn in gripper axes, m and rad, and by how much the jaw opens, m."""
-    xi = perturbation_between(from_T, to_T)
-    opened_m = 0.0 if from_m is None or to_m is None else to_m - from_m
-    return np.concatenate([xi[:3] @ from_T[:3, :3], xi[3:] @ from_T[:3, :3], [opened_m]])
-
-
-def moved(cam_T_grip: Array, motion: Array) -> Array:
-    """A pose (4, 4) after a motion (7,) in gripper axes."""
-    rotation = cam_T_grip[:3, :3]
-    return perturb(cam_T_grip, np.concatenate([rotation @ motion[:3], rotation @ motion[3:6]]))
-
-
 class LookAlignment:
     """Learns and measures the pixels of one gripper in one camera.  A pure function of the frames so far."""
 
@@ -157,9 +89,10 @@ class LookAlignment:
     def forget(self) -> None:
         """Learn again."""
         self.views = 0
-        self._learnt: _Placed | None = None
+        self._learnt: Placed | None = None
+        self._laid_out: tuple[Array, float | None, NDArray[np.uint16]] | None = None
         self._count: Array = np.zeros(0)
-        self._measured: _Placed | None = None
+        self._measured: Placed | None = None
         self._last: tuple[Array, float | None] | None = None
 
     @property
@@ -173,11 +106,15 @@ class LookAlignment:
         fingers = len(self._gripper.finger_ids)
         if self._learnt is None:
             return np.zeros(fingers)
-        now, first = (m - m.mean(axis=1, keepdims=True) for m in (self._mean, self._at_first))
-        told = (self._count >= FEWEST_VIEWS) & (np.sqrt((first**2).mean(axis=1)) > 2.0 * LEAST_DN)
-        alike = (now * first).sum(axis=1) > RENEWED * np.sqrt((now**2).sum(axis=1) * (first**2).sum(axis=1))
+        told, alike = self._likeness()
         other = np.bincount(self._finger[told], ~alike[told], fingers)
         return np.asarray(other / np.maximum(np.bincount(self._finger[told], minlength=fingers), 1))
+
+    def _likeness(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(p,) blocks that are known and textured; and those (p,) that look as at first."""
+        now, first = (m - m.mean(axis=1, keepdims=True) for m in (self._mean, self._at_first))
+        told = (self._count >= FEWEST_VIEWS) & (np.sqrt((first**2).mean(axis=1)) > 2.0 * LEAST_DN)
+        return told, (now * first).sum(axis=1) > RENEWED * np.sqrt((now**2).sum(axis=1) * (first**2).sum(axis=1))
 
     def renew(self) -> None:
         """The present look counts as the first."""
@@ -197,6 +134,59 @@ class LookAlignment:
             self._choose()
         elif self._measured is not None:
             self._take()
+
+    def state(self) -> LookPixels | None:
+        """What survives a restart, some 100 kB; None before the first frame."""
+        if self._laid_out is None or not self.views:
+            return None
+        cam_T_grip, jaw_opening_m, places = self._laid_out
+        parts = (places, self._mean, self._variance, self._at_first, self._count, self._unlike)
+        kept = (part.astype(kind).tobytes() for part, kind in zip(parts, _KINDS, strict=True))
+        return LookPixels(to_record(cam_T_grip), jaw_opening_m, self.views, *kept)
+
+    def restore(self, record: LookPixels) -> None:
+        """Go on with kept pixels.  Raises :class:`LookRefused`, and begins again, where they are not of these fingers
+        or don't hold together.
+        """
+        self.forget()
+        try:
+            places, mean, variance, first, count, unlike = (
+                np.frombuffer(data, kind).reshape(shape)
+                for data, kind, shape in zip(
+                    (record.blocks, record.mean, record.variance, record.first, record.count, record.unlike),
+                    _KINDS,
+                    ((-1, 3), *(((-1, BLOCK_PX**2),) * 3), (-1,), (-1,)),
+                    strict=True,
+                )
+            )
+        except ValueError:
+            raise LookRefused("the kept look's pixels are cut off; it is learnt again") from None
+        if len({len(part) for part in (places, mean, variance, first, count, unlike)}) > 1:
+            raise LookRefused("the kept look's pixels don't belong together; it is learnt again")
+        sound = np.isfinite(mean).all() and np.isfinite(variance).all() and np.isfinite(count).all()
+        if not sound or (variance < 0.0).any() or (count < 0.0).any() or np.isinf(first).any():
+            raise LookRefused("the kept look holds pixels that can't be; it is learnt again")
+        cam_T_grip = from_record(record.cam_T_grip)
+        points_grip_m, now = self._blocks(cam_T_grip, record.jaw_opening_m)
+        where = {tuple(place): row for row, place in enumerate(now.tolist())}
+        rows = [where.get(tuple(place), -1) for place in places.tolist()]
+        if -1 in rows or len(set(rows)) < max(len(rows), 1):
+            raise LookRefused("the kept look has other blocks of pixels than this version's; it is learnt again")
+        self._begin(points_grip_m[rows], places, cam_T_grip, record.jaw_opening_m)
+        self.views = record.views
+        self._mean, self._variance, self._at_first = mean.astype(float), variance.astype(float), first.astype(float)
+        self._count, self._unlike = count.astype(float), unlike.astype(np.intp)
+        if self.views >= FEWEST_VIEWS:
+            self._choose()
+
+    def places_px(self) -> tuple[Array, NDArray[np.bool_]]:
+        """(p, 2) middles of the blocks where the gripper was seen last, and which of them look otherwise than at first;
+        none before the first frame.
+        """
+        if self._learnt is None:
+            return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        told, alike = self._likeness()
+        return np.asarray(self._learnt.base_px.mean(axis=1)), told & ~alike
 
     def measure(
         self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, jaw_sigma_m: float
@@ -233,7 +223,7 @@ class LookAlignment:
             return None
         since = here - motion
         found_T = moved(start[0], since)
-        opening_m = None if start[1] is None else start[1] + since[6]
+        opening_m = None if start[1] is None else start[1] + float(since[6])
         self._last = found_T, opening_m
         covariance = self._covariance(information, pulls, scatter, len(share))
         turn = np.kron(np.eye(2), found_T[:3, :3])
@@ -257,27 +247,38 @@ class LookAlignment:
         return np.divide(total, count, out=np.full(fingers, np.nan), where=count > 0)
 
     def _lay_out(self, grey: tuple[Image, Array], cam_T_grip: Array, jaw_opening_m: float | None) -> bool:
-        points_grip_m, finger = _blocks(self._camera, self._gripper, cam_T_grip, jaw_opening_m)
-        if not len(finger):
+        points_grip_m, places = self._blocks(cam_T_grip, jaw_opening_m)
+        if not len(places):
             return False
-        every = _Placed(self._camera, self._gripper, points_grip_m, finger)
-        # At the nominal opening: fingers move as wholes.
-        points_grip_m = points_grip_m - every.offsets_m(jaw_opening_m)[finger][:, None]
-        every = _Placed(self._camera, self._gripper, points_grip_m, finger)
+        every = Placed(self._camera, self._gripper, points_grip_m, places[:, 2].astype(np.intp))
         every.motion_to(cam_T_grip, jaw_opening_m)
         values = self._by.read(*grey, every.base_px, every.flow, np.zeros(7))
         values = np.nan_to_num(values)
-        jacobian = _jacobian(values, every.flow, np.ones_like(values))
-        best = _most_telling(jacobian, np.ones((len(finger), _INNER.size)), LEARNT_BLOCKS)
-        self._points, self._finger = points_grip_m[best], finger[best]
-        self._learnt = _Placed(self._camera, self._gripper, self._points, self._finger)
+        jacobian = jacobian_of(values, every.flow, np.ones_like(values))
+        best = most_telling(jacobian, np.ones((len(places), INNER.size)), LEARNT_BLOCKS)
+        self._begin(points_grip_m[best], places[best], cam_T_grip, jaw_opening_m)
+        return True
+
+    def _blocks(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, NDArray[np.uint16]]:
+        """As :func:`blocks_in`, at the nominal opening: fingers move as wholes."""
+        points_grip_m, places = blocks_in(self._camera, self._gripper, cam_T_grip, jaw_opening_m)
+        finger = places[:, 2].astype(np.intp)
+        offsets_m = Placed(self._camera, self._gripper, points_grip_m, finger).offsets_m(jaw_opening_m)
+        return points_grip_m - offsets_m[finger][:, None], places
+
+    def _begin(
+        self, points_grip_m: Array, places: NDArray[np.uint16], cam_T_grip: Array, jaw_opening_m: float | None
+    ) -> None:
+        """Nothing is known yet of blocks (p, n, 3) that were chosen at a pose (4, 4) and an opening."""
+        self._laid_out = cam_T_grip.copy(), jaw_opening_m, places
+        self._points, self._finger = points_grip_m, places[:, 2].astype(np.intp)
+        self._learnt = Placed(self._camera, self._gripper, self._points, self._finger)
         self._learnt.motion_to(cam_T_grip, jaw_opening_m)
         # How a motion changes what is seen was the same from everywhere near: as where they were laid out.
         self._flow = self._learnt.flow.copy()
         self._mean, self._variance = np.zeros(self._points.shape[:2]), np.zeros(self._points.shape[:2])
         self._at_first = np.full(self._points.shape[:2], np.nan)
-        self._count, self._unlike = np.zeros(len(best)), np.zeros(len(best), dtype=np.intp)
-        return True
+        self._count, self._unlike = np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)
 
     def _add(self, values: Array) -> None:
         """Follow the means and variances, in the light of what was learnt."""
@@ -309,18 +310,18 @@ class LookAlignment:
 
     def _choose(self) -> None:
         weight = self._weights()
-        jacobian = _jacobian(self._mean, self._flow, weight)
+        jacobian = jacobian_of(self._mean, self._flow, weight)
         noise = 0.5 / (weight * np.minimum(self._count, MOST_VIEWS)[:, None] + 1e-12)
-        across, down = _gradients(self._mean)
-        textured = (across**2 + down**2).mean(axis=1) > TEXTURE * 2.0 * noise[:, _INNER].mean(axis=1)
+        across, down = gradients(self._mean)
+        textured = (across**2 + down**2).mean(axis=1) > TEXTURE * 2.0 * noise[:, INNER].mean(axis=1)
         weight = weight * textured[:, None]
-        best = _most_telling(jacobian, weight[:, _INNER], MEASURED_BLOCKS)
+        best = most_telling(jacobian, weight[:, INNER], MEASURED_BLOCKS)
         best = best[textured[best]]
         if not len(best):
             self._measured = None
             return
         self._chosen, self._finger_in = best, self._finger[best]
-        self._measured = _Placed(self._camera, self._gripper, self._points[best][:, _INNER], self._finger_in)
+        self._measured = Placed(self._camera, self._gripper, self._points[best][:, INNER], self._finger_in)
         self._last = None
         self._take()
 
@@ -332,9 +333,9 @@ class LookAlignment:
 
     def _take(self) -> None:
         weight, best = self._weights()[self._chosen], self._chosen
-        self._mean_in = np.ascontiguousarray(self._mean[best][:, _INNER])
-        self._weight_in = np.ascontiguousarray(weight[:, _INNER])
-        self._jacobian = _jacobian(self._mean[best], self._flow[best], weight)
+        self._mean_in = np.ascontiguousarray(self._mean[best][:, INNER])
+        self._weight_in = np.ascontiguousarray(weight[:, INNER])
+        self._jacobian = jacobian_of(self._mean[best], self._flow[best], weight)
 
 
 def warm_up() -> None:
@@ -347,78 +348,9 @@ def warm_up() -> None:
     kernel.align(values, values, values, np.zeros((1, 1, 7)), np.ones(7))
 
 
-_INNER = np.arange(BLOCK_PX**2).reshape(BLOCK_PX, BLOCK_PX)[1:-1, 1:-1].ravel()
-
-
 def _channels(image: Image) -> tuple[Image, Array]:
     """An image (h, w, c), and what its channels weigh in steps of 8 bits."""
     quantum = {np.dtype(np.uint8): 1.0, np.dtype(np.uint16): 257.0}.get(image.dtype, 1.0 / 255.0)
     if image.ndim == 2:
         return image[..., None], np.array([1.0 / quantum])
     return image, GREY_BGR / quantum
-
-
-def _blocks(
-    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None
-) -> tuple[Array, NDArray[np.intp]]:
-    """Points (p, n, 3), gripper frame, of all blocks that lie inside a finger, and whose they are (p,)."""
-    depths = finger_depths_m(camera, gripper, cam_T_grip, jaw_opening_m)
-    nearest = np.fmin.reduce(depths)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER_PX + 1,) * 2)
-    points, finger = [np.zeros((0, BLOCK_PX**2, 3))], []
-    reach = np.arange(BLOCK_PX)
-    within = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
-    for f, depth_m in enumerate(depths):
-        own = (np.isfinite(depth_m) & (depth_m <= nearest)).astype(np.uint8)
-        own = np.asarray(cv2.erode(own, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0), dtype=np.uint8)
-        rows, columns = (np.arange(0, size - BLOCK_PX + 1, BLOCK_PX) for size in own.shape)
-        corner = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
-        block = corner + within
-        block = block[own[block[..., 1], block[..., 0]].all(axis=1)]
-        flat = block.reshape(-1, 2)
-        xy = camera.undistort(flat.astype(float))
-        z_m = depth_m[flat[:, 1], flat[:, 0]]
-        place = (np.column_stack([xy, np.ones(len(xy))]) * z_m[:, None] - cam_T_grip[:3, 3]) @ cam_T_grip[:3, :3]
-        place = place.reshape(-1, BLOCK_PX**2, 3)
-        sound = np.isfinite(place).all(axis=(1, 2))
-        points.append(place[sound])
-        finger += [f] * int(sound.sum())
-    return np.concatenate(points), np.array(finger, dtype=np.intp)
-
-
-def _gradients(mean: Array) -> tuple[Array, Array]:
-    """(p, inner) each, of blocks (p, n): central differences, as of the interpolation between pixels."""
-    square = mean.reshape(-1, BLOCK_PX, BLOCK_PX)
-    across = 0.5 * (square[:, 1:-1, 2:] - square[:, 1:-1, :-2])
-    down = 0.5 * (square[:, 2:, 1:-1] - square[:, :-2, 1:-1])
-    return across.reshape(len(mean), -1), down.reshape(len(mean), -1)
-
-
-def _jacobian(mean: Array, flow: Array, weight: Array) -> Array:
-    """(p, inner, 7): how a motion changes what blocks (p, n) show where they were, less gain and offset of light."""
-    gradient = np.stack(_gradients(mean), axis=-1)
-    out = -np.einsum("pnk,pnkj->pnj", gradient, flow[:, _INNER])
-    weight, mean = weight[:, _INNER], mean[:, _INNER]
-    total = np.maximum(weight.sum(axis=1), 1e-300)[:, None]
-    learnt = mean - (weight * mean).sum(axis=1, keepdims=True) / total
-    out -= np.einsum("pn,pnj->pj", weight, out)[:, None] / total[:, None]
-    own = np.maximum((weight * learnt**2).sum(axis=1), 1e-300)[:, None]
-    out -= learnt[..., None] * (np.einsum("pn,pnj->pj", weight * learnt, out) / own)[:, None]
-    return np.ascontiguousarray(out)
-
-
-def _most_telling(jacobian: Array, weight: Array, most: int) -> NDArray[np.intp]:
-    """Blocks that together tell most of the weakest motions: each in turn adds most to the information's determinant.
-
-    The opening is left out: it is mostly known.
-    """
-    of_block = np.einsum("pn,pni,pnj->pij", weight, jacobian[..., :6], jacobian[..., :6])
-    whole = of_block.sum(axis=0)
-    so_far = np.diag(np.maximum(whole.diagonal(), 1e-12)) * (1e-3 / max(len(weight), 1))
-    left = np.ones(len(weight), dtype=bool)
-    for _ in range(min(most, len(weight))):
-        gain = np.einsum("ij,pij->p", np.linalg.inv(so_far), of_block)
-        best = int(np.argmax(np.where(left, gain, -1.0)))
-        left[best] = False
-        so_far = so_far + of_block[best]
-    return np.flatnonzero(~left)

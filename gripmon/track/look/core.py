@@ -22,7 +22,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.records import Array, Image, LookRecord
-from gripmon.track.look.agreement import AGREEING_CORRELATION, LookAgreement, patch_evidence
+from gripmon.track.look.agreement import AGREEING_CORRELATION, LookAgreement, LookRefused, patch_evidence
 from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
 
 FORGET_S = 4.0 * 3600.0
@@ -71,10 +71,6 @@ _U, _V = np.meshgrid(np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS), np.linspace(-1.0
 _LIGHT = np.linalg.qr(np.column_stack([np.ones(POINTS), _U.ravel(), _V.ravel()]))[0]
 _TEXTURE = (np.eye(POINTS) - _LIGHT @ _LIGHT.T).astype(np.float32)
 """(POINTS, POINTS), symmetric: takes brightness and both slopes out of a patch."""
-
-
-class LookRefused(ValueError):
-    """A kept look belongs to something else; the text says to what."""
 
 
 class GripperLook:

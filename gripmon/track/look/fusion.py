@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.records import Array
+from gripmon.model.geometry import from_record
+from gripmon.model.poses import perturb, perturbation_between, to_record
+from gripmon.model.records import Array, LookBias
+from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.alignment import LookMotion
 
 MEMORY = 64
@@ -46,6 +48,26 @@ class LookFusion:
         self._correlation = CORRELATED
         self._before: Array | None = None
         self._pending: tuple[Array, Array, Array, Array, float] | None = None
+
+    def state(self) -> LookBias | None:
+        """What survives a restart; None before a bias is known."""
+        if self._at is None:
+            return None
+        x, y, z, about_x, about_y, about_z = self._bias.tolist()
+        covariance = tuple(self._covariance.ravel().tolist())
+        bias, where = (x, y, z, about_x, about_y, about_z), to_record(self._at[0])
+        return LookBias(self.backgrounds, bias, covariance, where, float(self._at[1]), float(self._correlation))
+
+    def restore(self, record: LookBias) -> None:
+        """Go on with a kept bias.  Raises :class:`LookRefused`, and begins again, for one that can't be."""
+        self.forget()
+        bias, covariance = np.array(record.bias), np.reshape(record.covariance, (6, 6))
+        finite = np.isfinite(bias).all() and np.isfinite(covariance).all() and np.isfinite(record.correlation)
+        if not finite or not np.isfinite(record.jaw_opening_m) or np.linalg.eigvalsh(covariance).min() <= 0.0:
+            raise LookRefused("the kept look's bias can't be; it is learnt again")
+        self.backgrounds, self._bias, self._covariance = record.backgrounds, bias, covariance
+        self._at = from_record(record.cam_T_grip), record.jaw_opening_m
+        self._correlation = record.correlation
 
     def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> tuple[Array, Array] | None:
         """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one, with the covariance
