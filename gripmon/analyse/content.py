@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records import CauseWeight
+from gripmon.model.records import CauseWeight, LookNote
 
 Vector = tuple[float, float, float]
 
@@ -73,6 +73,10 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     after_seq: Annotated[int | None, _is("frame of the picture after: the first that was believed, if any was")] = None
     story: Annotated[tuple[Moment, ...], _is("its alerts, in order")] = ()
+    look: Annotated[
+        LookNote | msgspec.UnsetType,
+        _is("of the gripper's learnt look which one, and where; left out for all else"),
+    ] = msgspec.UNSET
 
 
 class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):

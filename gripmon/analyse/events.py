@@ -15,6 +15,7 @@ from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Ref
 TITLES = {
     AlertKind.VIBRATION: "The camera vibrated",
     AlertKind.GRIPPER: "The gripper is not as it should be",
+    AlertKind.LOOK: "The gripper's look",
     AlertKind.LENS: "Focus or zoom changed",
     AlertKind.RECALIBRATED: "Recalibrated: a new reference",
     AlertKind.PROPOSED: "A new reference waits for an operator",
@@ -43,7 +44,7 @@ def _event(history: AlertHistory) -> Event:
     alert = explained(alerts) or alerts[-1].alert
     since_ns = history.since_ns
     noted = not history.first.alert.alert_id
-    end_ns = since_ns if noted else None if history.over is None else history.over.stamp_ns
+    end_ns = history.first.stamp_ns if noted else None if history.over is None else history.over.stamp_ns
     return Event(
         kind=kind,
         title=TITLES.get(kind, str(kind).replace("_", " ").capitalize()),
@@ -57,6 +58,7 @@ def _event(history: AlertHistory) -> Event:
         part=alert.part,
         causes=alert.causes,
         alert_id=alert.alert_id,
+        look=alert.look,
         story=tuple(
             Moment(a.stamp_ns, a.alert.text if noted else f"{a.alert.event}: {a.alert.text}") for a in history.all
         ),

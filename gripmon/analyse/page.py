@@ -12,6 +12,7 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +35,7 @@ from gripmon.analyse.content import (
 )
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.summary import CAUSES, cause_words
-from gripmon.model.records import AlertKind, CauseWeight, Origin
+from gripmon.model.records import AlertKind, CauseWeight, LookNote, Origin
 from gripmon.record.read import Picture
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all alerts
@@ -101,15 +102,15 @@ def _title(report: Report) -> str:
 
 def _cards(events: Sequence[Event]) -> list[Event]:
     """Motions, new references and what is worth a warning; if there are many, the gravest and largest of them."""
-    worthy = [
-        e for e in events if e.kind in (*MOTIONS, AlertKind.RECALIBRATED) or (e.severity != "info" and e.kind != "gap")
-    ]
+    always = (*MOTIONS, AlertKind.RECALIBRATED, AlertKind.LOOK)
+    worthy = [e for e in events if e.kind in always or (e.severity != "info" and e.kind != "gap")]
     worthy.sort(key=lambda e: (_RANK.get(e.severity, 0), 0.0 if e.moved is None else e.moved.size_m), reverse=True)
     return worthy[:_MOST_CARDS]
 
 
 def _pictures(analysed: Analysed, event: Event) -> tuple[Shown | None, ...]:
-    return cut_alike([_judged(analysed, seq) for seq in (event.before_seq, event.at_seq, event.after_seq)])
+    seqs = event.before_seq, event.at_seq, event.after_seq
+    return cut_alike([_judged(analysed, seq) for seq in seqs], event.look)
 
 
 def _judged(analysed: Analysed, seq: int | None) -> JudgedPicture | None:
@@ -177,6 +178,8 @@ def _sentences(event: Event) -> str:
     if event.moved is None and event.story:
         text = event.story[0].text.removeprefix("raised: ")
         parts.insert(0, f"{text[:1].upper()}{text[1:]}.".replace("..", "."))
+    if event.look is not msgspec.UNSET:
+        parts.append(_look_words(event.look))
     if event.end_text:
         parts.append(
             f"It was over at {clock_time(event.end_ns, 1)}: {event.end_text}."
@@ -184,6 +187,17 @@ def _sentences(event: Event) -> str:
             else f"In the end: {event.end_text}."
         )
     return " ".join(parts)
+
+
+def _look_words(look: LookNote) -> str:
+    version = look.version
+    blocks = count(len(look.places_px), "block") + " of pixels"
+    alike = f"{len(look.different)} of {blocks} look different (red)" if look.different else f"{blocks} are learnt"
+    return (
+        f"Look {version.number} ({version.origin}), learnt before {count(look.views, 'background')} from "
+        f"{clock_time(version.first_stamp_ns, 0)} on, when reference {version.reference_id}, revision "
+        f"{version.revision}, was in force: {alike}."
+    )
 
 
 def _around(event: Event) -> tuple[float, float]:
@@ -230,9 +244,11 @@ class Shown:
     height_px: int
 
 
-def cut_alike(pictures: Sequence[JudgedPicture | None]) -> tuple[Shown | None, ...]:
+def cut_alike(
+    pictures: Sequence[JudgedPicture | None], look: LookNote | msgspec.UnsetType = msgspec.UNSET
+) -> tuple[Shown | None, ...]:
     """Pictures in order of time, any may be None, cut to the same part of the image; into the later ones the gripper's
-    place in the first one is drawn, too, in white.
+    place in the first one is drawn, too, in white.  A ``look`` is drawn over them all in place of edge points.
     """
     there = [each.picture for each in pictures if each is not None]
     if not there:
@@ -241,7 +257,9 @@ def cut_alike(pictures: Sequence[JudgedPicture | None]) -> tuple[Shown | None, .
     box = _box([points for picture in there for points in _points(picture)], width, height)
     first = pictures[0]
     outline = () if first is None else tuple(first.picture.predicted_edges)
-    return tuple(None if each is None else _shown(each, box, () if each is first else outline) for each in pictures)
+    return tuple(
+        None if each is None else _shown(each, box, () if each is first else outline, look) for each in pictures
+    )
 
 
 def _points(picture: Picture) -> list[Points]:
@@ -270,7 +288,12 @@ def _box(points: Sequence[Points], width: int, height: int) -> tuple[int, int, i
     return int(corner[0]), int(corner[1]), int(corner[0] + size[0]), int(corner[1] + size[1])
 
 
-def _shown(judged: JudgedPicture, box: tuple[int, int, int, int], outline: Sequence[Points]) -> Shown | None:
+def _shown(
+    judged: JudgedPicture,
+    box: tuple[int, int, int, int],
+    outline: Sequence[Points],
+    look: LookNote | msgspec.UnsetType,
+) -> Shown | None:
     left, top, right, bottom = box
     picture, believed = judged
     crop = _bgr8(picture.image)[top:bottom, left:right]
@@ -291,10 +314,16 @@ def _shown(judged: JudgedPicture, box: tuple[int, int, int, int], outline: Seque
         cv2.polylines(
             canvas, [p for p in polylines if len(p) > 1], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
         )
+    if look is not msgspec.UNSET:
+        _draw_look(canvas, place, look, scale)
     for points, colour, radius in (
-        (picture.edges_used, USED if believed else REFUSED, 2),
-        (picture.edges_refused, REFUSED, 2),
-        (_corners(picture)[: None if believed else 0], CORNER, 5),
+        ()
+        if look is not msgspec.UNSET
+        else (
+            (picture.edges_used, USED if believed else REFUSED, 2),
+            (picture.edges_refused, REFUSED, 2),
+            (_corners(picture)[: None if believed else 0], CORNER, 5),
+        )
     ):
         for x, y in place(points).tolist():
             filled = -1 if radius < 5 else 2
@@ -304,6 +333,18 @@ def _shown(judged: JudgedPicture, box: tuple[int, int, int, int], outline: Seque
         return None
     text = base64.b64encode(encoded.tobytes()).decode("ascii")
     return Shown(int(picture.seq), f"data:image/jpeg;base64,{text}", *size)
+
+
+def _draw_look(
+    canvas: NDArray[Any], place: Callable[[Points], NDArray[np.int32]], look: LookNote, scale: float
+) -> None:
+    """The blocks of pixels that were learnt: those that look as learnt green, those that look otherwise red."""
+    half = round(0.5 * scale * look.block_px * 2**_SUBPIXEL_BITS)
+    for number, place_px in enumerate(look.places_px):
+        for x, y in place(np.array(place_px, np.float32)).tolist():
+            colour = REFUSED if number in look.different else USED
+            corners = (x - half, y - half), (x + half, y + half)
+            cv2.rectangle(canvas, *corners, colour, 2 if number in look.different else 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _bgr8(image: NDArray[Any]) -> NDArray[Any]:

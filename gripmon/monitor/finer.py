@@ -216,7 +216,7 @@ class FinerLook:
         assert self.version is not None
         middle_px, other = self._alignment.places_px()
         places = tuple((u, v) for u, v in np.rint(middle_px).astype(int).tolist())
-        note = LookNote(self.version, self._alignment.views, BLOCK_PX, places, tuple(other.tolist()))
+        note = LookNote(self.version, self._alignment.views, BLOCK_PX, places, tuple(np.flatnonzero(other).tolist()))
         self._due.append(Alert(AlertKind.LOOK, Cause.UNKNOWN, severity, text, since_ns=since_ns, look=note))
 
 

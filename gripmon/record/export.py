@@ -112,7 +112,7 @@ _ALERTS: list[_Column] = [
     ("rotation_rad", _DOUBLE, "rad", "turn against the reference"),
     ("rate_m_per_min", _DOUBLE, "m/min", "speed of a creep"),
     ("time_left_s", _DOUBLE, "s", "until a creep reaches the limit"),
-    ("since_ns", _INTEGER, "ns", "when it was raised: Unix"),
+    ("since_ns", _INTEGER, "ns", "when it was raised, or the gripper began to look different: Unix"),
     ("acknowledged", _TRUTH, "", "an operator has taken note of it"),
     ("state", _TEXT, "", "what the monitor was doing"),
     *_REFERENCE,
@@ -399,7 +399,8 @@ def _table(table: str, rows: list[dict[str, Any]]) -> pa.Table:
 
 
 def _values(record: msgspec.Struct) -> dict[str, Any]:
-    values: dict[str, Any] = msgspec.to_builtins(msgspec.structs.asdict(record))
+    given = {name: value for name, value in msgspec.structs.asdict(record).items() if value is not msgspec.UNSET}
+    values: dict[str, Any] = msgspec.to_builtins(given)
     return values
 
 

@@ -28,7 +28,7 @@ class LookNote(msgspec.Struct, frozen=True):
     views: Annotated[int, Meta(description="frames with another background that it was learnt from")]
     block_px: Annotated[int, Meta(description="side of a block of pixels, px")]
     places_px: Annotated[tuple[tuple[int, int], ...], Meta(description="middle of each block in the frame's image")]
-    different: Annotated[tuple[bool, ...], Meta(description="of each block: it looks otherwise than at first")]
+    different: Annotated[tuple[int, ...], Meta(description="which of them, from 0, look otherwise than at first")]
 
 
 class LookPixels(msgspec.Struct, frozen=True):
