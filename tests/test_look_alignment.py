@@ -214,6 +214,26 @@ def test_the_fused_pose_scatters_less_than_either_and_about_the_edges_mean():
     assert (1e6 * np.abs(fused.mean(axis=0)) < 4.0 * edges_um / np.sqrt(MEMORY)).all()
 
 
+def test_the_fused_pose_changes_by_as_much_as_is_claimed_while_nothing_moves():
+    """From frame to frame by what changes; over many backgrounds by that and the bias."""
+    rng, fusion, poses, changes, biases = np.random.default_rng(8), LookFusion(0.03), [], [], []
+    for _ in range(3000):
+        edges_T = perturb(np.eye(4), rng.multivariate_normal(np.zeros(6), EDGES))
+        look_T = perturb(np.eye(4), rng.multivariate_normal(np.zeros(6), LOOK))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None, np.ones(2)))
+        fusion.learn()
+        if fused is not None:
+            poses.append(perturbation_between(np.eye(4), fused.cam_T_grip))
+            changes.append(fused.of_change)
+            biases.append(fused.of_bias)
+    at, change, bias = np.array(poses)[500:], np.array(changes)[500:], np.array(biases)[500:]
+    for lag, with_bias, bounds in ((1, 0.0, (0.6, 1.1)), (300, 1.0, (0.5, 1.2))):
+        way = at[lag:] - at[:-lag]
+        claimed = 2.0 * (change[lag:] + with_bias * bias[lag:])
+        squares = np.einsum("ni,ni->n", way, np.linalg.solve(claimed, way[..., None])[..., 0])
+        assert bounds[0] < squares.mean() / 6.0 < bounds[1], lag
+
+
 def test_the_edges_count_where_the_look_contradicts_them():
     fusion = LookFusion(0.03)
     fused_path(np.zeros((50, 3)), np.random.default_rng(6), fusion)

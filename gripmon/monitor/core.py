@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.judge.causes import CauseJudge, Watches
-from gripmon.judge.drift import Baseline, MotionWatch
+from gripmon.judge.drift import Baseline, Lasting, MotionWatch
 from gripmon.judge.inspection import inspect
 from gripmon.judge.policy import Evidence, Policy
 from gripmon.judge.recalibrate import Proposal
@@ -316,9 +316,10 @@ class Monitor:
         if 0 < self._astray < DOUBTED_FRAMES or not self._standing.believed:
             motion = self._watch.skip()
         else:
-            of_change = self._standing.of_change
-            covariance = self._covariance if of_change is None else of_change
-            motion = self._watch.add(self._since_start(shift), covariance, self._now_s)
+            covariance, bias, finer = self._covariance, None, self._standing.finer
+            if finer is not None:
+                covariance, bias = finer.of_change, Lasting(finer.of_bias, finer.renewed)
+            motion = self._watch.add(self._since_start(shift), covariance, self._now_s, bias)
         if motion.stepped:
             self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
@@ -349,7 +350,7 @@ class Monitor:
             self._baseline_weighed = True
             if self._baseline.error is not None and self._baseline.error.any():
                 # It was measured before one background: what such a frame claims, it is uncertain by.
-                self._watch.test.set_reference_covariance(self._covariance)
+                self._watch.set_reference_covariance(self._covariance)
         return since_start
 
     def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:

@@ -130,14 +130,14 @@ class FinerLook:
         if motion is not None:
             of_background = standing.covariance - self._floor
             refined = self._fusion.fuse(standing.cam_T_grip, of_background, motion)
-        pose = standing.cam_T_grip if refined is None else refined[0]
+        pose = standing.cam_T_grip if refined is None else refined.cam_T_grip
         # A copy: learning can wait, and the caller may read the next image into the same memory.
         self._pending = _Pending(frame.image.copy(), pose, opening_m, now_s, frame.stamp_ns, motion)
         if refined is None:
             return standing
         away = perturbation_between(standing.cam_T_grip, pose)
         wider = reaching(standing.protection, away, standing.protection.hypothesis)
-        return replace(standing, cam_T_grip=pose, protection=wider, of_change=refined[1] + self._floor)
+        return replace(standing, cam_T_grip=pose, protection=wider, finer=refined)
 
     def learn(self) -> None:
         """Learn from the newest frame if its background is a new one."""

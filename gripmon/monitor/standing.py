@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from gripmon.model.records import Array, Protection
 from gripmon.track.edges import Measurement
+from gripmon.track.look import Fused
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,8 +14,8 @@ class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
 
     ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
-    it; ``where_it_was``: the anchor has it there; ``of_change`` (6, 6): the covariance by which the pose changes while
-    nothing moves, where that is known to be less.
+    it; ``where_it_was``: the anchor has it there; ``finer``: what the gripper's look makes of it, which then is the
+    pose.
     """
 
     measurement: Measurement
@@ -23,4 +24,4 @@ class Standing:
     protection: Protection
     believed: bool
     where_it_was: bool
-    of_change: Array | None = None
+    finer: Fused | None = None

@@ -2,7 +2,7 @@
 was."""
 
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
-from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, MotionWatch
+from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, Lasting, MotionWatch
 from gripmon.judge.drift.sequential import Finding, SequentialTest, warm_up
 from gripmon.judge.drift.settings import DriftSettings
 
@@ -13,6 +13,7 @@ __all__ = [
     "DriftSettings",
     "Finding",
     "Foresight",
+    "Lasting",
     "MotionWatch",
     "SequentialTest",
     "foresee",

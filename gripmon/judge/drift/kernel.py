@@ -376,6 +376,7 @@ def refresh(
     times: Array,
     rare: Ints,
     reference: Array,
+    lasting: Array,
     known: Bools,
     plain: Array,
     mean_covariance: Array,
@@ -388,7 +389,8 @@ def refresh(
 
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
-    (k,): length from which on noise is rare.  The rest is overwritten.  False if rounding leaves no root.
+    (k,): length from which on noise is rare; ``lasting`` (k, 6, 6): what differences have on top.  The rest is
+    overwritten.  False if rounding leaves no root.
     """
     lengths, streams = learnt.shape
     total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
@@ -414,13 +416,14 @@ def refresh(
             if not _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s]):
                 return False
             way = 2 if known[1, k, s] else 0
-            if not _whiten(times[way, k, s] * of_difference[k, s] + 2.0 * missing, root, whitening[1, k, s]):
+            missing[:] = 2.0 * missing + lasting[k]
+            if not _whiten(times[way, k, s] * of_difference[k, s] + missing, root, whitening[1, k, s]):
                 return False
             if not _whiten(of_difference[k, s], root, learnt_whitening[k, s]):
                 return False
             if k < plain.shape[1]:
                 if not _whiten(total[2, k] + never, root, plain[0, k, s]):
                     return False
-                if not _whiten(times[2, k, s] * of_difference[k, s] + 2.0 * missing, root, plain[1, k, s]):
+                if not _whiten(times[2, k, s] * of_difference[k, s] + missing, root, plain[1, k, s]):
                     return False
     return True

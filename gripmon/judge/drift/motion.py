@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,6 +68,11 @@ the camera counts as back, so that between this and the test's threshold an aler
 EVIDENCE_LOOK_RATIO = 0.4
 """Part of the threshold from which the evidence is looked at more closely, before it is decided."""
 
+BIAS_CHANGED = 0.2
+"""Relative change of a finer measurement's lasting variance from which the test takes note of it: a tenth of its
+standard deviation.
+"""
+
 VIBRATING_FRAMES = 256
 """While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone; over
 twice as many the mean tells whether the camera is back.
@@ -78,11 +84,23 @@ VIBRATION_STEP_RATIO = 4.0
 """
 
 
+class Lasting(NamedTuple):
+    """Error that lasts: its ``covariance`` (6, 6), and the ``share`` of it that is another one from frame to frame."""
+
+    covariance: Array
+    share: float
+
+
 class MotionWatch:
     """The sequential test, and what follows from it for one camera."""
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
+        self._settings = settings
+        # What a finer measurement refines has a noise of its own, and so a test of its own.
+        self._other: SequentialTest | None = None
+        self._finer, self._missed = False, 0  # frames that the other one hasn't seen
+        self._reference, self._of_bias = np.zeros((6, 6)), np.zeros((6, 6))
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
@@ -98,8 +116,9 @@ class MotionWatch:
 
     def reset(self, reference_covariance: Array) -> None:
         """There is a new reference, with the covariance (6, 6) of its error: drift is reckoned from zero."""
-        self.test.restart(np.array([True]))
-        self.test.set_reference_covariance(reference_covariance)
+        for test in self._tests:
+            test.restart(np.array([True]))
+        self.set_reference_covariance(reference_covariance)
         self._history.clear()
         self._newest.clear()
         self._vibration.forget()
@@ -112,17 +131,30 @@ class MotionWatch:
         self._present = moved
         self._last = replace(self._last, present=moved)
 
+    def set_reference_covariance(self, covariance: Array) -> None:
+        """Covariance (6, 6) of the reference's own error, which is no drift."""
+        self._reference = covariance
+        for test in self._tests:
+            test.set_reference_covariance(covariance)
+
+    @property
+    def _tests(self) -> tuple[SequentialTest, ...]:
+        return (self.test,) if self._other is None else (self.test, self._other)
+
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate."""
         self._frames_per_s = frames_per_s
-        self.test.set_frames_per_s(frames_per_s)
+        for test in self._tests:
+            test.set_frames_per_s(frames_per_s)
 
-    def add(self, shift: Array | None, covariance: Array, now_s: float) -> Motion:
+    def add(self, shift: Array | None, covariance: Array, now_s: float, bias: Lasting | None = None) -> Motion:
         """One frame's shift (6,) against the reference, with its covariance (6, 6), at the frames' time.
 
-        None for a shift while the reference's error isn't known yet.
+        None for a shift while the reference's error isn't known yet.  ``bias``, of a frame that a finer measurement
+        refines: what lasts of its error; ``covariance`` is that of the rest then.
         """
         self.statistic_share = None
+        self._choose_test(bias)
         if shift is None:
             self._last = Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
             return self._last
@@ -135,6 +167,8 @@ class MotionWatch:
         at_once = stepped and length <= BLOCK_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
+            if self._other is not None:
+                self._other.restart(np.array([True]))
         self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance)
         frames = max(int(test.windows.frames[0]), 1)
         level, level_covariance = self._level(min(frames, 2 * VIBRATING_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
@@ -163,6 +197,25 @@ class MotionWatch:
             suspicious=bool(finding.excess[0] > EVIDENCE_LOOK_RATIO),
         )
         return self._last
+
+    def _choose_test(self, bias: Lasting | None) -> None:
+        """The one for frames of this kind; what it has of a minute ago is of another place, perhaps."""
+        self._missed += 1
+        if self._finer is not (bias is not None):
+            self._finer = bias is not None
+            if self._other is None:
+                self._other = SequentialTest(self._settings)
+                self._other.set_frames_per_s(self._frames_per_s)
+                self._other.set_reference_covariance(self._reference)
+            self.test, self._other = self._other, self.test
+            if self._missed > LEVEL_FRAMES:
+                self.test.restart(np.array([True]))
+            self._missed = 0
+        if bias is not None:
+            was, now = np.trace(self._of_bias[:3, :3]), np.trace(bias.covariance[:3, :3])
+            if abs(now - was) > BIAS_CHANGED * was:
+                self._of_bias = bias.covariance
+                self.test.set_bias(*bias)
 
     def learn(self) -> None:
         """Learn from the newest frame what nothing waits for; :meth:`add` does it first if no one has."""

@@ -115,6 +115,8 @@ class SequentialTest(ByArithmetic):
         self._seen = np.zeros(streams, dtype=np.intp)
         self._reported: Array = np.zeros((streams, 6, 6))
         self._reference: Array = np.zeros((streams, 6, 6))
+        self._bias: Array = np.zeros((6, 6))
+        self._lasting = np.zeros((len(LENGTHS), 6, 6))
         self._frames = self._since_restart = 0
         self.refreshes = 0
         """How often covariances and thresholds were reckoned again."""
@@ -143,6 +145,13 @@ class SequentialTest(ByArithmetic):
         """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is not a drift."""
         self._reference = np.broadcast_to(covariance, (self._streams, 6, 6)).copy()
         self._stale = True
+
+    def set_bias(self, covariance: Array, share: float) -> None:
+        """Covariance (6, 6) of an error that all frames have alike, and the share of it that is another one from frame
+        to frame: so much isn't a drift of a mean, nor, by as much as has changed, a difference.
+        """
+        self._bias, self._stale = covariance, True
+        self._lasting = 2.0 * np.minimum(COUNT * share, 1.0)[:, :, None] * covariance
 
     def add(
         self, shift: Array, covariance: Array, learn: np.ndarray | None = None, at_least: int = LENGTHS[0]
@@ -281,9 +290,9 @@ class SequentialTest(ByArithmetic):
         many times, ``each`` (3, k, s): for limits that are assumed, standard deviations, and limits that are learnt.
         """
         of = (
-            self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference, self._known,
-            self._plain, self._mean_covariance, self._whitening, self._learnt_whitening, self._to_reported,
-            self._from_reported,
+            self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference + self._bias,
+            self._lasting, self._known, self._plain, self._mean_covariance, self._whitening, self._learnt_whitening,
+            self._to_reported, self._from_reported,
         )  # fmt: skip
         if not self._by.refresh(*of):
             plain.refresh(*of)

@@ -4,12 +4,13 @@ from gripmon.track.look.agreement import LookAgreement, LookRefused
 from gripmon.track.look.alignment import LookAlignment, LookMotion, warm_up
 from gripmon.track.look.blocks import BLOCK_PX
 from gripmon.track.look.core import GripperLook, another_background
-from gripmon.track.look.fusion import LookFusion
+from gripmon.track.look.fusion import Fused, LookFusion
 from gripmon.track.look.strips import FingerStrips
 
 __all__ = [
     "BLOCK_PX",
     "FingerStrips",
+    "Fused",
     "GripperLook",
     "LookAgreement",
     "LookAlignment",

@@ -7,6 +7,8 @@ background.  A motion is seen by both, so that it never becomes bias, however sl
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from gripmon.model.geometry import from_record
@@ -30,6 +32,18 @@ PATIENCE, CORRELATED, MOST_CORRELATED = 10.0, 0.8, 0.98
 """Backgrounds over which it is learnt how alike the edges err from one to the next; before; and at most."""
 
 
+class Fused(NamedTuple):
+    """Edges and look in one: ``cam_T_grip`` (4, 4).  ``of_change`` (6, 6): covariance by which it changes while nothing
+    moves; ``of_bias`` (6, 6): of the part of its error that lasts, the look's bias, of whose variance each background
+    changes the share ``renewed``.
+    """
+
+    cam_T_grip: Array
+    of_change: Array
+    of_bias: Array
+    renewed: float
+
+
 class LookFusion:
     """The bias of one gripper's look, and what follows from it.  ``reach_m``: from the TCP to what is looked at, m."""
 
@@ -46,6 +60,7 @@ class LookFusion:
         self._covariance: Array = np.zeros((6, 6))
         self._at: tuple[Array, float] | None = None
         self._correlation = CORRELATED
+        self._share = 1.0  # of the bias that the newest background has changed
         self._before: Array | None = None
         self._pending: tuple[Array, Array, Array, Array, float] | None = None
 
@@ -69,10 +84,9 @@ class LookFusion:
         self._at = from_record(record.cam_T_grip), record.jaw_opening_m
         self._correlation = record.correlation
 
-    def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> tuple[Array, Array] | None:
-        """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one, with the covariance
-        (6, 6) by which that changes while nothing moves; None where they contradict each other, and before a bias is
-        known.
+    def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> Fused | None:
+        """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one; None where they
+        contradict each other, and before a bias is known.
 
         What errors of the edges outlast all backgrounds no one knows: as a place, the result is to be trusted no more
         than the edges.
@@ -82,13 +96,20 @@ class LookFusion:
         self._pending = difference, covariance, look.covariance, cam_T_grip, opening_m
         if self._at is None:
             return None
-        of_both = covariance + self._uncertainty(cam_T_grip, opening_m) + look.covariance
+        known = self._uncertainty(cam_T_grip, opening_m)
+        of_both = covariance + known + look.covariance
         innovation = difference - self._bias
         weighed = np.linalg.solve(of_both, innovation)
         if float(innovation @ weighed) > CONTRADICTION:
             return None
-        left = covariance - covariance @ np.linalg.solve(of_both, covariance)
-        return perturb(cam_T_grip, covariance @ weighed), 0.5 * (left + left.T)
+        # By this share it follows the look; what is left of the edges' error is another one before each background.
+        share = np.linalg.solve(of_both, covariance).T
+        rest = np.eye(6) - share
+        elsewhere = known - self._covariance
+        changing = look.covariance + elsewhere + self._share * self._covariance
+        of_change = rest @ covariance @ rest.T + share @ changing @ share.T
+        of_bias = share @ self._covariance @ share.T
+        return Fused(perturb(cam_T_grip, covariance @ weighed), _symmetric(of_change), _symmetric(of_bias), self._share)
 
     def learn(self) -> None:
         """Learn the bias from the newest frame, whose background is a new one: a Kalman update."""
@@ -117,9 +138,9 @@ class LookFusion:
         gain = np.linalg.solve(known + alike * of_edges + of_look, known).T
         self._bias = self._bias + gain @ innovation
         left = known - gain @ known
-        self._covariance = 0.5 * (left + left.T) * (1.0 + 1.0 / MEMORY)
+        self._covariance = _symmetric(left) * (1.0 + 1.0 / MEMORY)
         # The bias is that of where it was learnt: the place follows as the bias does.
-        share = float(np.trace(gain)) / 6.0
+        share = self._share = float(np.trace(gain)) / 6.0
         then_T, then_m = self._at
         here_T = perturb(then_T, share * perturbation_between(then_T, cam_T_grip))
         self._at = here_T, then_m + share * (opening_m - then_m)
@@ -132,3 +153,7 @@ class LookFusion:
         error_m = PER_MOTION * np.hypot(np.linalg.norm(way[:3]), turned)
         error_m = float(np.hypot(error_m, PER_OPENING * (opening_m - self._at[1])))
         return self._covariance + np.diag(np.square([error_m] * 3 + [error_m / self._reach_m] * 3))
+
+
+def _symmetric(matrix: Array) -> Array:
+    return np.asarray(0.5 * (matrix + matrix.T))
