@@ -33,7 +33,7 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.finer import DIFFERENT_S
 from gripmon.monitor.settings import LookSettings
 from gripmon.simulate import Scenario, Simulator
-from gripmon.simulate.scenario import Background, Creep, FingerLook
+from gripmon.simulate.scenario import Background, Creep, FingerLook, Tilt
 from gripmon.track.look import LookAlignment
 from gripmon.track.look.layout import finger_depths_m
 
@@ -361,3 +361,25 @@ def test_a_creep_of_a_micrometre_a_minute_is_never_learnt_as_look():
     # The look itself was learnt where both had it: it still shows the whole motion.
     bias = finer_of(kept(monitor)).bias
     assert bias is not None and abs(bias.bias[0]) < 3e-6
+
+
+@cache
+def stepped() -> tuple[Simulator, tuple[Frame, ...]]:
+    """Learning, then 0.05 mm across at once."""
+    step = Tilt(start_s=STEP_FRAME / FPS - 0.5 / FPS, time_s=0.0, tcp_shift_m=(5e-5, 0.0))
+    simulation = filmed(frames=STEP_FRAME + 10, mount=(step,))
+    return simulation, tuple(simulation.frame(i) for i in range(STEP_FRAME + 10))
+
+
+STEP_FRAME = 90
+
+
+def test_a_step_of_a_twentieth_of_a_millimetre_is_told_in_its_fourth_frame_and_by_the_edges_alone_in_none():
+    simulation, frames = stepped()
+    told: list[list[int]] = [[], []]
+    for enabled in (True, False):
+        for record in watched(new_monitor(simulation, enabled), frames):
+            kinds = {alert.kind for alert in record.alerts}
+            told[enabled] += [record.seq] if kinds & {AlertKind.STEP, AlertKind.DRIFT} else []
+    assert not told[False]
+    assert told[True] and STEP_FRAME < told[True][0] <= STEP_FRAME + 3

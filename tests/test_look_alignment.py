@@ -57,10 +57,10 @@ def errors_um(simulation: Simulator, alignment: LookAlignment, frames: range) ->
 
 def random_patches(rng: np.random.Generator, patches: int = 12, pixels: int = 36) -> tuple[np.ndarray, ...]:
     mean = rng.uniform(40.0, 200.0, (patches, pixels))
-    jacobian = rng.normal(0.0, 30.0, (patches, pixels, 7))
+    jacobian = rng.normal(0.0, 30.0, (patches, 7, pixels))
     truth = rng.normal(0.0, 0.02, 7)
     gain, offset = rng.uniform(0.6, 1.6, (patches, 1)), rng.uniform(-20.0, 20.0, (patches, 1))
-    values = gain * (mean + jacobian @ truth) + offset + rng.normal(0.0, 1.0, mean.shape)
+    values = gain * (mean + truth @ jacobian) + offset + rng.normal(0.0, 1.0, mean.shape)
     weight = rng.uniform(0.2, 1.0, mean.shape)
     values[1, :15] += 90.0  # something in front
     values[2] = rng.uniform(0.0, 255.0, pixels)

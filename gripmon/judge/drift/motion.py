@@ -100,7 +100,8 @@ class MotionWatch:
         # What a finer measurement refines has a noise of its own, and so a test of its own.
         self._other: SequentialTest | None = None
         self._finer, self._missed = False, 0  # frames that the other one hasn't seen
-        self._reference, self._of_bias = np.zeros((6, 6)), np.zeros((6, 6))
+        self._reference: Array = np.zeros((6, 6))
+        self._of_bias: Array = np.zeros((6, 6))
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s

@@ -226,7 +226,8 @@ class LookAlignment:
         opening_m = None if start[1] is None else start[1] + float(since[6])
         self._last = found_T, opening_m
         covariance = self._covariance(information, pulls, scatter, len(share))
-        turn = np.kron(np.eye(2), found_T[:3, :3])
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = found_T[:3, :3]
         return LookMotion(found_T, turn @ covariance[:6, :6] @ turn.T, opening_m, agree)
 
     def _covariance(self, information: Array, pulls: Array, scatter: float, patches: int) -> Array:
@@ -240,11 +241,7 @@ class LookAlignment:
         return self._measured.moved_px(motion_between(one[0], other[0], one[1], other[1])) <= LINEAR_PX
 
     def _agree(self, share: Array) -> Array:
-        fingers = len(self._gripper.finger_ids)
-        known = self._weight_in.any(axis=1)
-        count = np.bincount(self._finger_in[known], minlength=fingers)
-        total = np.bincount(self._finger_in[known], share[known], fingers)
-        return np.divide(total, count, out=np.full(fingers, np.nan), where=count > 0)
+        return self._finger_share @ share
 
     def _lay_out(self, grey: tuple[Image, Array], cam_T_grip: Array, jaw_opening_m: float | None) -> bool:
         points_grip_m, places = self._blocks(cam_T_grip, jaw_opening_m)
@@ -335,7 +332,12 @@ class LookAlignment:
         weight, best = self._weights()[self._chosen], self._chosen
         self._mean_in = np.ascontiguousarray(self._mean[best][:, INNER])
         self._weight_in = np.ascontiguousarray(weight[:, INNER])
-        self._jacobian = jacobian_of(self._mean[best], self._flow[best], weight)
+        own = self._finger_in == np.arange(len(self._gripper.finger_ids))[:, None]
+        own = own & self._weight_in.any(axis=1)
+        with np.errstate(invalid="ignore"):  # NaN for a finger of which nothing is known
+            self._finger_share = own / own.sum(axis=1, keepdims=True)
+        jacobian = jacobian_of(self._mean[best], self._flow[best], weight)
+        self._jacobian = np.ascontiguousarray(jacobian.swapaxes(1, 2))
 
 
 def warm_up() -> None:
@@ -345,7 +347,7 @@ def warm_up() -> None:
     nothing = np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 7)), np.zeros(7)
     for shape in ((8, 8), (8, 8, 3)):
         values = kernel.read(*_channels(np.zeros(shape, dtype=np.uint8)), *nothing)
-    kernel.align(values, values, values, np.zeros((1, 1, 7)), np.ones(7))
+    kernel.align(values, values, values, np.zeros((1, 7, 1)), np.ones(7))
 
 
 def _channels(image: Image) -> tuple[Image, Array]:

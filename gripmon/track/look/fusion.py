@@ -7,6 +7,7 @@ background.  A motion is seen by both, so that it never becomes bias, however sl
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -99,17 +100,17 @@ class LookFusion:
         known = self._uncertainty(cam_T_grip, opening_m)
         of_both = covariance + known + look.covariance
         innovation = difference - self._bias
-        weighed = np.linalg.solve(of_both, innovation)
-        if float(innovation @ weighed) > CONTRADICTION:
+        solved = np.linalg.solve(of_both, np.column_stack([covariance, innovation]))
+        if float(innovation @ solved[:, 6]) > CONTRADICTION:
             return None
         # By this share it follows the look; what is left of the edges' error is another one before each background.
-        share = np.linalg.solve(of_both, covariance).T
+        share = solved[:, :6].T
         rest = np.eye(6) - share
         elsewhere = known - self._covariance
         changing = look.covariance + elsewhere + self._share * self._covariance
         of_change = rest @ covariance @ rest.T + share @ changing @ share.T
         of_bias = share @ self._covariance @ share.T
-        return Fused(perturb(cam_T_grip, covariance @ weighed), _symmetric(of_change), _symmetric(of_bias), self._share)
+        return Fused(perturb(cam_T_grip, share @ innovation), _symmetric(of_change), _symmetric(of_bias), self._share)
 
     def learn(self) -> None:
         """Learn the bias from the newest frame, whose background is a new one: a Kalman update."""
@@ -149,10 +150,12 @@ class LookFusion:
         """(6, 6) of the bias, which is another one elsewhere: depths and lights are not exactly as thought."""
         assert self._at is not None
         way = perturbation_between(self._at[0], cam_T_grip)
-        turned = self._reach_m * float(np.linalg.norm(way[3:]))
-        error_m = PER_MOTION * np.hypot(np.linalg.norm(way[:3]), turned)
-        error_m = float(np.hypot(error_m, PER_OPENING * (opening_m - self._at[1])))
-        return self._covariance + np.diag(np.square([error_m] * 3 + [error_m / self._reach_m] * 3))
+        x, y, z, about_x, about_y, about_z = way.tolist()
+        moved_m = math.hypot(x, y, z, self._reach_m * math.hypot(about_x, about_y, about_z))
+        error_m = math.hypot(PER_MOTION * moved_m, PER_OPENING * (opening_m - self._at[1]))
+        known = self._covariance.copy()
+        known.ravel()[::7] += np.square([error_m] * 3 + [error_m / self._reach_m] * 3)
+        return known
 
 
 def _symmetric(matrix: Array) -> Array:

@@ -82,8 +82,9 @@ def _light(values: Array, mean: Array, weight: Array) -> tuple[float, float, flo
     value, learnt = value / total, learnt / total
     own, both = 0.0, 0.0
     for n in range(len(values)):
-        own += weight[n] * (mean[n] - learnt) * (mean[n] - learnt)
-        both += weight[n] * (mean[n] - learnt) * (values[n] - value)
+        off = weight[n] * (mean[n] - learnt)
+        own += off * (mean[n] - learnt)
+        both += off * (values[n] - value)
     if not own > 0.0:
         return 0.0, 0.0, 0.0
     gain = both / own
@@ -93,59 +94,90 @@ def _light(values: Array, mean: Array, weight: Array) -> tuple[float, float, flo
 
 
 @compiled
+def _residuals(
+    values: Array, mean: Array, weight: Array, jacobian: Array, motion: Array, robust: Array, residual: Array
+) -> float:
+    """What each pixel shows more than the light and a motion explain, NaN where no light does; and the scatter."""
+    count, squares = 0, 0.0
+    for p in range(values.shape[0]):
+        gain, value, learnt = _light(values[p], mean[p], robust[p])
+        if gain == 0.0:
+            residual[p] = np.nan
+            continue
+        off = residual[p]
+        for n in range(values.shape[1]):
+            off[n] = (values[p, n] - value) / gain - (mean[p, n] - learnt)
+        for j in range(7):
+            for n in range(values.shape[1]):
+                off[n] -= jacobian[p, j, n] * motion[j]
+        for n in range(values.shape[1]):
+            if weight[p, n] > 0.0:
+                count += 1
+                squares += min(off[n] * off[n] * weight[p, n], FAR * FAR)
+    return max(1.0, math.sqrt(squares / max(count, 1)))
+
+
+@compiled
+def _pull(of_motion: Array, off: Array) -> float:
+    """Sum of the products (n,), in four that don't wait for one another."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    pixels = len(off)
+    for n in range(0, pixels - 3, 4):
+        a += of_motion[n] * off[n]
+        b += of_motion[n + 1] * off[n + 1]
+        c += of_motion[n + 2] * off[n + 2]
+        d += of_motion[n + 3] * off[n + 3]
+    for n in range(pixels - pixels % 4, pixels):
+        a += of_motion[n] * off[n]
+    return (a + b) + (c + d)
+
+
+@compiled
 def align(
     values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array
 ) -> tuple[Array, Array, Array, Array, float]:
     """The motion (7,) of the learned pixels that shows best in ``values`` (p, n), robustly.
 
     ``mean`` (p, n) as learnt; ``weight`` (p, n) one over the variances, 0 for what doesn't count; ``jacobian``
-    (p, n, 7) by how much a motion changes what is seen where the gripper was, less what light could; ``prior`` (7,)
+    (p, 7, n) by how much a motion changes what is seen where the gripper was, less what light could; ``prior`` (7,)
     information that the motion is zero.  Also the information (7, 7), the sum (7, 7) of squares of what each patch
     pulls, the share (p,) of each patch's weight that agrees, and the scatter of the residuals over what was learnt, at
     least 1.
     """
     patches, pixels = values.shape
     motion, scatter = np.zeros(7), 1.0
-    robust = weight.copy()
-    residual = np.zeros((patches, pixels))
-    information, pull, pulls = np.zeros((7, 7)), np.zeros(7), np.zeros((7, 7))
+    robust, residual, weighed = weight.copy(), np.empty((patches, pixels)), np.empty((7, pixels))
+    own, pull, pulls = np.empty(7), np.empty(7), np.empty((7, 7))
+    # Sums over the patches for each place in a patch: the innermost loop then runs along them.
+    sums, information = np.empty((7, 7, pixels)), np.empty((7, 7))
     for turn in range(ROUNDS + 1):
-        count, squares = 0, 0.0
+        scatter = _residuals(values, mean, weight, jacobian, motion, robust, residual)
+        beyond = 1.0 / (BIWEIGHT * BIWEIGHT * scatter * scatter)
+        sums[:], pull[:], pulls[:] = 0.0, 0.0, 0.0
         for p in range(patches):
-            gain, value, learnt = _light(values[p], mean[p], robust[p])
+            off = residual[p]
             for n in range(pixels):
-                if gain == 0.0:
-                    residual[p, n] = np.nan
-                    continue
-                expected = 0.0
-                for j in range(7):
-                    expected += jacobian[p, n, j] * motion[j]
-                residual[p, n] = (values[p, n] - value) / gain - (mean[p, n] - learnt) - expected
-                if weight[p, n] > 0.0:
-                    count += 1
-                    squares += min(residual[p, n] * residual[p, n] * weight[p, n], FAR * FAR)
-        scatter = max(1.0, math.sqrt(squares / max(count, 1)))
-        information[:], pull[:], pulls[:] = 0.0, 0.0, 0.0
-        for p in range(patches):
-            own = np.zeros(7)
-            for n in range(pixels):
-                far = residual[p, n] * residual[p, n] * weight[p, n] / (BIWEIGHT * BIWEIGHT * scatter * scatter)
-                robust[p, n] = weight[p, n] * (1.0 - far) * (1.0 - far) if far < 1.0 else 0.0
-                if robust[p, n] > 0.0:
-                    for i in range(7):
-                        weighed = robust[p, n] * jacobian[p, n, i]
-                        own[i] += weighed * residual[p, n]
-                        for j in range(i + 1):
-                            information[i, j] += weighed * jacobian[p, n, j]
+                far = off[n] * off[n] * weight[p, n] * beyond
+                if far < 1.0:
+                    robust[p, n] = weight[p, n] * (1.0 - far) * (1.0 - far)
+                else:  # NaN, too
+                    robust[p, n] = off[n] = 0.0
+            for i in range(7):
+                for n in range(pixels):
+                    weighed[i, n] = robust[p, n] * jacobian[p, i, n]
+                own[i] = _pull(weighed[i], off)
+                for j in range(i + 1):
+                    for n in range(pixels):
+                        sums[i, j, n] += weighed[i, n] * jacobian[p, j, n]
             for i in range(7):
                 pull[i] += own[i]
                 for j in range(7):
                     pulls[i, j] += own[i] * own[j]
         for i in range(7):
-            information[i, i] += prior[i]
             pull[i] -= prior[i] * motion[i]
-            for j in range(i):
-                information[j, i] = information[i, j]
+            for j in range(i + 1):
+                information[i, j] = information[j, i] = sums[i, j].sum()
+            information[i, i] += prior[i]
         if turn < ROUNDS:
             motion += np.linalg.solve(information, pull)
     share = np.zeros(patches)

@@ -38,7 +38,7 @@ def align(
 
     Each patch has its own gain and offset of light, which are taken out of the residuals with the present weights.
     """
-    motion, robust = np.zeros(7), weight
+    motion, robust, jacobian = np.zeros(7), weight, jacobian.swapaxes(1, 2)
     for turn in range(ROUNDS + 1):
         residual = _residual(values, mean, robust) - jacobian @ motion
         counted = (weight > 0.0) & np.isfinite(residual)
