@@ -26,7 +26,7 @@ from gripmon.simulate.scenario import (
     Shadow,
 )
 from gripmon.track.look import GripperLook, LookAgreement, LookRefused
-from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
+from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S, MANY_VIEWS, RELEARN_S
 
 RISK = 1e-5
 LEARNT = 16
@@ -240,6 +240,22 @@ def test_a_long_pause_leaves_what_was_learnt():
     assert look.learn(simulation.render(LEARNT), truth.cam_T_grip, truth.jaw_opening_m, 50.0 * FORGET_S)
     agreement = held_against(simulation, look)
     assert agreement.supports(RISK) and not agreement.contradicts(RISK)
+
+
+def test_of_a_fast_camera_not_every_frame_is_learnt():
+    simulation = filmed()
+    look = taught(simulation)
+    truth, last_s = simulation.truth(LEARNT), simulation.truth(LEARNT - 1).time_s
+
+    def learns(at_s: float) -> bool:
+        return look.learn(simulation.render(LEARNT), truth.cam_T_grip, truth.jaw_opening_m, at_s)
+
+    look.views = MANY_VIEWS
+    assert not learns(last_s + 0.9 * RELEARN_S)
+    assert learns(last_s + 1.1 * RELEARN_S)
+    look.views = MANY_VIEWS
+    look.learn(simulation.render(LEARNT + 1), truth.cam_T_grip, truth.jaw_opening_m, 0.0)
+    assert look.views == MANY_VIEWS + 1, "also when time has jumped backwards"
 
 
 def test_wrong_poses_now_and_then_spoil_nothing():

@@ -31,6 +31,11 @@ FORGET_S = 4.0 * 3600.0
 FEWEST_VIEWS = 12
 """Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
 
+MANY_VIEWS, RELEARN_S = 100, 0.1
+"""Frames learnt one after the other, what isn't the gripper's averages to a tenth; then so many seconds apart: frames
+of a fast camera show nearly the same, and forgetting takes hours.
+"""
+
 KEPT_SLIDE_TRIES = 3
 """Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
 
@@ -143,8 +148,10 @@ class GripperLook:
         first time 0.1 s, when the patches are laid out.
 
         False, and nothing learnt, while the background is the same as in the last frame that was: it would be taken for
-        the gripper's; and while no finger is in view.
+        the gripper's; while no finger is in view; and soon after the last one where :data:`MANY_VIEWS` were learnt.
         """
+        if self.views >= MANY_VIEWS and self._last_s is not None and 0.0 <= now_s - self._last_s < RELEARN_S:
+            return False
         if not len(self._points):
             if now_s < self._not_before_s:
                 return False
