@@ -9,6 +9,7 @@ Where little shows of a rounding it is like a corner, at which neither of its tw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +159,7 @@ class _Places:
         return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, *columns[2:])
 
 
+@lru_cache(maxsize=8)
 def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
     """(s,) the finger of each place at which one may end: corners, where sides turn into curves, roundings."""
     return FingerEnds(gripper, EdgeSettings()).finger
@@ -172,6 +174,7 @@ class FingerEnds:
         self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
+        self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
 
     @property
     def finger(self) -> NDArray[np.intp]:
@@ -287,10 +290,14 @@ class FingerEnds:
 
     def _rounded(self, prediction: Prediction) -> dict[int, Rounding]:
         """The roundings that this view has, where it isn't seen how a side turns into a curve."""
+        if self._kept_roundings is not None and self._kept_roundings[0] is prediction:
+            return self._kept_roundings[1]
         places, profiles = self._places, prediction.profiles
         turning = (places.side >= 0) & (profiles[places.side] > 0) & (profiles[places.curve] > 0)
         pairs = np.column_stack([places.side, places.curve])[turning].tolist()
-        return self._roundings.seen_in(prediction, {frozenset(pair) for pair in pairs})
+        seen = self._roundings.seen_in(prediction, {frozenset(pair) for pair in pairs})
+        self._kept_roundings = prediction, seen
+        return seen
 
     def _turn(
         self, prediction: Prediction, number: int, here: int, clear_px: Array

@@ -17,15 +17,13 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.compiled import COMPILES
+from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.records import Array, Image
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profile_kernel import (
     BEYOND_PX,
-    BLUE,
     FLAT_PEAK_CURVATURE,
-    GREEN,
-    RED,
     SATURATION_SHIFT_WIDTHS,
     SHARPNESS,
 )
@@ -33,9 +31,6 @@ from gripmon.track.edges.saturation import doubt
 
 if TYPE_CHECKING:
     from gripmon.track.edges.robust_fit import RobustFitSettings
-
-GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
-"""Luma weights of ITU-R BT.601 in OpenCV's channel order."""
 
 
 class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
