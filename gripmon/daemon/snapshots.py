@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.neighbours import Asked
+from gripmon.model.errors import in_short
 from gripmon.model.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
 
 _log = logging.getLogger(__name__)
@@ -83,7 +84,7 @@ class Snapshots:
                 _complete(job)
             except Exception as error:  # noqa: BLE001  said to the asker
                 _log.debug("snapshot", exc_info=error)
-                job.asked.answer(CommandError(CommandFault.INTERNAL, f"{type(error).__name__}: {error}"))
+                job.asked.answer(CommandError(CommandFault.INTERNAL, in_short(error)))
 
 
 def _complete(job: _Job) -> None:

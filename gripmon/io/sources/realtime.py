@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.model.errors import in_short
 from gripmon.model.records import Frame, Image
 
 _log = logging.getLogger(__name__)
@@ -274,7 +275,7 @@ def _render(maker: FrameMaker, ring: _Ring, schedule: _Schedule, announce: Conne
     except Exception as error:  # noqa: BLE001  the parent raises it
         _log.exception("rendering failed")
         os.set_blocking(announce.fileno(), True)
-        announce.send(f"{type(error).__name__}: {error}"[:1000])
+        announce.send(in_short(error)[:1000])
 
 
 def _deliver(
