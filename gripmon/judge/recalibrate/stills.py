@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array, EdgeSums
 
 LASTING_SHARE = 0.25
@@ -23,11 +25,8 @@ NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
 of neighbours that a few frames can tell.
 """
 
-OUTLYING_ERROR_SQUARE = 22.46
-"""Squared normalised error that six normal errors exceed once in a thousand times (chi-square)."""
-
-OUTLYING_FRAME_SQUARE = 37.7
-"""The same for once in a million times: from there on one frame doesn't belong to the others."""
+OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
+"""Squared normalised error that normal errors exceed once in a thousand times."""
 
 FIRST_FRAMES = 3
 """First frames, whose claims are taken for those of all if they are larger."""
@@ -77,7 +76,7 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
     xis = np.array([perturbation_between(middle_T, f.cam_T_grip) for f in frames])
     weights = np.array([np.linalg.inv(f.covariance) for f in frames])
     centre = np.median(xis, axis=0)
-    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > OUTLYING_FRAME_SQUARE
+    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > GATE_SQUARE
     outlying = float(far.mean())
     if np.count_nonzero(~far) >= 4:
         xis, weights = xis[~far], weights[~far]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Image
+from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
@@ -54,14 +55,6 @@ by, px.
 
 CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
-
-CONTINUATION_SHARE = 0.5
-"""Share of the probes that must show it: half of them, as for an edge beside a corner."""
-
-TURN_SEEN_SHARE = 0.5
-"""Share of the profiles on a stretch of the curve that must agree for a turn to be seen, and over the rest of its side
-that of the side's end: half, as for an edge beside a corner.
-"""
 
 
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
@@ -215,7 +208,7 @@ class FingerEnds:
             if places.rounding[number] < 0:
                 usual[0] = consensus.edge_share[places.side[number]]
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
-            measured[number] = seen and (shown >= TURN_SEEN_SHARE * usual).all()
+            measured[number] = seen and (shown >= SHOWN_BESIDE * usual).all()
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
@@ -237,7 +230,7 @@ class FingerEnds:
         shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
-        goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > CONTINUATION_SHARE
+        goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > SHOWN_BESIDE
         return np.asarray(goes_on | shown[:, :PROBES_AT_CORNER].all(axis=1) if strict else goes_on)
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
