@@ -41,7 +41,9 @@ that was handed over twice, and images of another kind, before it is another cam
 """
 
 CALM_FRAMES = 30
-"""Frames without a fault of their stamps after which the clock is right again."""
+"""Frames in a row without a fault of their stamps after which the clock is right again, or in which nothing looks wrong
+after which the evidence of a cause is forgotten.
+"""
 
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
 """A stamp that is so many usual periods, and so long, after the one before has jumped."""

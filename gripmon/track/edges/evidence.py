@@ -26,7 +26,7 @@ from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.prediction import FEWEST_SAMPLES
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
-from gripmon.track.edges.settling import Expected, Measurement, Settler
+from gripmon.track.edges.settling import ZOOMS, Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
@@ -41,9 +41,6 @@ fewer show may be anything that has an edge or two: a shadow, a finger's other s
 
 FINGER_FOUND_SHARE = 0.55
 """Share of a finger's profiles that must agree there: other things have a straight edge or two as well."""
-
-WIDE_ZOOMS = (2, 4)
-"""Zooms with which it is looked for there."""
 
 FEWEST_SHARE = 0.4
 """Part of a stretch's profiles, and no fewer than an edge needs, that must agree for it to count as seen."""
@@ -128,7 +125,7 @@ class FingerMeter(Settler):
         if best is None or best.share >= FINGER_SEEN_SHARE:
             return best
         opening_m = prediction.jaw_opening_m
-        for zoom in WIDE_ZOOMS:
+        for zoom in ZOOMS[1:]:
             if zoom <= measurement.candidates.zoom:
                 continue
             for pose in (measurement.cam_T_grip, *elsewhere):

@@ -9,10 +9,7 @@ import numpy as np
 from gripmon.model.records import Image
 from gripmon.track.edges.kernel import FEWEST_AGREEING
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profiles import read_profiles
-
-BESIDE_PX = (2.0, 5.0)
-"""From where to where the grey levels beside an edge are averaged, px of the zoomed image: clear of its blur."""
+from gripmon.track.edges.profiles import BESIDE_PX, read_profiles
 
 
 def unevenness(image: Image, prediction: Prediction) -> float:

@@ -47,10 +47,12 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 _CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
 
-UNREST_FROM_PX, UNREST_TO_PX = 2.0, 5.0
-"""Where texture is looked for that may shift an edge, from the edge to both sides, px."""
+BESIDE_PX = (2.0, 5.0)
+"""From where to where the grey levels beside an edge are averaged, and texture is looked for that may shift it, px of
+the zoomed image: clear of its blur.
+"""
 
-_NEAR, _FAR = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
+_NEAR, _FAR = (round(way_px / STEP_PX) for way_px in BESIDE_PX)
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,7 +89,7 @@ RESTART_WIDTH_PX = 0.4
 NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
 
 ROUNDS = 6
-_ROUNDS_AGAIN = 3
+_ROUNDS_AGAIN = ROUNDS // 2  # from a start that is nearly right
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image, LookRecord
-from gripmon.track.look.agreement import AGREEING_CORRELATION, LookAgreement, patch_evidence
+from gripmon.track.look.agreement import AGREEING_CORRELATION, CHANCE_BOUNDS, LookAgreement, patch_evidence
 from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
 
 FORGET_S = 4.0 * 3600.0
@@ -31,9 +31,6 @@ FORGET_S = 4.0 * 3600.0
 
 FEWEST_VIEWS = 12
 """Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
-
-KEPT_SLIDE_TRIES = 3
-"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
 
 LAY_OUT_AGAIN_S = 60.0
 """Pause before fingers that weren't in view are looked for again, s: it takes as long as some frames."""
@@ -47,14 +44,14 @@ CHANGED_BACKGROUND_SHARE = 0.33
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
 """Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
 
+KEPT_SLIDE_TRIES = FEWEST_VIEWS // len(SLIDES_M)
+"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
+
 ELSEWHERE_M = 2e-3
 """From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
 
 CONSTANT_PATCH_LENGTH = 0.7
 """Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
-
-LARGEST_CHANCE = 0.3
-"""A patch that agrees more often than this where the gripper isn't tells nothing."""
 
 KEPT_PATCHES = 16
 """Most telling ones of a finger that poses are compared with: 512 points on two fingers."""
@@ -309,7 +306,7 @@ class GripperLook:
         """The patches of each finger that tell most: always the same where they are, and another view elsewhere."""
         length = np.linalg.norm(self._mean, axis=1)
         chance = self._chance[self._far].max(axis=0)
-        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= LARGEST_CHANCE) & bool((self._tried >= 0.5).all())
+        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
         worth = np.where(tells, length - chance, -np.inf)
         best = []
         for finger in range(len(self._first)):

@@ -12,6 +12,7 @@ import numpy as np
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
+from gripmon.track.jaw import CORRELATED, PATIENCE
 from gripmon.track.look.alignment import LookMotion
 
 MEMORY = 64
@@ -22,8 +23,8 @@ PER_MOTION, PER_OPENING = 0.02, 2e-3
 of the camera and 0.002 after 17 mm of the jaw, where depths are interpolated between edges.
 """
 
-PATIENCE, CORRELATED, MOST_CORRELATED = 10.0, 0.8, 0.98
-"""Backgrounds over which it is learnt how alike the edges err from one to the next; before; and at most."""
+MOST_CORRELATED = 0.98
+"""How alike the edges are taken to err from one background to the next, at most."""
 
 
 class LookFusion:
