@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gripmon.model.errors import one_line
+from gripmon.model.images import PNG
 from gripmon.model.pixels import ENCODINGS, unpacked
 from gripmon.model.records import FrameNote, Image, MessageRefused, from_json
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
-
-JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-"""How such a file begins."""
 
 MOST_SCANS = 100
 """A progressive JPEG has some ten; each one costs as much as the whole image, whatever few bytes it takes."""
