@@ -27,7 +27,6 @@ from gripmon.judge.recalibrate.pnp import (
 )
 from gripmon.judge.recalibrate.settings import RecalibrationSettings
 from gripmon.judge.recalibrate.stills import (
-    OUTLYING_ERROR_SQUARE,
     Average,
     MeanCorners,
     StillFrame,
@@ -37,7 +36,11 @@ from gripmon.judge.recalibrate.stills import (
 )
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
 from gripmon.model.gripper import Gripper
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
+
+OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
+"""Squared normalised error that normal errors exceed once in a thousand times."""
 
 OUTLIER_SHARE = 0.25
 """Part of the frames whose pose may lie far from the others' while the camera counts as standing still; and of the

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array, EdgeSums
 
 LASTING_SHARE = 0.25
@@ -24,9 +23,6 @@ NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
 """Frames in a row that count as one at least, since their changing errors are alike, too; and the largest correlation
 of neighbours that a few frames can tell.
 """
-
-OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
-"""Squared normalised error that normal errors exceed once in a thousand times."""
 
 FIRST_FRAMES = 3
 """First frames, whose claims are taken for those of all if they are larger."""
