@@ -25,6 +25,7 @@ from gripmon.analyse.stretches import Stretch, mountings_of
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import Verdict
+from gripmon.record.export import POSE
 
 TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
 _NONE = np.full(36, np.nan)
@@ -222,7 +223,6 @@ def _field(name: str, kind: pa.DataType, text: str) -> pa.Field:
 
 
 _F, _I, _S = pa.float64(), pa.int64(), pa.string()
-_POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 SCHEMA = pa.schema(
     [
         _field("episode", _S, "path below the dataset; of LeRobot with # and its number"),
@@ -234,7 +234,7 @@ SCHEMA = pa.schema(
         _field("frames", pa.int32(), "in the stretch"),
         _field("measured_share", _F, "of its frames with a transform of their own, 0 to 1"),
         _field("valid_share", _F, "of its frames whose transform was valid, 0 to 1"),
-        *(_field(f"cam_T_grip_{name}", _F, "maps gripper to camera coordinates; null: not measured") for name in _POSE),
+        *(_field(f"cam_T_grip_{name}", _F, "maps gripper to camera coordinates; null: not measured") for name in POSE),
         _field("covariance", pa.list_(_F), "6 x 6 by rows, position (m) then rotation (rad), camera axes"),
         _field("protection_m", _F, "bound on the position error in each frame of the stretch; null: none"),
         _field("protection_rad", _F, "bound on the rotation error"),
@@ -279,7 +279,7 @@ def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int
         "picture": measured.pictures[shown] if 0 <= shown < len(measured.pictures) else None,
     }  # fmt: skip
     if stretch.cam_T_grip is not None:
-        row |= {f"cam_T_grip_{name}": value for name, value in zip(_POSE, stretch.cam_T_grip, strict=True)}
+        row |= {f"cam_T_grip_{name}": value for name, value in zip(POSE, stretch.cam_T_grip, strict=True)}
     if (motion := stretch.motion) is not None:
         row |= {
             "motion_ns": motion.stamp_ns, "motion_earliest_ns": motion.earliest_ns,

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.neighbours import Asked
+from gripmon.io.publish.presence import CLOSE_WITHIN_S
+from gripmon.model.errors import in_short
 from gripmon.model.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
 
 _log = logging.getLogger(__name__)
@@ -27,7 +29,6 @@ _LARGEST_FILE_BYTES = 40 << 20
 _JPEG_QUALITY = 95
 _WAITING_MOST = 2
 _NICENESS = 10  # the loop goes first
-_CLOSE_WITHIN_S = 1.0
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
@@ -72,8 +73,8 @@ class Snapshots:
         """Complete what is in hand, if that takes no longer than a second."""
         if self._thread is not None:
             with contextlib.suppress(queue.Full):
-                self._jobs.put(None, timeout=_CLOSE_WITHIN_S)
-            self._thread.join(_CLOSE_WITHIN_S)
+                self._jobs.put(None, timeout=CLOSE_WITHIN_S)
+            self._thread.join(CLOSE_WITHIN_S)
 
     def _run(self) -> None:
         with contextlib.suppress(OSError):
@@ -83,7 +84,7 @@ class Snapshots:
                 _complete(job)
             except Exception as error:  # noqa: BLE001  said to the asker
                 _log.debug("snapshot", exc_info=error)
-                job.asked.answer(CommandError(CommandFault.INTERNAL, f"{type(error).__name__}: {error}"))
+                job.asked.answer(CommandError(CommandFault.INTERNAL, in_short(error)))
 
 
 def _complete(job: _Job) -> None:

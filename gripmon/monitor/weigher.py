@@ -16,9 +16,10 @@ from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import DISPLACED_SQUARE, Anchor, Lasting
+from gripmon.monitor.anchor import Anchor, Lasting
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -153,7 +154,7 @@ class Weigher:
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses = fits.hypotheses
         # What would need a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= DISPLACED_SQUARE
+        holds = anchored.surprise <= CONTRADICTION_SQUARE
         displaced = not holds[0] and explained is None
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
@@ -195,7 +196,7 @@ class Weigher:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is not a vibration, but what rings after it is.
             noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, DISPLACED_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
+            self.swing = self.swing + (np.minimum(square, CONTRADICTION_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
         elif trust.displaced:
             # Knocked while no one watched, or marks on the fingers, or a wrong model: a person has to say.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.errors import NoResultError
+from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.profiles import GREY_BGR, full_scale, quantum
+from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 10
 """Images of one opening: the scatter of ten is known to 24 % (1 / sqrt(2 (n - 1)))."""

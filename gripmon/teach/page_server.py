@@ -30,7 +30,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, in_short
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
@@ -201,7 +201,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
             _log.debug("request failed", exc_info=True)
-            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(f"{type(error).__name__}: {error}")
+            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(in_short(error))
         if status is not HTTPStatus.OK:
             self.close_connection = True  # what is left of its body is not read
         with contextlib.suppress(ConnectionError, TimeoutError):

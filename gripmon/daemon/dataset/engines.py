@@ -16,7 +16,7 @@ from gripmon.analyse.dataset import Measured
 from gripmon.daemon.config import Config
 from gripmon.daemon.dataset.measuring import failed, measure
 from gripmon.io.sources.episodes import Episode
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, one_line
 
 AHEAD = 2
 """Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
@@ -100,8 +100,9 @@ def ray_cluster(config: Config, episodes: Sequence[Episode], lens: str, address:
         try:
             ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
-            text = " ".join(str(error).split())
-            raise InputError(f"no Ray cluster at {address or 'this machine'} ({text:.200})", "address") from None
+            raise InputError(
+                f"no Ray cluster at {address or 'this machine'} ({one_line(error):.200})", "address"
+            ) from None
     environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
     task: Any = ray.remote(num_cpus=1, max_retries=_RAY_TRIES - 1, runtime_env=environment)(_on_ray)
     shared = ray.put((config, lens))

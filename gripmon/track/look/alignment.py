@@ -20,6 +20,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.compiled import COMPILES
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
+from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.records import Array, Image
 from gripmon.track.look import kernel, plain
 from gripmon.track.look.layout import BORDER_PX, finger_depths_m
@@ -63,21 +64,18 @@ gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is le
 RENEWED = 0.5
 """Correlation of a block with what it was first, below which it shows something else."""
 
-GREY_BGR = np.array([0.114, 0.587, 0.299])
-
 ARITHMETIC: ModuleType = kernel if COMPILES else plain
 
 
 @dataclass(frozen=True, slots=True)
 class LookMotion:
     """Where the look has the gripper: ``cam_T_grip`` (4, 4) with covariance (6, 6) of its error since it was learnt,
-    camera axes; the opening then; ``agree`` (f,): share of each finger that looks as learnt, NaN where none is known.
+    camera axes; the opening then.
     """
 
     cam_T_grip: Array
     covariance: Array
     jaw_opening_m: float | None
-    agree: Array
 
 
 class _Placed:
@@ -227,8 +225,7 @@ class LookAlignment:
         except np.linalg.LinAlgError:  # hidden, but for too little
             self._last = None
             return None
-        agree = self._agree(share)
-        if not np.isfinite(here).all() or not (agree > 0.5).any():
+        if not np.isfinite(here).all() or not (self._agree(share) > 0.5).any():
             self._last = None
             return None
         since = here - motion
@@ -237,7 +234,7 @@ class LookAlignment:
         self._last = found_T, opening_m
         covariance = self._covariance(information, pulls, scatter, len(share))
         turn = np.kron(np.eye(2), found_T[:3, :3])
-        return LookMotion(found_T, turn @ covariance[:6, :6] @ turn.T, opening_m, agree)
+        return LookMotion(found_T, turn @ covariance[:6, :6] @ turn.T, opening_m)
 
     def _covariance(self, information: Array, pulls: Array, scatter: float, patches: int) -> Array:
         """(7, 7): by how much pixels scatter, and more if those of a patch pull together."""
@@ -250,6 +247,7 @@ class LookAlignment:
         return self._measured.moved_px(motion_between(one[0], other[0], one[1], other[1])) <= LINEAR_PX
 
     def _agree(self, share: Array) -> Array:
+        """(f,) share of each finger that looks as learnt, NaN where none is known."""
         fingers = len(self._gripper.finger_ids)
         known = self._weight_in.any(axis=1)
         count = np.bincount(self._finger_in[known], minlength=fingers)
@@ -355,7 +353,7 @@ def _channels(image: Image) -> tuple[Image, Array]:
     quantum = {np.dtype(np.uint8): 1.0, np.dtype(np.uint16): 257.0}.get(image.dtype, 1.0 / 255.0)
     if image.ndim == 2:
         return image[..., None], np.array([1.0 / quantum])
-    return image, GREY_BGR / quantum
+    return image, np.array([BLUE, GREEN, RED]) / quantum
 
 
 def _blocks(

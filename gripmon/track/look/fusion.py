@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
+from gripmon.track.jaw import CORRELATED, PATIENCE
 from gripmon.track.look.alignment import LookMotion
 
 MEMORY = 64
@@ -21,11 +23,8 @@ PER_MOTION, PER_OPENING = 0.02, 2e-3
 of the camera and 0.002 after 17 mm of the jaw, where depths are interpolated between edges.
 """
 
-CONTRADICTION = 33.1
-"""Squared normalised difference of six numbers that noise exceeds once in 100,000 frames (chi-square)."""
-
-PATIENCE, CORRELATED, MOST_CORRELATED = 10.0, 0.8, 0.98
-"""Backgrounds over which it is learnt how alike the edges err from one to the next; before; and at most."""
+MOST_CORRELATED = 0.98
+"""How alike the edges are taken to err from one background to the next, at most."""
 
 
 class LookFusion:
@@ -63,7 +62,7 @@ class LookFusion:
         of_both = covariance + self._uncertainty(cam_T_grip, opening_m) + look.covariance
         innovation = difference - self._bias
         weighed = np.linalg.solve(of_both, innovation)
-        if float(innovation @ weighed) > CONTRADICTION:
+        if float(innovation @ weighed) > CONTRADICTION_SQUARE:
             return None
         left = covariance - covariance @ np.linalg.solve(of_both, covariance)
         return perturb(cam_T_grip, covariance @ weighed), 0.5 * (left + left.T)
@@ -81,7 +80,7 @@ class LookFusion:
             return
         innovation = difference - self._bias
         known = self._uncertainty(cam_T_grip, opening_m)
-        if float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation)) > CONTRADICTION:
+        if float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation)) > CONTRADICTION_SQUARE:
             self.contradicts = True
             return
         self.contradicts = False

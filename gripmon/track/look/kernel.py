@@ -11,13 +11,11 @@ import math
 import numpy as np
 
 from gripmon.model.compiled import compiled
+from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array, Image
 
 ROUNDS = 2
 """Re-weightings: a third one changed no scatter that was measured in its second digit."""
-
-BIWEIGHT = 4.685
-"""Residual, in standard deviations, from which a pixel counts for nothing: 95 % efficient on normal noise (Tukey)."""
 
 FAR = 3.0
 """Standard deviations that a residual counts for at most in the frame's own scatter."""
@@ -129,7 +127,7 @@ def align(
         for p in range(patches):
             own = np.zeros(7)
             for n in range(pixels):
-                far = residual[p, n] * residual[p, n] * weight[p, n] / (BIWEIGHT * BIWEIGHT * scatter * scatter)
+                far = residual[p, n] * residual[p, n] * weight[p, n] / (TUKEY * TUKEY * scatter * scatter)
                 robust[p, n] = weight[p, n] * (1.0 - far) * (1.0 - far) if far < 1.0 else 0.0
                 if robust[p, n] > 0.0:
                     for i in range(7):
