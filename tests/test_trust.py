@@ -275,6 +275,36 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
     assert bound_m[1e5, 1.0] > 0.1
 
 
+def test_edges_of_both_ends_without_a_corner_count_once():
+    """One straight border stands in for both of them at once: behind it the mount may have been knocked."""
+    monitor = new_monitor()
+    for frame in frames_of(scene(BEGINS))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    limit_m = PolicySettings().alert_limit_m
+    for corners, holds in (((0, 0), False), ((1, 0), True)):
+        ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
+        assert weigher.confirmations(measurement, ends) == 2
+        trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s)
+        assert not (trust.proven or trust.displaced)
+        assert (trust.protection.position_m < limit_m) == holds
+
+
+def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pytest.MonkeyPatch):
+    ends, looked, hidden = Tracker.ends, [], set(range(BEGINS, BEGINS + 6))
+
+    def counted(tracker: Tracker, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+        looked.append(frame.seq)
+        seen = ends(tracker, frame, measurement, strict)
+        return replace(seen, seen=np.array([1, 0])) if frame.seq in hidden else seen
+
+    monkeypatch.setattr(Tracker, "ends", counted)
+    watched(scene(BEGINS + 12))
+    proved = [seq for seq in set(looked) if 4 <= seq < BEGINS]
+    assert len(proved) <= BEGINS / 4 and set(range(max(proved) + 4, BEGINS + 6)) <= set(looked)
+
+
 def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_than_they_exclude():
     """Each excludes nine of ten, and one in 1e5 is asked for: a knock that has happened in 1e-3 of such times."""
     monitor = new_monitor(MonitorSettings(policy=PolicySettings(mount_jumps_per_month=1.0, integrity_risk=1e-5)))

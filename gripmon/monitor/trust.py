@@ -26,7 +26,7 @@ from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
 PROOF_EVERY_FRAMES = 4
-"""While the gripper is where it was, its ends are looked at in one of so many frames."""
+"""While the gripper is where it was, its ends are looked at in one of so many frames; also after one without proof."""
 
 ONE_EDGE_PX = 2.0
 """Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
@@ -66,6 +66,7 @@ class Integrity:
         self._frames = 0
         self._elsewhere = 0
         self._believed = False
+        self._ends_seen = False
 
     @property
     def look(self) -> GripperLook:
@@ -135,10 +136,11 @@ class Integrity:
         weigh = self._weigher.weigh
         cam_T_grip, covariance = self._tracker.update(measurement)
         trust = weigh(measurement, cam_T_grip, None, now_s)
-        due = self._frames % PROOF_EVERY_FRAMES == 0
+        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+            self._ends_seen = trust.proven
         here = _Candidate(measurement, cam_T_grip, covariance, trust)
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
