@@ -12,22 +12,19 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 from support.meters import box_gripper
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import Watched, new_monitor, reference_of, watch
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import make_transform, perturb
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
-from gripmon.monitor import Monitor, MonitorSettings, Tracker
-from gripmon.monitor.refits import SIGMA_INFLATION
+from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import MISREAD_PROBABILITY, Trust, Weigher
+from gripmon.monitor.weigher import Trust
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
@@ -306,77 +303,6 @@ def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pyte
     watched(scene(BEGINS + 12))
     proved = [seq for seq in set(looked) if 4 <= seq < BEGINS]
     assert len(proved) <= BEGINS / 4 and set(range(max(proved) + 4, BEGINS + 6)) <= set(looked)
-
-
-# --- fingers that tell where they are along themselves ---
-
-
-@lru_cache(maxsize=1)
-def knocked_tapered_fingers() -> tuple[Monitor, Measurement]:
-    """A monitor of fingers whose outer sides slant by 22 degrees, that knows their place; and what is measured 3 mm
-    along from there.
-    """
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    for name, point in model["points"].items():
-        if "out" in name and name.endswith("back"):
-            point["xyz_m"][0] += 0.016 if name.startswith("R") else -0.016
-    gripper, camera, pose = gripper_from_dict(model), make_camera(PAPER_LENS), nominal_cam_T_grip()
-    settings = MonitorSettings(jaw_sigma_m=0.0)
-    monitor = Monitor(camera, gripper, settings, reference_of(pose))
-    scenario = scene(BEGINS + 2, mount=(along_fingers(-3e-3, BEGINS_S),))
-    simulator = Simulator(camera, gripper, pose, scenario, 1)
-    for k in range(BEGINS):
-        monitor.process(simulator.frame(k))
-    measurement = Tracker(camera, gripper, settings).measure(
-        simulator.frame(BEGINS + 1), simulator.truth(BEGINS + 1).cam_T_grip, 0.0
-    )
-    return monitor, measurement
-
-
-def sigma_m_of(measurement: Measurement, chosen: np.ndarray) -> float:
-    """Standard deviation of the position in its worst direction by some edges (v,) alone, the opening being known."""
-    known = np.zeros((7, 7))
-    known[6, 6] = 1e12
-    information = measurement.normal.information[chosen].sum(axis=0) + known
-    inverse = np.linalg.inv(information)
-    covariance = inverse @ (measurement.normal.middle[chosen].sum(axis=0) + known) @ inverse
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-
-
-NO_END = FingerEndsSeen(np.array([0, 0]), np.array([3, 3]))
-
-
-def test_tapered_fingers_need_ends_where_one_more_wrong_edge_leaves_too_little():
-    """Their four sides tell all six unknowns, but three of them don't."""
-    monitor, measurement = knocked_tapered_fingers()
-    weigher = monitor._trust._weigher
-    assert weigher.anchor is not None
-    sides = monitor._tracker.along[measurement.normal.edge]
-    others = [sides & (np.arange(len(sides)) != k) for k in np.flatnonzero(sides)]
-    worst_m, limit_m = max(sigma_m_of(measurement, kept) for kept in others), PolicySettings().alert_limit_m
-    exceeded_once_in_a_thousand = 3.29  # standard deviations: the risk over the prior of a wrong edge
-    assert exceeded_once_in_a_thousand * worst_m > limit_m > 4.42 * SIGMA_INFLATION * sigma_m_of(measurement, sides)
-    trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, weigher.anchor.now_s)
-    assert trust.displaced and not trust.proven
-    assert trust.protection.position_m > MISREAD_PROBABILITY * exceeded_once_in_a_thousand * worst_m
-
-
-def test_a_pose_that_needs_no_ends_is_remembered_without_them():
-    """As certain as the sides make it: what looked like the ends isn't proven by that."""
-    monitor, measurement = knocked_tapered_fingers()
-    wide = MonitorSettings(jaw_sigma_m=0.0, policy=PolicySettings(alert_limit_m=1.0, alert_limit_rad=3.0))
-    tracker, gripper = monitor._tracker, monitor._gripper
-    weigher = Weigher(tracker, gripper, wide, reference_of(nominal_cam_T_grip()))
-    covariance = measurement.covariance[:6, :6]
-    trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, 0.0)
-    assert trust.displaced and trust.proven
-    weigher.settle(trust, measurement.cam_T_grip, covariance, 0.0)
-    assert weigher.anchor is not None
-    claimed_m = np.sqrt(np.linalg.eigvalsh(weigher.anchor.covariance[:3, :3])[-1])
-    sides = tracker.along[measurement.normal.edge]
-    assert claimed_m > 0.99 * sigma_m_of(measurement, sides) > 1.2 * sigma_m_of(measurement, np.ones_like(sides))
 
 
 def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_than_they_exclude():
