@@ -6,7 +6,7 @@ Whatever happens, no frame is valid, nor any bound stated, that the truth is bey
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import msgspec
@@ -24,7 +24,7 @@ from gripmon.model.geometry import make_transform, perturb
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import Trust
+from gripmon.monitor.weigher import MISREAD_PROBABILITY, Trust
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
@@ -275,20 +275,23 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
     assert bound_m[1e5, 1.0] > 0.1
 
 
-def test_edges_of_both_ends_without_a_corner_count_once():
+def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     """One straight border stands in for both of them at once: behind it the mount may have been knocked."""
     monitor = new_monitor()
     for frame in frames_of(scene(BEGINS))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
     assert measurement is not None and weigher.anchor is not None
-    limit_m = PolicySettings().alert_limit_m
-    for corners, holds in (((0, 0), False), ((1, 0), True)):
-        ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
-        assert weigher.confirmations(measurement, ends) == 2
-        trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s)
+    normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
+    near = np.array([along[edge] or names[edge] in ("L_tip_near", "R_tip_near") for edge in normal.edge])
+    on_one_line = replace(normal, **{part.name: getattr(normal, part.name)[near] for part in fields(normal)})
+    limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
+    for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
+        ends, seen = FingerEndsSeen(np.array(corners), np.array([3, 3])), replace(measurement, normal=sides_and)
+        assert weigher._misread(seen, ends, None) == pytest.approx(MISREAD_PROBABILITY**times)
+        trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
         assert not (trust.proven or trust.displaced)
-        assert (trust.protection.position_m < limit_m) == holds
+        assert (trust.protection.position_m < limit_m) == (times > 1)
 
 
 def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pytest.MonkeyPatch):

@@ -21,15 +21,12 @@ from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Trust, Weigher
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Trust, Weigher
 from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
 PROOF_EVERY_FRAMES = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames; also after one without proof."""
-
-ONE_EDGE_PX = 2.0
-"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
 
 ALONG_Z = np.array([0.0, 0.0, 1.0])
 """The way that fingers without a direction of their own are slid along for the look: out of the gripper."""

@@ -45,6 +45,9 @@ MISREAD_PROBABILITY = 0.1
 border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
 """
 
+ONE_EDGE_PX = 2.0
+"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
+
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
 
@@ -159,10 +162,7 @@ class Weigher:
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        confirmed = self.confirmations(measurement, ends, kept)
-        if ends is not None and not ends.seen.any():
-            confirmed = min(confirmed, 1)  # one straight border may stand in for the edges of all fingers
-        misread = 0.0 if proven else 1.0 if slid else MISREAD_PROBABILITY**confirmed
+        misread = 0.0 if proven else 1.0 if slid else self._misread(measurement, ends, kept)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         # How probable it is that only the frame tells where the fingers are along themselves.
@@ -239,10 +239,22 @@ class Weigher:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
         further corner.  ``kept`` (v,): the measured edges that count.
         """
-        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
-        edge = edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
-        by_edge = set(self._gripper.edge_finger[edge].tolist())
+        by_edge = set(self._gripper.edge_finger[self._at_ends(measurement, kept)].tolist())
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
+
+    def _at_ends(self, measurement: Measurement, kept: NDArray[np.bool_] | None) -> NDArray[np.intp]:
+        """The edges at the fingers' ends that are seen."""
+        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+        return edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
+
+    def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
+        """Probability that ends that are seen where they are expected are none.  A single straight border shows what
+        edges on one line do, of whatever fingers they are.
+        """
+        times = self.confirmations(measurement, ends, kept)
+        if ends is not None and not ends.seen.any() and _on_one_line(measurement, self._at_ends(measurement, kept)):
+            times = min(times, 1)
+        return MISREAD_PROBABILITY**times
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
@@ -316,6 +328,16 @@ def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
         return False
     expected = not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
     return ends.sure or expected or (again and ends.at_each)
+
+
+def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
+    """Whether some edges are seen on one straight line of the image."""
+    prediction = measurement.prediction
+    uv_px = prediction.uv_px[np.isin(prediction.layout.edge, edges) & prediction.ok]
+    if len(uv_px) == 0:
+        return True
+    off_px = uv_px - uv_px.mean(axis=0)
+    return bool(np.abs(off_px @ np.linalg.svd(off_px, full_matrices=False)[2][-1]).max() < ONE_EDGE_PX)
 
 
 def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
