@@ -27,7 +27,7 @@ from support.published import Published
 from support.teach_page_browser import Visitor, browser, page
 
 from gripmon.cli import main
-from gripmon.client import Condition, Fleet, MonitorName
+from gripmon.client import Client, Condition, Fleet, MonitorName
 from gripmon.daemon.fleet_page import CARDS_MOST, PICTURE_PX, FleetSite, Order, Shown
 from gripmon.daemon.overlay import overlay
 from gripmon.io.wire import PublishSettings
@@ -374,6 +374,8 @@ def test_an_operators_way(
         assert "<img src=x onerror=document.title=2>" in visitor.text("main") and "<b>bold</b>" in visitor.text("main")
         assert driver.title == "gripmon fleet"
 
+        outlines_lie_on_measured_corners(endpoint)
+
         visitor.click(f"{card()} [data-order=accept]")  # asked, and someone else is faster
         wait_for("as reference of demo/wrist?", lambda: f"{card()} .asked")
         assert send(endpoint, "accept") == 0
@@ -408,6 +410,18 @@ def test_an_operators_way(
         assert visitor.script(enabled, "article button") == 0
         assert running.ended()[0] == 130
     capsys.readouterr()
+
+
+def outlines_lie_on_measured_corners(endpoint: str) -> None:
+    """What the snapshot says of the predicted edges, against what was measured in the image."""
+    with Client("demo", connect=endpoint) as client:
+        reply, _ = client.snapshot(WAIT_S)
+    assert reply.snapshot is not None and len(reply.snapshot.outlines_px) >= 6
+    ends = np.array([line[k] for line in reply.snapshot.outlines_px for k in (0, -1)])
+    used = [corner.uv_px for corner in reply.snapshot.record.corners if corner.used]
+    assert len(used) >= 4
+    for uv_px in used:
+        assert np.linalg.norm(ends - np.array(uv_px), axis=1).min() < 1.0
 
 
 def looks_right_at_every_width(visitor: Visitor, card: Callable[[], str]) -> None:

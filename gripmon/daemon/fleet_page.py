@@ -207,16 +207,19 @@ class FleetSite:
 
 
 def _card(status: MonitorStatus) -> Card:
-    state = status.state
-    common = {
-        "robot": status.name.robot, "camera": status.name.camera, "monitor_id": status.monitor_id,
-        "condition": status.condition, "gone_since_ns": status.gone_since_ns, "heard_s": status.state_age_s,
-    }  # fmt: skip
+    card = Card(
+        robot=status.name.robot,
+        camera=status.name.camera,
+        monitor_id=status.monitor_id,
+        condition=status.condition,
+        gone_since_ns=status.gone_since_ns,
+        heard_s=status.state_age_s,
+    )
+    state, alerts = status.state, status.alerts
     if state is None:
-        return Card(**common)
-    alerts = status.alerts
-    return Card(
-        **common,
+        return card
+    return msgspec.structs.replace(
+        card,
         state=_short(state.state),
         message=_short(state.message),
         drift_m=status.drift_m,
