@@ -10,7 +10,8 @@ from pathlib import Path
 import msgspec
 
 from gripmon import __version__
-from gripmon.analyse.dataset import Journal, Written, write_dataset
+from gripmon.analyse.dataset import Journal, Rows, Written, write_dataset
+from gripmon.analyse.dataset_annotations import Annotations
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.dataset.engines import local, ray_cluster
 from gripmon.daemon.replaying import as_configured
@@ -49,6 +50,7 @@ def measure_dataset(
     level: float = 0.01,
     tolerance_m: float = 0.0,
     tolerance_rad: float = 0.0,
+    annotate: str | Path | None = None,
     step: Callable[[int], None] = lambda _total: None,
 ) -> Survey:
     """Measure every episode of a folder or URL by every one of ``cameras`` (topics, features), and write the table and
@@ -56,8 +58,9 @@ def measure_dataset(
 
     ``config`` has the gripper, a camera, a rough reference, and in its source how the state gives the opening.
     ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: processes (None: as
-    many as there are cores).  ``step`` is called with their number after each episode.  Called again with the same
-    ``out`` it measures what is new, has changed or was interrupted.
+    many as there are cores).  ``annotate``: a folder or URL for the results in the dataset's own format, see
+    :class:`gripmon.analyse.dataset_annotations.Annotations`.  ``step`` is called with their number after each episode.
+    Called again with the same ``out`` it measures what is new, has changed or was interrupted.
 
     Raises :class:`InputError`: nothing to measure, several cameras of which none is named, an ``out`` that holds
     another configuration's results, an engine that isn't there.
@@ -67,6 +70,7 @@ def measure_dataset(
         episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
     except SourceError as error:
         raise InputError(str(error)) from None
+    annotations = None if annotate is None else Annotations(episodes, str(annotate))
     folder = writable_folder(Path(out))
     with Journal(folder, _fingerprint(config, lens)) as journal:
         versions = {episode.key: episode.version for episode in episodes}
@@ -83,6 +87,8 @@ def measure_dataset(
             step(len(episodes))
         order = [episode.key for episode in episodes]
         written = write_dataset(journal, order, folder, str(dataset), level, tolerance_m, tolerance_rad)
+        if annotations is not None:
+            annotations.write(Rows(journal, written))
     return Survey(written, len(episodes), len(left))
 
 
