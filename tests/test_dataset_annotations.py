@@ -123,7 +123,7 @@ def test_copy_never_lies_in_what_is_there(tmp_path: Path, to: str, words: str):
 def test_columns_that_are_there_are_not_replaced(tmp_path: Path):
     write_lerobot(tmp_path / "set", [BLANK], fps=10, codec="libx264")
     annotated(tmp_path / "set", tmp_path / "out", tmp_path / "copy", [{"stretches": stretches(0)}])
-    with pytest.raises(InputError, match="has a column observation.extrinsics.wrist already"):
+    with pytest.raises(InputError, match=r"has a column observation\.extrinsics\.wrist already"):
         Annotations(find_episodes(str(tmp_path / "copy")), str(tmp_path / "again"))
 
 
