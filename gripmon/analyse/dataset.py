@@ -43,6 +43,7 @@ class Measured(msgspec.Struct, frozen=True):
     frames: int = 0
     own_reference: Annotated[bool, Meta(description="it was recalibrated from the episode's own images")] = False
     lens: Annotated[str, Meta(description="file or configuration: whose camera calibration")] = "configuration"
+    gripper: Annotated[str | None, Meta(description="gripper file by which it was measured")] = None
     stretches: tuple[Stretch, ...] = ()
     fault: str | None = None
     pictures: Annotated[tuple[bytes, ...], Meta(description="JPEGs of the first stretch and the last")] = ()
@@ -255,6 +256,7 @@ SCHEMA = pa.schema(
         _field("motion_cause", _S, "most probable cause by the alerts; unknown: none is probable enough"),
         _field("own_reference", pa.bool_(), "recalibrated from this episode; false: against the configuration's"),
         _field("lens", _S, "whose camera calibration: file or configuration"),
+        _field("gripper", _S, "gripper file by which it was measured; null: none"),
         _field("reason", _S, "why there is no transform, or why frames weren't valid"),
         _field("picture", pa.binary(), "JPEG with what was measured; null: none"),
     ],
@@ -265,7 +267,8 @@ SCHEMA = pa.schema(
 def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(SCHEMA.names) | {
         "episode": measured.episode, "stretch": number, "verdict": Verdict.UNKNOWN.value, "frames": measured.frames,
-        "own_reference": measured.own_reference, "lens": measured.lens, "reason": measured.fault, "moved": None,
+        "own_reference": measured.own_reference, "lens": measured.lens, "gripper": measured.gripper,
+        "reason": measured.fault, "moved": None,
     }  # fmt: skip
     if stretch is None:
         return row

@@ -14,6 +14,7 @@ DATASET          folder or URL; below it every episode that is found
 --config CONFIG  configuration (YAML) with gripper, camera and a rough reference; of its source section the opening
 --out DIR        where the results go; made if it is missing
 --camera NAME...  a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one)
+--gripper FILE...    other grippers that an episode may show; measured by the one that fits, or by none (a reason)
 --own-lens       the configuration's camera calibration, also where a file brings one
 --annotate DIR   also in the dataset's own format; DATASET itself: beside its recordings (not of LeRobot)
 --engine NAME    local (processes of this machine, the default) or ray (a Ray cluster)
@@ -79,6 +80,7 @@ def dataset(arguments: Arguments) -> int:
             tolerance_m=1e-3 * (arguments.tolerance_mm or 0.0),
             tolerance_rad=math.radians(arguments.tolerance_deg or 0.0),
             annotate=arguments.annotate,
+            grippers=arguments.gripper or (),
             step=step,
         )
     good = found.episodes - found.failed
