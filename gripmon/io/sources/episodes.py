@@ -17,6 +17,8 @@ from gripmon.io.sources.stored import file_system
 from gripmon.model.errors import one_line
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key
 
+ANNOTATION_SUFFIX = ".gripmon.mcap"
+"""Of what ``gripmon dataset --annotate`` writes beside recordings: not an episode."""
 _VIDEOS = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
 
 
@@ -48,7 +50,11 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         files: dict[str, dict[str, Any]] = system.find(inside, detail=True)
     except Exception as error:  # noqa: BLE001  each store has its own
         raise SourceError(f"path: {root} can't be listed ({one_line(error):.200})") from None
-    files = {path: one for path, one in files.items() if not _hidden(path[len(inside) :])}
+    files = {
+        path: one
+        for path, one in files.items()
+        if not _hidden(path[len(inside) :]) and not path.endswith(ANNOTATION_SUFFIX)
+    }
     if not files:
         raise SourceError(f"path: there is nothing in {root}; a folder or a URL with episodes")
     remote = "://" in root
