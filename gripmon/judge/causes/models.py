@@ -30,7 +30,10 @@ PART_SIZES_M = np.geomspace(SMALLEST_M, 3e-3, 6)
 FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 """How far things move when they move: shift of the TCP; of a finger or the opening; relative focal length."""
 
-_MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.3, 0.1, 0.1
+_MOUNT, _FINGER, _JAW, _RARE = 0.3, 0.25, 0.15, 0.1
+"""Probabilities beforehand, given that something looks wrong: of a mount that moved, or another camera after a pause;
+of a bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +83,14 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
 
     pose = np.array([1.0] * 3 + [1.0 / distance_m] * 3)
     out = [
-        Suspect(None, None, _NOTHING, Model(held, freed(), np.zeros(0))),
+        Suspect(None, None, _RARE, Model(held, freed(), np.zeros(0))),
         Suspect(Cause.CAMERA_MOUNT, None, _MOUNT, Model(held, freed((POSE, pose)), MOUNT_SIZES_M)),
-        Suspect(Cause.LENS, None, _LENS, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
+        Suspect(Cause.LENS, None, _RARE, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
     ]
     if interrupted:
         # Another camera in its place: an image of another scale from nearly the same place.
         model = Model(held, freed((POSE, pose), (FOCAL, 5.0)), MOUNT_SIZES_M)
-        out.append(Suspect(Cause.CAMERA_REPLACED, None, _REPLACED, model))
+        out.append(Suspect(Cause.CAMERA_REPLACED, None, _MOUNT, model))
     if gripper.has_jaw and known.jaw_reported:
         out.append(Suspect(Cause.JAW_OPENING, None, _JAW, Model(held, freed((JAW, 1.0)), PART_SIZES_M)))
     if fingers > 1:
@@ -95,7 +98,7 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
             model = Model(held, freed(bent(finger)), PART_SIZES_M)
             out.append(Suspect(Cause.FINGER_BENT, finger, _FINGER / fingers, model))
     every = freed((POSE, pose), (FOCAL, 5.0), *(bent(finger) for finger in range(fingers)))
-    out.append(Suspect(Cause.UNKNOWN, None, _SEVERAL, Model(held, every, MOUNT_SIZES_M)))
+    out.append(Suspect(Cause.UNKNOWN, None, _RARE, Model(held, every, MOUNT_SIZES_M)))
     return out
 
 

@@ -16,6 +16,7 @@ BLOCK_S = 0.5
 """Seconds over which frames are averaged; a change of the mean that took no longer is a step."""
 
 KEPT_BLOCKS = 256
+"""Blocks in which the beginning of a motion is looked for: two minutes."""
 
 LASTING_BLOCKS = 3
 """Blocks that must have come after a step."""

@@ -13,6 +13,7 @@ import numpy as np
 from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT_SIGMAS, History, VibrationWatch, goes_on
 from gripmon.judge.drift.sequential import SequentialTest
 from gripmon.judge.drift.settings import DriftSettings
+from gripmon.judge.drift.statistics import BLOCK_FRAMES
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
@@ -68,8 +69,8 @@ the camera counts as back, so that between this and the test's threshold an aler
 EVIDENCE_LOOK_RATIO = 0.4
 """Part of the threshold from which the evidence is looked at more closely, before it is decided."""
 
-VIBRATING_FRAMES = 256
-"""While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone; over
+VIBRATING_FRAMES = BLOCK_FRAMES
+"""While it vibrates: frames of the shortest window that decides, for over a block a vibration is nearly gone; over
 twice as many the mean tells whether the camera is back.
 """
 
