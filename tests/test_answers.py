@@ -127,7 +127,7 @@ def test_a_flood_of_commands_is_answered_to_the_last_one():
 
 
 def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gripmon.io.publish.presence._CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
+    monkeypatch.setattr("gripmon.io.publish.presence.CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
     before = set(threading.enumerate())
     answers = Answers("test")
     answers.send(stalled, lambda query: query.reply("", b"in time"))  # type: ignore[arg-type]

@@ -76,3 +76,32 @@ def test_jaws_are_elsewhere_from_three_standard_deviations_and_fifty_micrometres
         watch.add(OPENING_M, OPENING_M + (scatter_m if index % 2 else -scatter_m))
     usual_m = OPENING_M  # the middle of two values as far above as below
     assert [watch.add(OPENING_M, usual_m + off_m) for _ in range(5)][-1] is asks
+
+
+@pytest.mark.parametrize(
+    ("usual_px", "now_px", "asks"), [(0.6, 0.84, False), (0.6, 0.86, True), (2.0, 2.55, False), (2.0, 2.65, True)]
+)
+def test_a_blur_is_another_from_a_quarter_of_a_pixel_and_three_tenths_on(usual_px: float, now_px: float, asks: bool):
+    watch = BlurWatch()
+    for _ in range(20):
+        watch.add(usual_px)
+    assert [watch.add(now_px) for _ in range(5)][-1] is asks
+
+
+def test_what_is_usual_is_known_after_twenty_frames():
+    watch = BlurWatch()
+    assert not any(watch.add(blur_px) for blur_px in [0.7] * 15 + [2.0] * 4)
+    assert watch.add(2.0)
+
+
+@pytest.mark.parametrize(
+    ("scatter_px", "off_px", "asks"),
+    [(0.0, 0.048, False), (0.0, 0.052, True), (0.02, 0.078, False), (0.02, 0.082, True)],
+)
+def test_edges_contradict_from_a_twentieth_of_a_pixel_and_four_standard_deviations_on(
+    scatter_px: float, off_px: float, asks: bool
+):
+    watch = ResidualWatch()
+    for index in range(20):
+        watch.add(np.full(3, scatter_px if index % 2 else -scatter_px))
+    assert [watch.add(np.array([off_px, -off_px, 0.0])) for _ in range(5)][-1] is asks

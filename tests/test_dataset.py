@@ -110,6 +110,27 @@ def test_again_it_measures_nothing_and_writes_the_same(lerobot: tuple[Path, list
     assert hashes_of(folder / "out" / "stretches") == before
 
 
+def test_results_go_back_into_a_copy_of_the_dataset(lerobot: tuple[Path, list[Truth]]):
+    """Each frame's columns against the truth at its time; all that is written: tests/test_dataset_annotations.py."""
+    folder, truths = lerobot
+    hashes = hashes_of(folder / "set")
+    found = measure_dataset(folder / "set", folder / "out", folder / "lerobot.yaml", annotate=folder / "copy")
+    assert found.measured == 0 and hashes_of(folder / "set") == hashes, "originals are never touched"
+    table = pq.read_table(folder / "copy" / "data")
+    numbers, time_s = np.asarray(table["episode_index"]), np.asarray(table["timestamp"])
+    poses = np.array(table["observation.extrinsics.wrist"].to_pylist())
+    usable = np.asarray(table["observation.extrinsics_valid.wrist"]) == 1.0
+    for number, truth in enumerate(truths):
+        later = np.zeros(len(numbers), bool) if truth.moved_at_s is None else time_s >= truth.moved_at_s
+        for mine, true_T in (
+            ((numbers == number) & ~later, truth.first_T),
+            ((numbers == number) & later, truth.last_T),
+        ):
+            assert usable[mine].sum() >= mine.sum() - 2
+            off_m = np.linalg.norm(poses[mine & usable, :3] - true_T[:3, 3], axis=1)
+            assert off_m.max(initial=0.0) < 1e-4
+
+
 def test_another_configuration_does_not_mix_in(lerobot: tuple[Path, list[Truth]], tmp_path: Path):
     folder, _ = lerobot
     text = (folder / "lerobot.yaml").read_text().replace("1.0e-4", "2.0e-4")
@@ -153,7 +174,7 @@ def test_episode_that_kills_its_worker_is_a_row_and_the_others_are_measured(lero
     folder, _ = lerobot
     config = load_config(folder / "lerobot.yaml", check_source=False)
     episodes = [Episode(str(i), BagSettings(path="x"), "") for i in range(5)]
-    found = {each.episode: each.fault for each in local(config, episodes, "file", 2, die_of_the_second)}
+    found = {each.episode: each.fault for each in local((config,), episodes, "file", 2, die_of_the_second)}
     assert found == {"0": None, "1": DIED, "2": None, "3": None, "4": None}
 
 
@@ -179,7 +200,7 @@ def test_what_is_bad_is_an_answer_with_a_reason(tmp_path: Path, shots: Shots | N
         path.write_bytes(b"\x89MCAP0\r\n, cut")
     else:
         write_mcap(path, shots)
-    found = measure(config, Episode("a", BagSettings(path=str(path), **options), ""))
+    found = measure((config,), Episode("a", BagSettings(path=str(path), **options), ""))
     assert found.stretches == ()
     assert re.search(words, found.fault or ""), found.fault
 

@@ -12,14 +12,13 @@ from support.watched import pose_of, reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import AlertKind, Frame, Origin, Verdict
+from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.teach.cad import gripper_from_cad
 from tools.benchmarks.meshes import MeshCamera, box_fingers, curved_fingers, rounded_fingers, wandering, write_meshes
 
 FRAMES = 45
 ROUNDED_M = (0.002, 0.004, 0.008)
-
 
 SHAPES = {
     "box": (box_fingers, (15e-6, 60e-6)),
@@ -31,29 +30,44 @@ SHAPES = {
 """Meshes by name, and what 95 % of the frames' errors keep across and along the optical axis, m."""
 
 
+def tracked(meshes: list, folder: Path) -> tuple[Gripper, MeshCamera]:
+    """The gripper made from meshes, and a camera that takes pictures of them."""
+    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip()
+    view = {"camera": camera, "cam_T_grip": pose, "length_m": 0.035}
+    paths = write_meshes(meshes, folder)
+    return gripper_from_cad(paths, unit="mm", jaw_range_m=(0.0, 0.06), **view).gripper, MeshCamera(camera, meshes)
+
+
+def watch_of(gripper: Gripper) -> Monitor:
+    return Monitor(make_camera(PAPER_LENS), gripper, MonitorSettings(), reference_of(nominal_cam_T_grip()))
+
+
+def seen(
+    monitor: Monitor, k: int, image: np.ndarray, opening_m: float | None, truth: np.ndarray
+) -> tuple[FrameRecord, np.ndarray | None]:
+    """A frame's record and its error (6,); valid ones are within their bound."""
+    record = monitor.process(Frame(seq=k, stamp_ns=int(k / 30 * 1e9), image=image, jaw_opening_m=opening_m))
+    error = None if record.cam_T_grip is None else difference(pose_of(record.cam_T_grip), truth)
+    if record.verdict is Verdict.VALID:
+        assert error is not None and record.protection is not None
+        assert np.linalg.norm(error[:3]) <= record.protection.position_m, k
+    return record, error
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_what_was_made_from_a_mesh_tracks_it(shape: str, tmp_path: Path):
     """The camera wanders by 0.2 mm and 1 mrad, the jaws by 1 mm, and each frame has another background."""
     meshes, (across_m, along_m) = SHAPES[shape][0](), SHAPES[shape][1]
-    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip()
-    view = {"camera": camera, "cam_T_grip": pose, "length_m": 0.035}
-    paths = write_meshes(meshes, tmp_path)
-    gripper = gripper_from_cad(paths, unit="mm", jaw_range_m=(0.0, 0.06), **view).gripper
-    monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(pose))
-    pictures = MeshCamera(camera, meshes)
-    errors, valid = [], 0
+    gripper, pictures = tracked(meshes, tmp_path)
+    monitor, errors, valid = watch_of(gripper), [], 0
     for k in range(FRAMES):
-        truth = wandering(pose, k / FRAMES, 2e-4, 1e-3)
+        truth = wandering(nominal_cam_T_grip(), k / FRAMES, 2e-4, 1e-3)
         opened_m = 0.001 * np.sin(2.0 * np.pi * k / FRAMES)
         image = pictures.picture(truth, [np.array([side * opened_m / 2.0, 0.0, 0.0]) for side in (-1.0, 1.0)])
-        stamp_ns, opening_m = int(k / 30 * 1e9), gripper.jaw_nominal_m + opened_m
-        record = monitor.process(Frame(seq=k, stamp_ns=stamp_ns, image=image, jaw_opening_m=opening_m))
-        if record.cam_T_grip is not None and record.source is not Origin.HELD:
-            errors.append(difference(pose_of(record.cam_T_grip), truth))
-            if record.verdict is Verdict.VALID:
-                valid += 1
-                assert record.protection is not None
-                assert np.linalg.norm(errors[-1][:3]) <= record.protection.position_m
+        record, error = seen(monitor, k, image, gripper.jaw_nominal_m + opened_m, truth)
+        if error is not None and record.source is not Origin.HELD:
+            errors.append(error)
+            valid += record.verdict is Verdict.VALID
     # The first frame has none before it that confirms it.
     assert len(errors) >= 0.98 * FRAMES and valid >= 0.98 * (FRAMES - 1)
     off = np.abs(np.array(errors))
@@ -65,12 +79,7 @@ def test_what_was_made_from_a_mesh_tracks_it(shape: str, tmp_path: Path):
 
 
 def rounded(radius_m: float, folder: Path) -> tuple[Gripper, MeshCamera]:
-    meshes, camera, pose = rounded_fingers(radius_m), make_camera(PAPER_LENS), nominal_cam_T_grip()
-    paths = write_meshes(meshes, folder)
-    made = gripper_from_cad(
-        paths, unit="mm", jaw_range_m=(0.0, 0.06), camera=camera, cam_T_grip=pose, length_m=0.035
-    )  # fmt: skip
-    return made.gripper, MeshCamera(camera, meshes)
+    return tracked(rounded_fingers(radius_m), folder)
 
 
 def slid(slide_m: float) -> np.ndarray:
@@ -123,40 +132,23 @@ def test_a_bar_before_or_behind_rounded_tips_is_not_taken_for_them(radius_m: flo
 def test_a_knock_along_rounded_fingers_behind_a_bar_is_never_valid_beyond_its_bound(radius_m: float, tmp_path: Path):
     """The bar's rim lies where the tips were; then the gripper is knocked by 2 mm along its fingers, and seen free."""
     gripper, pictures = rounded(radius_m, tmp_path)
-    monitor = Monitor(make_camera(PAPER_LENS), gripper, MonitorSettings(), reference_of(nominal_cam_T_grip()))
+    monitor, valid = watch_of(gripper), []
     before = [(bar(-0.03, 0.004, -0.02), 120.0)]
-    valid = []
     for k in range(60):
         truth = slid(-2e-3 if k >= 25 else 0.0)
         image = pictures.picture(truth, before=before if 15 <= k < 40 else ())
-        opening_m = gripper.jaw_nominal_m
-        record = monitor.process(Frame(seq=k, stamp_ns=int(k / 30 * 1e9), image=image, jaw_opening_m=opening_m))
-        valid.append(record.verdict is Verdict.VALID)
-        if valid[-1]:
-            assert record.protection is not None and record.cam_T_grip is not None
-            error = difference(pose_of(record.cam_T_grip), truth)
-            assert np.linalg.norm(error[:3]) <= record.protection.position_m, k
+        valid.append(seen(monitor, k, image, gripper.jaw_nominal_m, truth)[0].verdict is Verdict.VALID)
     assert np.mean(valid[1:15]) > 0.9 and not any(valid[25:40]) and np.mean(valid[50:]) > 0.9
 
 
 def test_a_knock_of_curved_fingers_is_reported(tmp_path: Path):
     """Their curves tell where they are along themselves: no end has to be seen for a knock to count as one."""
-    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip()
-    view = {"camera": camera, "cam_T_grip": pose, "length_m": 0.035}
-    meshes = curved_fingers()
-    gripper = gripper_from_cad(write_meshes(meshes, tmp_path), unit="mm", jaw_range_m=(0.0, 0.06), **view).gripper
-    monitor, pictures = Monitor(camera, gripper, MonitorSettings(), reference_of(pose)), MeshCamera(camera, meshes)
-    alerts = []
+    gripper, pictures = tracked(curved_fingers(), tmp_path)
+    monitor, alerts = watch_of(gripper), []
     for k in range(60):
-        truth = pose.copy()
+        truth = nominal_cam_T_grip()
         truth[:3, 3] += np.array([4e-4, 6e-4, 6e-4]) * (k >= 25)
-        record = monitor.process(
-            Frame(seq=k, stamp_ns=int(k / 30 * 1e9), image=pictures.picture(truth), jaw_opening_m=gripper.jaw_nominal_m)
-        )
+        record, _ = seen(monitor, k, pictures.picture(truth), gripper.jaw_nominal_m, truth)
         alerts += [alert.kind for alert in record.alerts]
-        if record.verdict is Verdict.VALID:
-            assert record.cam_T_grip is not None and record.protection is not None
-            error = difference(pose_of(record.cam_T_grip), truth)
-            assert np.linalg.norm(error[:3]) <= record.protection.position_m
         assert k < 35 or record.verdict is Verdict.VALID
     assert alerts and alerts[0] in (AlertKind.STEP, AlertKind.DRIFT)

@@ -104,8 +104,17 @@ def separate(
 class Model:
     """A linear model of v edges with m unknowns: Jacobian rows with normal errors of known size, fitted at once."""
 
-    def __init__(self, rng: np.random.Generator, edges: int = 9, unknowns: int = 6, rows: int = 7) -> None:
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        edges: int = 9,
+        unknowns: int = 6,
+        rows: int = 7,
+        tells: np.ndarray | float = 1.0,
+    ) -> None:
+        """``tells`` (v,): factor on what each edge tells of the third unknown."""
         self.jacobian = rng.normal(size=(edges, rows, unknowns))
+        self.jacobian[:, :, 2] *= np.reshape(tells, (-1, 1))
         self.sigma = rng.uniform(0.5, 2.0, (edges, rows))
         weighted = self.jacobian / self.sigma[..., None] ** 2
         self.information = np.einsum("vri,vrj->vij", weighted, self.jacobian)
@@ -372,6 +381,37 @@ def test_hypotheses_know_what_kind_they_are():
     assert found.name[found.ends] == "what looks like the fingers' ends is something else"
     np.testing.assert_array_equal(found.keep[found.ends], ALONG)
     assert not of_two_fingers().opening.any()
+
+
+def test_without_ends_each_hypothesis_doubts_them_besides():
+    every = of_two_fingers(has_opening=True)
+    without, more = every.without_ends()
+    np.testing.assert_array_equal(without.keep, every.keep * ALONG)
+    np.testing.assert_array_equal(without.prior, every.prior)
+    on_the_sides = [f"edge {name} belongs to something else" for name in ("a_out", "a_in", "b_out", "b_in")]
+    fingers = [f"finger {name} is not where its model says" for name in "ab"]
+    assert {every.name[k] for k in np.flatnonzero(more)} == {*on_the_sides, *fingers, "the jaw opening is wrong"}
+
+
+def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
+    """Of the sides one alone tells much of a motion along z.  If that is something else as well, which has moved with
+    what looks like the ends, what reckons with one thing at a time states far too little.
+    """
+    every, risk, trials = of_two_fingers(), 1e-3, 100
+    without, more = every.without_ends()
+    both = Hypotheses(
+        every.name + tuple(without.name[k] for k in np.flatnonzero(more)),
+        *(
+            np.concatenate([getattr(every, part), getattr(without, part)[more]])
+            for part in ("prior", "keep", "opening", "sudden")
+        ),
+        every.ends,
+    )
+    model = Model(np.random.default_rng(6), rows=12, tells=np.where(ALONG & (np.array(NAMES) != "a_out"), 0.02, 1.0))
+    moved = ~ALONG | (np.array(NAMES) == "a_out")
+    bias = np.where(moved[:, None], 3.0 * model.jacobian[:, :, 2], 0.0)
+    assert exceeded(model, every, risk, trials, bias, seed=21) > 0.9
+    assert exceeded(model, both, risk, trials, bias, seed=21) == 0.0
 
 
 def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.least_squares import (
     TUKEY,
+    chi_square_limit,
     covariance_of,
     fit,
     minimise,
@@ -173,3 +174,10 @@ def test_whitened_errors_are_independent_with_unit_variance():
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
     root = whitening(covariance)
     np.testing.assert_allclose(root @ covariance @ root.T, np.eye(2), atol=1e-14)
+
+
+@pytest.mark.parametrize(("chance", "dimensions"), [(1e-6, 6), (0.05, 6), (1e-3, 2)])
+def test_a_chi_square_limit_is_what_normal_errors_exceed_by_chance(chance: float, dimensions: int):
+    from scipy.stats import chi2
+
+    assert chi2.sf(chi_square_limit(chance, dimensions), dimensions) == pytest.approx(chance, rel=1e-9)

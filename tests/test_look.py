@@ -26,7 +26,7 @@ from gripmon.simulate.scenario import (
     Shadow,
 )
 from gripmon.track.look import GripperLook, LookAgreement, LookRefused
-from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
+from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S, MANY_VIEWS, RELEARN_S
 
 RISK = 1e-5
 LEARNT = 16
@@ -80,9 +80,8 @@ def held_against(simulation: Simulator, look: GripperLook, frame: int = 24) -> L
 def test_a_textured_finger_is_recognised_where_it_is_and_nowhere_along_it():
     simulation, look = ordinary()
     assert look.ready and look.missing == ""
-    assert look.informative.min() >= 10
-    np.testing.assert_array_equal(look.tells_slide_m(RISK), 1e-3)
     agreement = held_against(simulation, look)
+    assert agreement.seen[0].min() >= 10
     assert agreement.correlation[0].min() > 0.85
     assert np.abs(agreement.correlation[1:]).max() < 0.6
     assert agreement.supports(RISK) and not agreement.contradicts(RISK)
@@ -153,7 +152,6 @@ def test_what_changes_every_day_takes_nothing_from_it(settings: dict[str, object
 def test_a_finger_of_one_shade_says_that_it_says_nothing():
     simulation = filmed(REAR_OUT_OF_VIEW, fingers=PLAIN_FINGERS)
     look = taught(simulation)
-    assert np.isnan(look.tells_slide_m(RISK)).all()
     agreement = held_against(simulation, look)
     assert not any(agreement.contradicts(RISK, pose) for pose in range(1 + len(TELLING_SLIDES_M)))
     assert not look.ready and look.missing == "the fingers look the same all along, or never the same twice"
@@ -161,10 +159,11 @@ def test_a_finger_of_one_shade_says_that_it_says_nothing():
 
 def test_a_marked_finger_beside_a_plain_one_tells_for_itself():
     mark = msgspec.structs.replace(MARKS.marks[0], finger="left")
-    look = taught(filmed(REAR_OUT_OF_VIEW, fingers=msgspec.structs.replace(MARKS, marks=(mark,))))
-    left, right = look.tells_slide_m(RISK)
-    assert left == 1e-3 and np.isnan(right)
-    assert look.informative[1] <= 2
+    simulation = filmed(REAR_OUT_OF_VIEW, fingers=msgspec.structs.replace(MARKS, marks=(mark,)))
+    agreement = held_against(simulation, taught(simulation))
+    left, right = (agreement.log_odds[0] - agreement.log_odds[1:]).T
+    assert (left > -np.log(RISK)).all() and (right < -np.log(RISK)).all()
+    assert agreement.seen[0, 1] <= 2
 
 
 def test_a_view_that_is_covered_contradicts_nothing():
@@ -240,6 +239,22 @@ def test_a_long_pause_leaves_what_was_learnt():
     assert look.learn(simulation.render(LEARNT), truth.cam_T_grip, truth.jaw_opening_m, 50.0 * FORGET_S)
     agreement = held_against(simulation, look)
     assert agreement.supports(RISK) and not agreement.contradicts(RISK)
+
+
+def test_of_a_fast_camera_not_every_frame_is_learnt():
+    simulation = filmed()
+    look = taught(simulation)
+    truth, last_s = simulation.truth(LEARNT), simulation.truth(LEARNT - 1).time_s
+
+    def learns(at_s: float) -> bool:
+        return look.learn(simulation.render(LEARNT), truth.cam_T_grip, truth.jaw_opening_m, at_s)
+
+    look.views = MANY_VIEWS
+    assert not learns(last_s + 0.9 * RELEARN_S)
+    assert learns(last_s + 1.1 * RELEARN_S)
+    look.views = MANY_VIEWS
+    look.learn(simulation.render(LEARNT + 1), truth.cam_T_grip, truth.jaw_opening_m, 0.0)
+    assert look.views == MANY_VIEWS + 1, "also when time has jumped backwards"
 
 
 def test_wrong_poses_now_and_then_spoil_nothing():

@@ -129,14 +129,13 @@ def test_light_and_jaws_change_little(settings: dict[str, object], most_um: tupl
     assert (np.abs(errors.mean(axis=0)) < most_um).all()
 
 
-def test_what_hides_half_of_a_finger_is_left_out_and_told():
+def test_what_hides_half_of_a_finger_is_left_out():
     simulation, alignment = standing()
     truth = simulation.truth(30)
     image = simulation.render(30).copy()
     image[:, :160] = 215
     found = alignment.measure(image, truth.cam_T_grip, truth.jaw_opening_m, 0.0)
     assert found is not None
-    assert found.agree[0] < 0.7 < found.agree[1]
     error = perturbation_between(found.cam_T_grip, truth.cam_T_grip)
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
 
@@ -191,7 +190,7 @@ def fused_path(path: np.ndarray, rng: np.random.Generator, fusion: LookFusion) -
         true_T = perturb(np.eye(4), np.concatenate([xyz, np.zeros(3)]))
         edges_T = perturb(true_T, rng.multivariate_normal(np.zeros(6), EDGES))
         look_T = perturb(true_T, bias + rng.multivariate_normal(np.zeros(6), LOOK))
-        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None, np.ones(2)))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None))
         fusion.learn()
         out.append((edges_T if fused is None else fused[0])[:3, 3])
     return np.array(out)
@@ -220,7 +219,7 @@ def test_the_fused_pose_changes_by_as_much_as_is_claimed_while_nothing_moves():
     for _ in range(3000):
         edges_T = perturb(np.eye(4), rng.multivariate_normal(np.zeros(6), EDGES))
         look_T = perturb(np.eye(4), rng.multivariate_normal(np.zeros(6), LOOK))
-        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None, np.ones(2)))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(look_T, LOOK, None))
         fusion.learn()
         if fused is not None:
             poses.append(perturbation_between(np.eye(4), fused.cam_T_grip))
@@ -238,7 +237,7 @@ def test_the_edges_count_where_the_look_contradicts_them():
     fusion = LookFusion(0.03)
     fused_path(np.zeros((50, 3)), np.random.default_rng(6), fusion)
     far = perturb(np.eye(4), np.array([0.0, 0.0, 1e-4, 0.0, 0.0, 0.0]))
-    assert fusion.fuse(np.eye(4), EDGES, LookMotion(far, LOOK, None, np.ones(2))) is None
+    assert fusion.fuse(np.eye(4), EDGES, LookMotion(far, LOOK, None)) is None
     fusion.learn()
     assert fusion.contradicts
 
@@ -252,7 +251,7 @@ def test_after_a_motion_the_edges_decide_again_as_far_as_depths_may_be_wrong():
     errors = []
     for _ in range(20):
         edges_T = perturb(there, rng.multivariate_normal(np.zeros(6), EDGES))
-        fused = fusion.fuse(edges_T, EDGES, LookMotion(wrong, LOOK, None, np.ones(2)))
+        fused = fusion.fuse(edges_T, EDGES, LookMotion(wrong, LOOK, None))
         fusion.learn()
         assert fused is not None
         errors.append(fused[0][1, 3] - there[1, 3])

@@ -23,10 +23,12 @@ from support.sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
+from gripmon.daemon.fleet_page import FleetSite, Order
 from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.io.wire.session import load_file
 from gripmon.model.records import CommandName, CommandReply
+from gripmon.teach.messages import BadRequest
 
 PREFIX = "gripmon/arm/wrist"
 
@@ -142,6 +144,27 @@ def test_only_the_operator_commands(site: Site):
     with Client("arm", "wrist", zenoh_config_file=str(site.file("operator"))) as operator:
         assert operator.send(CommandName.UNDO).text == "so be it"
     assert site.commands[before:] == [CommandName.UNDO]
+
+
+def test_the_page_of_the_fleet_can_do_what_its_certificate_may(site: Site):
+    before = len(site.commands)
+    for name in ("controller", "operator"):
+        with Fleet(zenoh_config_file=str(site.file(name))) as fleet:
+            page = FleetSite(fleet)
+
+            def shown(page: FleetSite = page) -> bool:
+                site.monitor.state(state_record(3))
+                return [card.condition for card in page.shown().cards] == [Condition.VALID]
+
+            wait_until(shown, "the monitor on the page")
+            (card,) = page.shown().cards
+            order = Order(robot="arm", camera="wrist", monitor_id=card.monitor_id, name="accept", argument="p-1")
+            if name == "controller":
+                with pytest.raises(BadRequest, match="may not let you"):
+                    page.carry_out(order)
+            else:
+                assert page.carry_out(order).text == "so be it"
+    assert site.commands[before:] == [CommandName.ACCEPT]
 
 
 def test_send_says_what_may_be_wrong(site: Site, stranger: Path):

@@ -152,7 +152,7 @@ def test_the_gate_lets_all_but_one_in_a_million_of_honest_measurements_pass():
 
     from gripmon.judge.smoothing import GATE_SQUARE
 
-    assert chi2.sf(GATE_SQUARE, 6) == pytest.approx(1.3e-6, rel=0.1)
+    assert chi2.sf(GATE_SQUARE, 6) == pytest.approx(1e-6, rel=1e-6)
 
 
 # --- what is made of a stream ---

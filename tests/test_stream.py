@@ -106,6 +106,33 @@ def test_a_source_that_shows_every_frame_twice_is_not_frozen():
     assert not any(kinds(watch, twice))
 
 
+@pytest.mark.parametrize(("buffers", "told"), [(8, True), (9, False)])
+def test_a_ring_of_up_to_eight_buffers_is_recognised(buffers: int, told: bool):
+    watch = StreamWatch()
+    well = frames(0, 150)
+    kinds(watch, well)
+    held = [f.image for f in well[-buffers:]]
+    found = kinds(watch, [replace(f, image=held[k % buffers]) for k, f in enumerate(after(well, 60))])
+    assert ({"frozen"} in found) == told
+
+
+def test_a_source_that_repeats_is_frozen_after_four_times_its_longest_repetition():
+    watch = StreamWatch(StreamSettings(frozen_frames=3, frozen_s=0.03))
+    thrice = [replace(f, image=picture(f.seq // 3)) for f in frames(0, 150)]
+    assert not any(kinds(watch, thrice))
+    found = kinds(watch, after(thrice, 20, image=picture(1000)))
+    assert found.index({"frozen"}) == 4 * 2
+
+
+@pytest.mark.parametrize(("inner", "told"), [(200, True), (199, False)])
+def test_200_pixels_neither_black_nor_white_are_enough_to_tell_a_coder(inner: int, told: bool):
+    before = np.full(1000, 128, np.uint8)
+    before[inner:] = np.arange(1000 - inner) % 2 * 255
+    now = before.copy()
+    now[0] = 129
+    assert _stands_in_large_parts(now, before) == told
+
+
 def test_frames_that_repeat_for_a_moment_are_not_frozen():
     watch = StreamWatch()
     well = frames(0, 150)
@@ -189,7 +216,50 @@ def test_a_clock_that_was_set_is_told_and_forgotten(change_ns: int, kind: str, c
     later = [replace(f, stamp_ns=f.stamp_ns + change_ns) for f in after(well, 80)]
     told = watch.add(later[0])
     assert [(f.kind, f.cause) for f in told] == [(kind, cause)]
-    assert not kinds(watch, later[1:])[-1]
+    found = kinds(watch, later[1:])
+    assert all(found[:29]) and not any(found[29:])
+
+
+@pytest.mark.parametrize(
+    ("fps", "pause_s", "told"), [(FPS, 4.9, False), (FPS, 5.2, True), (1.0, 49.0, False), (1.0, 51.0, True)]
+)
+def test_a_gap_is_fifty_periods_and_five_seconds_long(fps: float, pause_s: float, told: bool):
+    watch = StreamWatch()
+    well = frames(0, 100, fps)
+    kinds(watch, well)
+    found = kinds(watch, after(well, 1, fps=1.0 / pause_s))
+    assert found == [{"gap"} if told else set()]
+
+
+@pytest.mark.parametrize(("fps", "learnt_after"), [(5.0, 49), (60.0, 121)])
+def test_the_usual_rate_is_learnt_from_six_blocks_that_span_two_seconds(fps: float, learnt_after: int):
+    """49 frames are six blocks of eight intervals; 121 span two seconds."""
+    watch = StreamWatch()
+    kinds(watch, frames(0, learnt_after - 1, fps))
+    assert watch._rate.usual_ns is None
+    kinds(watch, frames(learnt_after - 1, 1, fps))
+    assert watch._rate.usual_ns == pytest.approx(1e9 / fps, rel=1e-6)
+
+
+def test_the_rate_is_that_of_the_last_64_intervals():
+    watch = StreamWatch()
+    well = frames(0, 100)
+    kinds(watch, well)
+    slower = after(well, 34, fps=15.0)
+    kinds(watch, slower[:31])
+    assert watch.frames_per_s == pytest.approx(FPS, rel=1e-6)
+    kinds(watch, slower[31:])
+    assert watch.frames_per_s == pytest.approx(15.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("uneven", "has_rate"), [(0.2, True), (0.4, False)])
+def test_intervals_that_differ_by_a_third_have_no_usual_rate(uneven: float, has_rate: bool):
+    """Intervals of the middle one less and more a share, by turns: that is their median deviation."""
+    stamp_ns, watch = START_NS, StreamWatch()
+    for k in range(200):
+        stamp_ns += round(1e9 / FPS * (1.0 + (uneven, 0.0, -uneven, uneven, -uneven, 0.0, uneven, -uneven)[k % 8]))
+        watch.add(Frame(k, stamp_ns, picture(k)))
+    assert (watch._rate.usual_ns is not None) == has_rate
 
 
 def test_a_clock_that_stands_still_is_told_but_not_one_frame_handed_over_twice():
@@ -212,7 +282,9 @@ def test_another_rate_is_told_within_seconds_and_cleared(factor: float):
     faults = watch.add(after(other, 1, fps=factor * FPS)[0])
     assert faults[0].cause is Cause.CLOCK
     assert f"{factor * FPS:.1f} frames a second" in faults[0].text and f"{FPS:.1f} were usual" in faults[0].text
-    assert not kinds(watch, after(other, 200))[-1]
+    nearer = after(other, round(8.0 * 1.45 * FPS), fps=1.45 * FPS)  # not back yet
+    assert {"rate"} in kinds(watch, nearer)[-20:]
+    assert not kinds(watch, after(nearer, 200))[-1]
 
 
 def test_a_short_hiccup_is_no_other_rate():

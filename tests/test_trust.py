@@ -6,7 +6,7 @@ Whatever happens, no frame is valid, nor any bound stated, that the truth is bey
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import msgspec
@@ -24,7 +24,7 @@ from gripmon.model.geometry import make_transform, perturb
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import Trust
+from gripmon.monitor.weigher import MISREAD_PROBABILITY, Trust
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
@@ -273,6 +273,39 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
     limit_m = PolicySettings().alert_limit_m
     assert bound_m[1.0, 0.0] < limit_m and bound_m[1.0, 1.0] < limit_m and bound_m[1e5, 0.0] < limit_m
     assert bound_m[1e5, 1.0] > 0.1
+
+
+def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
+    """One straight border stands in for both of them at once: behind it the mount may have been knocked."""
+    monitor = new_monitor()
+    for frame in frames_of(scene(BEGINS))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
+    near = np.array([along[edge] or names[edge] in ("L_tip_near", "R_tip_near") for edge in normal.edge])
+    on_one_line = replace(normal, **{part.name: getattr(normal, part.name)[near] for part in fields(normal)})
+    limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
+    for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
+        ends, seen = FingerEndsSeen(np.array(corners), np.array([3, 3])), replace(measurement, normal=sides_and)
+        assert weigher._misread(seen, ends, None) == pytest.approx(MISREAD_PROBABILITY**times)
+        trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
+        assert not (trust.proven or trust.displaced)
+        assert (trust.protection.position_m < limit_m) == (times > 1)
+
+
+def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pytest.MonkeyPatch):
+    ends, looked, hidden = Tracker.ends, [], set(range(BEGINS, BEGINS + 6))
+
+    def counted(tracker: Tracker, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+        looked.append(frame.seq)
+        seen = ends(tracker, frame, measurement, strict)
+        return replace(seen, seen=np.array([1, 0])) if frame.seq in hidden else seen
+
+    monkeypatch.setattr(Tracker, "ends", counted)
+    watched(scene(BEGINS + 12))
+    proved = [seq for seq in set(looked) if 4 <= seq < BEGINS]
+    assert len(proved) <= BEGINS / 4 and set(range(max(proved) + 4, BEGINS + 6)) <= set(looked)
 
 
 def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_than_they_exclude():

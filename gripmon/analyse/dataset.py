@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +24,7 @@ from gripmon import __version__
 from gripmon.analyse.stretches import Stretch, mountings_of
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
+from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Verdict
 
 TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
@@ -42,6 +43,7 @@ class Measured(msgspec.Struct, frozen=True):
     frames: int = 0
     own_reference: Annotated[bool, Meta(description="it was recalibrated from the episode's own images")] = False
     lens: Annotated[str, Meta(description="file or configuration: whose camera calibration")] = "configuration"
+    gripper: Annotated[str | None, Meta(description="gripper file by which it was measured")] = None
     stretches: tuple[Stretch, ...] = ()
     fault: str | None = None
     pictures: Annotated[tuple[bytes, ...], Meta(description="JPEGs of the first stretch and the last")] = ()
@@ -165,11 +167,10 @@ def write_dataset(
     mountings = _mountings(lines, covariances, level, tolerance_m, tolerance_rad)
     fresh = out / f".{TABLE}"
     shutil.rmtree(fresh, ignore_errors=True)
-    by_place = {(line.key, line.number): int(number) for line, number in zip(lines, mountings, strict=True)}
-    _write_table(journal, keys, by_place, fresh)
+    written = Written(out / TABLE, out / REPORT, lines, mountings)
+    _write_table(Rows(journal, written), keys, fresh)
     shutil.rmtree(out / TABLE, ignore_errors=True)
     fresh.rename(out / TABLE)
-    written = Written(out / TABLE, out / REPORT, lines, mountings)
     from gripmon.analyse.dataset_page import page
 
     write_atomically(out / REPORT, page(written, journal, name))
@@ -222,7 +223,6 @@ def _field(name: str, kind: pa.DataType, text: str) -> pa.Field:
 
 
 _F, _I, _S = pa.float64(), pa.int64(), pa.string()
-_POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 SCHEMA = pa.schema(
     [
         _field("episode", _S, "path below the dataset; of LeRobot with # and its number"),
@@ -234,7 +234,10 @@ SCHEMA = pa.schema(
         _field("frames", pa.int32(), "in the stretch"),
         _field("measured_share", _F, "of its frames with a transform of their own, 0 to 1"),
         _field("valid_share", _F, "of its frames whose transform was valid, 0 to 1"),
-        *(_field(f"cam_T_grip_{name}", _F, "maps gripper to camera coordinates; null: not measured") for name in _POSE),
+        *(
+            _field(f"cam_T_grip_{name}", _F, "maps gripper to camera coordinates; null: not measured")
+            for name in POSE_NAMES
+        ),
         _field("covariance", pa.list_(_F), "6 x 6 by rows, position (m) then rotation (rad), camera axes"),
         _field("protection_m", _F, "bound on the position error in each frame of the stretch; null: none"),
         _field("protection_rad", _F, "bound on the rotation error"),
@@ -253,6 +256,7 @@ SCHEMA = pa.schema(
         _field("motion_cause", _S, "most probable cause by the alerts; unknown: none is probable enough"),
         _field("own_reference", pa.bool_(), "recalibrated from this episode; false: against the configuration's"),
         _field("lens", _S, "whose camera calibration: file or configuration"),
+        _field("gripper", _S, "gripper file by which it was measured; null: none"),
         _field("reason", _S, "why there is no transform, or why frames weren't valid"),
         _field("picture", pa.binary(), "JPEG with what was measured; null: none"),
     ],
@@ -261,9 +265,10 @@ SCHEMA = pa.schema(
 
 
 def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int) -> dict[str, Any]:
-    row: dict[str, Any] = {
+    row: dict[str, Any] = dict.fromkeys(SCHEMA.names) | {
         "episode": measured.episode, "stretch": number, "verdict": Verdict.UNKNOWN.value, "frames": measured.frames,
-        "own_reference": measured.own_reference, "lens": measured.lens, "reason": measured.fault, "moved": None,
+        "own_reference": measured.own_reference, "lens": measured.lens, "gripper": measured.gripper,
+        "reason": measured.fault, "moved": None,
     }  # fmt: skip
     if stretch is None:
         return row
@@ -279,7 +284,7 @@ def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int
         "picture": measured.pictures[shown] if 0 <= shown < len(measured.pictures) else None,
     }  # fmt: skip
     if stretch.cam_T_grip is not None:
-        row |= {f"cam_T_grip_{name}": value for name, value in zip(_POSE, stretch.cam_T_grip, strict=True)}
+        row |= {f"cam_T_grip_{name}": value for name, value in zip(POSE_NAMES, stretch.cam_T_grip, strict=True)}
     if (motion := stretch.motion) is not None:
         row |= {
             "motion_ns": motion.stamp_ns, "motion_earliest_ns": motion.earliest_ns,
@@ -295,20 +300,28 @@ def moved(stretches: Sequence[Stretch]) -> bool:
     return len(stretches) > 1 or any(stretch.crept_m is not None for stretch in stretches)
 
 
-def _rows(journal: Journal, keys: Sequence[str], places: dict[tuple[str, int], int]) -> Iterator[tuple[str, Any]]:
-    for key in keys:
-        measured = journal.read(key)
-        for number, stretch in enumerate(measured.stretches or (None,)):
-            yield measured.camera, _row(measured, number, stretch, places[key, number])
+class Rows:
+    """The table's rows, made of the journal one episode at a time."""
+
+    def __init__(self, journal: Journal, written: Written) -> None:
+        self._journal = journal
+        numbered = zip(written.lines, written.mountings, strict=True)
+        self._mountings = {(line.key, line.number): int(number) for line, number in numbered}
+
+    def of(self, key: str) -> tuple[Measured, list[dict[str, Any]]]:
+        """Of an episode by a camera: a row for each stretch, one where there are none."""
+        measured = self._journal.read(key)
+        stretches = measured.stretches or (None,)
+        return measured, [_row(measured, n, stretch, self._mountings[key, n]) for n, stretch in enumerate(stretches)]
 
 
-def _write_table(journal: Journal, keys: Sequence[str], places: dict[tuple[str, int], int], folder: Path) -> None:
+def _write_table(rows: Rows, keys: Sequence[str], folder: Path) -> None:
     """``camera=NAME/part-N.parquet``, in the layout of Hive; a file's rows are in the order of ``keys``."""
     waiting: dict[str, list[dict[str, Any]]] = {}
     files: dict[str, tuple[pq.ParquetWriter, int, int]] = {}
 
     def put(camera: str) -> None:
-        rows = waiting.pop(camera)
+        some = waiting.pop(camera)
         writer, number, count = files.get(camera, (None, -1, _FILE_ROWS))
         if count >= _FILE_ROWS:
             if writer is not None:
@@ -317,13 +330,14 @@ def _write_table(journal: Journal, keys: Sequence[str], places: dict[tuple[str, 
             where = folder / f"camera={quote(camera, safe='')}"
             where.mkdir(parents=True, exist_ok=True)
             writer = pq.ParquetWriter(where / f"part-{number:05d}.parquet", SCHEMA, compression="zstd")
-        writer.write_table(pa.Table.from_pylist(rows, SCHEMA))
-        files[camera] = writer, number, count + len(rows)
+        writer.write_table(pa.Table.from_pylist(some, SCHEMA))
+        files[camera] = writer, number, count + len(some)
 
-    for camera, row in _rows(journal, keys, places):
-        waiting.setdefault(camera, []).append(row)
-        if len(waiting[camera]) >= _GROUP_ROWS:
-            put(camera)
+    for key in keys:
+        measured, made = rows.of(key)
+        waiting.setdefault(measured.camera, []).extend(made)
+        if len(waiting[measured.camera]) >= _GROUP_ROWS:
+            put(measured.camera)
     for camera in list(waiting):
         put(camera)
     for writer, _, _ in files.values():

@@ -40,6 +40,7 @@ from gripmon.model.records import Array
 
 FEWEST_POSES = 3
 LEAST_TURN_RAD = 5e-3
+"""How far a direction of the end-effector has to turn, root mean square over the orientations."""
 FALSE_OUTLIERS = 0.05
 """How many good poses of a whole data set may be left out, on average."""
 _ROUNDS, _ARM_ROUNDS = 20, 5
@@ -47,14 +48,15 @@ _LEAST_M, _LEAST_RAD = 1e-7, 1e-7
 _MOST_M, _MOST_RAD = 0.1, 0.5
 _STARTS = (1e-5, 2e-4, 3e-3)
 FARTHEST_M = 20.0
-"""No camera measures a target's pose beyond: such numbers are millimetres."""
+"""No camera measures a target's pose beyond, and no arm reaches farther from its base: such numbers are millimetres."""
 SUSPECT_RAD = 0.02
 """What is left of the rotations (each axis) from which it is asked whether another reading fits."""
 HOPELESS_RAD = 0.1
 """What no arm and no camera are off by."""
 _BETTER = 0.1
 _AGREEING = 0.7
-_OFFSETS = (1, -1, 2, -2)
+OFFSETS = (1, -1, 2, -2)
+"""Rows by which poses and images may be shifted against each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +315,7 @@ def _readings(cam_T_target: Array, base_T_ee: Array) -> Iterator[tuple[str, Arra
         "the poses fit with the arm's or the target's inverted: base_T_ee and cam_T_target; or --eye-in-hand is missing"
     )
     yield f"{text}, or too much", cam_T_target, np.linalg.inv(base_T_ee)
-    for offset in _OFFSETS:
+    for offset in OFFSETS:
         count = len(base_T_ee) - abs(offset)
         if count <= FEWEST_POSES:
             continue

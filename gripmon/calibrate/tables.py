@@ -17,7 +17,7 @@ import numpy as np
 from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
 from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.formats import as_number, read_mapping
-from gripmon.calibrate.robot_world import check_target_scale
+from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
@@ -38,8 +38,6 @@ POSE_COLUMNS = (
 )
 _UNIT = 1e-2
 _ORTHONORMAL = 1e-3
-_FARTHEST_M = 20.0
-"""No arm reaches farther from its base: such numbers are millimetres."""
 _TABLE = "a table of samples"
 _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
 
@@ -199,7 +197,7 @@ def checked_transform(matrix: Array, place: str) -> Array:
 def check_scale(base_T_ee: Array) -> None:
     """ValueError for poses (n, 4, 4) that no arm reaches."""
     far = float(np.median(np.linalg.norm(base_T_ee[:, :3, 3], axis=1)))
-    if far > _FARTHEST_M:
+    if far > FARTHEST_M:
         raise ValueError(
             f"the end-effector is {far:.4g} m from the base (median), which no arm reaches: millimetres? metres"
         )

@@ -14,7 +14,9 @@ DATASET          folder or URL; below it every episode that is found
 --config CONFIG  configuration (YAML) with gripper, camera and a rough reference; of its source section the opening
 --out DIR        where the results go; made if it is missing
 --camera NAME...  a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one)
+--gripper FILE...    other grippers that an episode may show; measured by the one that fits, or by none (a reason)
 --own-lens       the configuration's camera calibration, also where a file brings one
+--annotate DIR   also in the dataset's own format; DATASET itself: beside its recordings (not of LeRobot)
 --engine NAME    local (processes of this machine, the default) or ray (a Ray cluster)
 --workers N      processes of --engine local (default: as many as there are cores)
 --address HOST   of the Ray cluster, as ray.init takes it (default: the one that Ray finds, or this machine)
@@ -44,6 +46,7 @@ def _probability(text: str) -> float:
     config=REQUIRED, out=REQUIRED, engine={"choices": ("local", "ray")},
     workers=whole_number(1, 4096, "isn't a number of processes; 1 or more"),
     level=_probability, tolerance_mm=positive_number, tolerance_deg=positive_number, dataset=str, address=str,
+    annotate=str,
 )  # fmt: skip
 def dataset(arguments: Arguments) -> int:
     """Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
@@ -55,6 +58,9 @@ def dataset(arguments: Arguments) -> int:
       stretches/camera=NAME/part-00000.parquet   a row for each stretch without a motion, failures too
       report.html                                mountings over time, what failed, the worst episodes
       journal.jsonl                              what was measured: called again, only the rest is
+
+    With --annotate an MCAP for each recording (NAME.gripmon.mcap), and of LeRobot datasets a copy with columns
+    more, observation.extrinsics.CAMERA and observation.extrinsics_valid.CAMERA, whose videos are links.
     """
     from gripmon.daemon.dataset import measure_dataset
 
@@ -73,6 +79,8 @@ def dataset(arguments: Arguments) -> int:
             level=arguments.level or 0.01,
             tolerance_m=1e-3 * (arguments.tolerance_mm or 0.0),
             tolerance_rad=math.radians(arguments.tolerance_deg or 0.0),
+            annotate=arguments.annotate,
+            grippers=arguments.gripper or (),
             step=step,
         )
     good = found.episodes - found.failed

@@ -9,7 +9,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import fleet_table
-from gripmon.cli.common import NETWORK_OPTIONS, Arguments, Command, check_file, positive_number
+from gripmon.cli.common import (
+    NETWORK_OPTIONS,
+    PAGE_PORT,
+    PORT_OPTIONS,
+    Arguments,
+    Command,
+    announcer,
+    check_file,
+    positive_number,
+)
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
@@ -26,10 +35,17 @@ _OPTIONS = f"""
 --seconds S   end after so long (s); with --once 3 by default
 """
 
+_PAGE = f"""
+--web              show a page in the browser: pictures, alerts, proposals, and buttons for them
+--address ADDRESS  an address of this machine by which others reach the page; default: this machine only
+{PORT_OPTIONS.strip()}
+"""
+
 _EXAMPLES = """\
   gripmon watch
   gripmon watch --once --connect tcp/10.0.0.5:7447
   gripmon watch --alerts --out fleet-alerts.jsonl
+  gripmon watch --web --zenoh-config operator.json5
 
 exit codes: 0 done (--once, --seconds); 2 wrong usage; 3 with --once: no monitor is on the network;
 130 Ctrl-C"""
@@ -38,8 +54,8 @@ _ALERT_PERIOD_S = 0.2
 
 
 @Command(
-    "watch", "a live table of all monitors, or their alerts", _OPTIONS, _EXAMPLES,
-    period={"type": positive_number, "default": 1.0}, seconds=positive_number,
+    "watch", "a live table of all monitors, or their alerts", _OPTIONS, _EXAMPLES, {"the page": (None, _PAGE)},
+    period={"type": positive_number, "default": 1.0}, seconds=positive_number, port=PAGE_PORT,
 )  # fmt: skip
 def watch(arguments: Arguments) -> None:
     """A live table of all monitors on the network, the worst first: those that are gone, silent or have no
@@ -55,8 +71,15 @@ def watch(arguments: Arguments) -> None:
 
     With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
     when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.
+
+    With --web the same is a page, with what each monitor sees.  Its buttons send what gripmon send does:
+    where a router has rules they need an operator's certificate (--zenoh-config).
     """
     joined = arguments.network()
+    if arguments.web:
+        _serve(arguments, joined)
+        return
+    arguments.refuse(("address", "no_browser"), "is for the page; add --web")
     if arguments.out and not arguments.alerts:
         raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
     if arguments.alerts and (arguments.once or arguments.transforms):
@@ -82,6 +105,26 @@ def watch(arguments: Arguments) -> None:
             _live(fleet, arguments.period, end_s)
         else:
             _repeat(_Changes(fleet).show, arguments.period, end_s)
+
+
+def _serve(arguments: Arguments, joined: dict[str, Any]) -> None:
+    arguments.refuse(
+        ("once", "json", "alerts", "out", "transforms", "seconds"), "has no effect beside --web; leave it out"
+    )
+    from gripmon.client import Fleet
+    from gripmon.daemon.fleet_page import FleetSite
+    from gripmon.teach.page_server import ADDRESS, serve
+
+    address = arguments.address or ADDRESS
+    if address in ("0.0.0.0", "::"):
+        raise InputError(f"--address {address}: names no machine; the address by which others reach this one")
+    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # what is missing stands on the page
+    with arguments.network_errors():
+        opened = Fleet(**joined)
+    with opened as fleet:
+        serve(
+            FleetSite(fleet), arguments.port, announcer("watch"), open_browser=not arguments.no_browser, address=address
+        )
 
 
 def _open_log(arguments: Arguments) -> AlertLog:

@@ -17,9 +17,10 @@ to start, and nothing needs help when a monitor or a router ends and comes again
 from __future__ import annotations
 
 from gripmon.client.alert_log import AlertLog, Event
+from gripmon.client.asking import Ambiguous, NotCarriedOut
 from gripmon.client.fleet import Condition, Fleet, MonitorStatus, trouble
 from gripmon.client.network import MonitorName
-from gripmon.client.reader import Ambiguous, Client, NotCarriedOut
+from gripmon.client.reader import Client
 from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
 from gripmon.client.transforms import TransformClient
 

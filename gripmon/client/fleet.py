@@ -7,6 +7,7 @@ import logging
 import math
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import msgspec
 import zenoh
 import zenoh.ext
 
+from gripmon.client.asking import Asker, NotCarriedOut
 from gripmon.client.network import (
     Listener,
     MonitorName,
@@ -24,9 +26,20 @@ from gripmon.client.network import (
     named_as_arguments,
     reader_settings,
     start_of,
+    where_of,
 )
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
-from gripmon.model.records import AlertRecord, MessageRefused, Severity, StandingAlert, StateRecord, from_json
+from gripmon.model.records import (
+    AlertRecord,
+    CommandName,
+    CommandReply,
+    CommandRequest,
+    MessageRefused,
+    Severity,
+    StandingAlert,
+    StateRecord,
+    from_json,
+)
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 _log = logging.getLogger(__name__)
@@ -156,8 +169,11 @@ class Fleet(Listener):
         self._lock = threading.Lock()  # guards what is above against Zenoh's threads
         self._keys = Keys("*", "*")
         self._declared: list[object] = []  # Zenoh undeclares what is referred to no more
+        settings = reader_settings(connect, zenoh_config_file)
+        self._where = where_of(settings)
+        self._asker: Asker | None = None  # before there is a session
         with named_as_arguments():
-            self._link = Link(reader_settings(connect, zenoh_config_file))
+            self._link = Link(settings)
         self._link.attach(self._declare)
 
     def monitors(self) -> list[MonitorStatus]:
@@ -165,6 +181,22 @@ class Fleet(Listener):
         now_s = time.monotonic()
         with self._lock:
             return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
+
+    def send(
+        self,
+        monitor: MonitorName,
+        name: CommandName,
+        argument: str = "",
+        timeout_s: float = 5.0,
+        *,
+        monitor_id: str = "",
+    ) -> tuple[CommandReply, bytes | None]:
+        """Tell one of them something, as :meth:`gripmon.client.Client.send` does; with the reply what is attached to
+        it, a snapshot's image.  Raises as that does.
+        """
+        if self._asker is None:
+            raise NotCarriedOut(f"there is no connection to {self._where}")
+        return self._asker.ask(Keys(*monitor), CommandRequest(argument, uuid.uuid4().hex, monitor_id), name, timeout_s)
 
     def fault(self) -> str:
         """Why there is no session, in a few words; empty if there is one."""
@@ -176,6 +208,7 @@ class Fleet(Listener):
 
     def _declare(self, session: zenoh.Session) -> None:
         keys, tokens = self._keys, session.liveliness()
+        self._asker = Asker(session, self._where)
         self._declared = [
             session.declare_subscriber(keys["state"], in_zenohs_thread(self._take_state)),
             tokens.declare_subscriber(keys["alive"], in_zenohs_thread(self._take_token), history=True),

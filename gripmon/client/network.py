@@ -58,6 +58,12 @@ def reader_settings(connect: str | Sequence[str], zenoh_config_file: str | None)
     return PublishSettings(listen=(), connect=(connect,) if isinstance(connect, str) else tuple(connect))
 
 
+def where_of(settings: PublishSettings) -> str:
+    """Whom a reader connects to, for a person."""
+    file = settings.zenoh_config
+    return " or ".join(settings.connect) if file is None else f"what {file} names"
+
+
 @contextmanager
 def named_as_arguments() -> Iterator[None]:
     """A :class:`PublishError` names the argument of a client, not the key of the daemon's configuration."""

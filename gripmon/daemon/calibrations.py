@@ -27,7 +27,7 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.images import image_paths
+from gripmon.model.images import LARGEST_BYTES, image_paths
 from gripmon.model.provenance import Provenance, provenance_of
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, TargetError, checked, parse_target
@@ -36,7 +36,6 @@ from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
 
 _RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its estimates (JSON lines)"
-_LARGEST_BYTES = 1 << 30
 
 
 def read_calibrated(path: Path) -> Calibrated:
@@ -53,7 +52,7 @@ def read_calibrated(path: Path) -> Calibrated:
 def read_bytes(path: Path) -> bytes:
     """A file's content; :class:`~gripmon.model.errors.InputError` if it can't be read."""
     try:
-        if path.is_file() and path.stat().st_size > _LARGEST_BYTES:
+        if path.is_file() and path.stat().st_size > LARGEST_BYTES:
             raise InputError(f"{path}: is larger than 1 GB; {_RIGHT}")
         return path.read_bytes()
     except FileNotFoundError:

@@ -48,7 +48,6 @@ from gripmon.teach.accuracy import (
 from gripmon.teach.mounts import Mount
 from gripmon.teach.visibility import (
     FEWEST_CORNERS,
-    FEWEST_EDGES,
     SOUGHT_M,
     SOUGHT_RAD,
     Rig,
@@ -57,6 +56,7 @@ from gripmon.teach.visibility import (
     over_jaw,
     see,
 )
+from gripmon.track.edges.kernel import FEWEST_EDGES
 
 __all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
 

@@ -7,12 +7,11 @@ from typing import Protocol
 
 import msgspec
 
+from gripmon.io.publish.presence import CLOSE_WITHIN_S
 from gripmon.model.records import MonitorState, ReferenceRecord
 
 RETRY_S = 1.0
 """Pause before a state that could not be written is tried again."""
-
-_CLOSE_WITHIN_S = 1.0
 
 
 class StateSink(Protocol):
@@ -89,7 +88,7 @@ class StateKeeper:
             self._closing = True
             self._changed.notify()
         if self._thread is not None:
-            self._thread.join(_CLOSE_WITHIN_S)
+            self._thread.join(CLOSE_WITHIN_S)
         if self._sink is not None:
             self._sink.close()
 

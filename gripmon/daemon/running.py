@@ -26,7 +26,7 @@ from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
 from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
-from gripmon.model.records import Alert
+from gripmon.model.records import Alert, FrameRecord, Outlines
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.record.write import Recorder
 
@@ -52,19 +52,21 @@ def run(
     notices: Sequence[Alert] = (),
     duration_s: float | None = None,
     stop: StopRequest | None = None,
+    outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
     In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
     frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
     the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
-    from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`).  The logger
-    ``gripmon`` is left as the caller set it up (see :func:`gripmon.daemon.service.log_to_stderr`).
+    from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`); ``outlines``:
+    what snapshots show of the gripper.  The logger ``gripmon`` is left as the caller set it up (see
+    :func:`gripmon.daemon.service.log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
     """
-    with _closing(source, publisher, recorder, settings, estimates, stop, keeper) as opened:
+    with _closing(source, publisher, recorder, settings, estimates, stop, keeper, outlines) as opened:
         own = _faults(jaw, recorder, opened.lines, keeper)
         reports = reports or Reports()
         daemon = Daemon(
@@ -129,6 +131,7 @@ def _closing(
     lines: Path | None,
     stop: StopRequest | None,
     keeper: StateKeeper | None = None,
+    outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
 ) -> Iterator[_Opened]:
     """Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that."""
     stop = stop or StopRequest()
@@ -140,7 +143,7 @@ def _closing(
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(source.close)
         file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
-        snapshots = closing.enter_context(contextlib.closing(Snapshots()))
+        snapshots = closing.enter_context(contextlib.closing(Snapshots(outlines)))
         yield _Opened(stop, file, snapshots)
 
 

@@ -8,6 +8,7 @@ import os
 import queue
 import threading
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -16,7 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.neighbours import Asked
-from gripmon.model.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
+from gripmon.io.publish.presence import CLOSE_WITHIN_S
+from gripmon.model.errors import in_short
+from gripmon.model.records import (
+    CommandError,
+    CommandFault,
+    CommandReply,
+    Frame,
+    FrameRecord,
+    Outlines,
+    Snapshot,
+    SnapshotImage,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +39,6 @@ _LARGEST_FILE_BYTES = 40 << 20
 _JPEG_QUALITY = 95
 _WAITING_MOST = 2
 _NICENESS = 10  # the loop goes first
-_CLOSE_WITHIN_S = 1.0
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
@@ -47,9 +58,10 @@ class _Job(NamedTuple):
 
 
 class Snapshots:
-    """Completes replies in a thread of its own, which is started by the first."""
+    """Completes replies in a thread of its own, which is started by the first; ``outlines`` gives a record's."""
 
-    def __init__(self) -> None:
+    def __init__(self, outlines: Callable[[FrameRecord], Outlines] = lambda _: ()) -> None:
+        self._outlines = outlines
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
 
@@ -72,28 +84,28 @@ class Snapshots:
         """Complete what is in hand, if that takes no longer than a second."""
         if self._thread is not None:
             with contextlib.suppress(queue.Full):
-                self._jobs.put(None, timeout=_CLOSE_WITHIN_S)
-            self._thread.join(_CLOSE_WITHIN_S)
+                self._jobs.put(None, timeout=CLOSE_WITHIN_S)
+            self._thread.join(CLOSE_WITHIN_S)
 
     def _run(self) -> None:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # of this thread alone, on Linux
         while (job := self._jobs.get()) is not None:
             try:
-                _complete(job)
+                _complete(job, self._outlines(job.newest.record))
             except Exception as error:  # noqa: BLE001  said to the asker
                 _log.debug("snapshot", exc_info=error)
-                job.asked.answer(CommandError(CommandFault.INTERNAL, f"{type(error).__name__}: {error}"))
+                job.asked.answer(CommandError(CommandFault.INTERNAL, in_short(error)))
 
 
-def _complete(job: _Job) -> None:
+def _complete(job: _Job, outlines: Outlines) -> None:
     frame, record, judged_s = job.newest
     image, data, said = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
     if (encoded := encode(frame.image)) is not None:
         image, data = encoded
         said = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
     age_s = job.asked_s - judged_s
-    snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image)
+    snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image, outlines)
     text = f"frame {frame.seq}, {age_s:.2f} s old, {record.state}, transform {record.verdict}: {said}"
     job.asked.answer(msgspec.structs.replace(job.reply, text=text, snapshot=snapshot), data)
 

@@ -27,7 +27,7 @@ from gripmon.io.sources import Source
 from gripmon.judge.statefile import StateFile, StateFileError
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
+from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
 from gripmon.monitor import warm_up
 from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
@@ -153,7 +153,14 @@ def run_monitor(
             notices=_notices(kept),
             duration_s=duration_s,
             stop=stop,
+            outlines=lambda record: _outlines(config, record),
         )
+
+
+def _outlines(config: Config, record: FrameRecord) -> Outlines:
+    from gripmon.daemon.overlay import outlines_of  # what draws isn't loaded before someone asks
+
+    return outlines_of(config.camera, config.gripper, record)
 
 
 def _run_second(

@@ -42,7 +42,7 @@ from gripmon.model.records import (
     accepting,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import Recorder
+from gripmon.record.write import ROOM_POLL_S, Recorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -50,9 +50,6 @@ _T = TypeVar("_T")
 
 _RESTS_FOR = 3.0
 """After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
-
-_ROOM_POLL_S = 0.002
-"""Pause of a source that can wait for the recording."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
@@ -159,7 +156,7 @@ class Loop(ABC):
         self._obey()
         self._between()
         if not self._source.live and not self._recorder.has_room:
-            time.sleep(_ROOM_POLL_S)
+            time.sleep(ROOM_POLL_S)
             self._say_state(time.monotonic())
             return True
         try:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import deque
 from typing import Annotated, NamedTuple
 
 import msgspec
 
+from gripmon.io.wire.link import FIGURES
 from gripmon.judge.policy import AlertBook
 from gripmon.model.records import (
     Alert,
@@ -25,7 +25,6 @@ from gripmon.model.records import (
 )
 
 _RATE_OVER_FRAMES = 64
-_FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _UPDATE_S = 10.0
 """Pause between two reasons of what fails: a disk that is gone and then full is news; figures that change are not."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
@@ -242,7 +241,7 @@ class Watch:
 
 def _kind(message: str) -> str:
     """Without figures, which differ in every frame, and what comes behind a second colon."""
-    return _FIGURES.sub("", ":".join(message.split(":")[:2]))
+    return FIGURES.sub("", ":".join(message.split(":")[:2]))
 
 
 def _of_record(record: FrameRecord) -> Judged:

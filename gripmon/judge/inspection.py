@@ -8,8 +8,8 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, Image, Refusal
 
-_DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
-"""Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
+_DARK, _FLAT = 0.02, 0.01
+"""Parts of the full scale: nothing brighter is black, nothing as far from the top is white, no more spread is flat."""
 
 _FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
 
@@ -54,7 +54,7 @@ def _grey_levels(pixels: Image) -> tuple[Refusal, str] | None:
     if high <= _DARK * scale:
         said = f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
         return Refusal.BLACK, said + (_FEWER_BITS if pixels.dtype == np.uint16 and high > 0.0 else "")
-    if low >= _BRIGHT * scale:
+    if low >= (1.0 - _DARK) * scale:
         return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
     if high - low <= _FLAT * scale:
         return Refusal.FLAT, f"all pixels within {100.0 * (high - low) / scale:.1f} % of the full scale"

@@ -27,8 +27,7 @@ CONFIGURATION, MONITOR, OPERATOR = "configuration", "monitor", "operator"
 UNDO, RESET = "undo", "reset"
 """Origins of references that an operator brought back."""
 
-_UNIT_TOLERANCE = 1e-6
-_SYMMETRY_TOLERANCE = 1e-6
+_TOLERANCE = 1e-6  # of a quaternion's length, and of a normalised covariance's symmetry: files hold rounded numbers
 _ROUNDING = 1e-9
 
 
@@ -300,7 +299,7 @@ def _numbers_fault(references: Sequence[ReferenceRecord]) -> str:
         normalised = covariances / (scale[:, :, None] * scale[:, None, :])
         finite = np.isfinite(normalised).all(axis=(1, 2))
         normalised[~finite] = np.eye(6)
-        skewed = np.abs(normalised - np.swapaxes(normalised, 1, 2)).max(axis=(1, 2)) > _SYMMETRY_TOLERANCE
+        skewed = np.abs(normalised - np.swapaxes(normalised, 1, 2)).max(axis=(1, 2)) > _TOLERANCE
         indefinite = np.linalg.eigvalsh(normalised)[:, 0] < -_ROUNDING
     bad = np.flatnonzero(~finite | skewed | indefinite)
     return f"{references[bad[0]].reference_id}: no covariance" if len(bad) else ""
@@ -308,4 +307,4 @@ def _numbers_fault(references: Sequence[ReferenceRecord]) -> str:
 
 def _is_pose(transform: Transform) -> bool:
     numbers = np.array([*transform.translation_m, *transform.rotation_xyzw])
-    return bool(np.isfinite(numbers).all()) and abs(float(np.linalg.norm(numbers[3:])) - 1.0) < _UNIT_TOLERANCE
+    return bool(np.isfinite(numbers).all()) and abs(float(np.linalg.norm(numbers[3:])) - 1.0) < _TOLERANCE

@@ -25,13 +25,12 @@ from msgspec import Meta
 from scipy.linalg.lapack import dposv
 
 from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 
-GATE_SQUARE = 37.7
-"""Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of
-freedom).
-"""
+GATE_SQUARE = chi_square_limit(1e-6)
+"""Squared normalised innovation that normal errors exceed once in a million frames."""
 
 SETTLING, SETTLING_GATE = 20, 14.0
 """So many frames after a start a frame that is surprising by less starts the average again, and at once: what has just

@@ -18,8 +18,7 @@ from msgspec import Meta
 from gripmon.judge.inspection import FULL_SCALE, sparse
 from gripmon.model.compiled import COMPILES, compiled
 from gripmon.model.records import Cause, Frame, Image
-
-_NS = 1_000_000_000
+from gripmon.model.records.values import NS_PER_S
 
 RING_FRAMES = 8
 """Newest frames among which a frame that comes again is recognised: drivers that hang hand over a ring of buffers."""
@@ -37,19 +36,22 @@ FEWEST_INNER = 200
 
 SURE_FRAMES = 3
 """Frames that make sure: images with large parts that stand, stamps that stand, before it is the clock and not a frame
-that was handed over twice, and images of another kind, before it is another camera.
+that was handed over twice, and images of a kind, before it is the camera's own, or
+another camera.
 """
 
 CALM_FRAMES = 30
-"""Frames without a fault of their stamps after which the clock is right again."""
+"""Frames in a row without a fault of their stamps after which the clock is right again, or in which nothing looks wrong
+after which the evidence of a cause is forgotten.
+"""
 
-JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
+JUMP_PERIODS, JUMP_NS = 50.0, 5 * NS_PER_S
 """A stamp that is so many usual periods, and so long, after the one before has jumped."""
 
 BLOCK_INTERVALS = 8
 """Intervals that are taken together."""
 
-LEARN_BLOCKS, LEARN_NS = 6, 2 * _NS
+LEARN_BLOCKS, LEARN_NS = 6, 2 * NS_PER_S
 """Blocks, and the time that they span, from which the usual rate is learnt."""
 
 ARRIVALS, MOST_BLOCKS = 64, 512
@@ -60,9 +62,6 @@ REGULAR_INTERVAL_DEVIATION = 0.3
 
 DEPARTED, RETURNED = 1.6, 1.3
 """Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
-
-KIND_FRAMES = 5
-"""Frames in a row of one size and type after which that is the camera's own."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -175,7 +174,7 @@ class _Frozen:
         enough = max(self._settings.frozen_frames, FREEZE_TO_USUAL_RATIO * self._longest)
         settings = self._settings
         frozen_s = settings.frozen_s if self._coded < SURE_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
-        self._frozen |= self._run >= enough and lasted_ns >= _NS * frozen_s
+        self._frozen |= self._run >= enough and lasted_ns >= NS_PER_S * frozen_s
         if not self._frozen:
             return None
         text = f"the last {self._run} images repeat earlier ones to the bit: the camera, or its driver, is frozen"
@@ -281,12 +280,12 @@ class _Rate:
             return None
         half, odd = divmod(len(self._in_order_ns), 2)
         upper_ns = self._in_order_ns[half]
-        return _NS / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
+        return NS_PER_S / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
 
     def longest_ns(self, frames: int) -> float:
         """Longest time that so many frames take as long as nothing is wrong; infinite until it is known."""
         frames_per_s = self.frames_per_s
-        return math.inf if frames_per_s is None else frames * JUMP_PERIODS * _NS / frames_per_s
+        return math.inf if frames_per_s is None else frames * JUMP_PERIODS * NS_PER_S / frames_per_s
 
     def add(self, frame: Frame) -> StreamFault | None:
         last, self._last = self._last, (frame.seq, frame.stamp_ns)
@@ -318,13 +317,13 @@ class _Rate:
         for block in reversed(self._blocks):
             recent.append(block)
             lasted_ns += block.lasted_ns
-            if lasted_ns >= _NS * self._settings.rate_s:
+            if lasted_ns >= NS_PER_S * self._settings.rate_s:
                 break
         else:
             return
         slower = _middle_ns(recent) / usual_ns
         if max(slower, 1.0 / slower) > DEPARTED:
-            text = f"{_NS / (slower * usual_ns):.1f} frames a second arrive; {_NS / usual_ns:.1f} were usual"
+            text = f"{NS_PER_S / (slower * usual_ns):.1f} frames a second arrive; {NS_PER_S / usual_ns:.1f} were usual"
             self._fault = StreamFault("rate", Cause.CLOCK, text)
         elif max(slower, 1.0 / slower) < RETURNED:
             self._fault = None
@@ -370,7 +369,7 @@ class _Kind:
         self._run = self._run + 1 if kind == self._candidate else 1
         self._candidate = kind
         if self._own is None:
-            self._own = kind if self._run >= KIND_FRAMES else None
+            self._own = kind if self._run >= SURE_FRAMES else None
             return None
         if kind == self._own or self._run < SURE_FRAMES:
             return None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.robot_world import OFFSETS
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
 from gripmon.laser.refinement import PoseNoise, Refined, SpotProblem, refine, with_held_lens
@@ -23,6 +24,7 @@ from gripmon.laser.setup import (
     _vector,
     pose_jacobian,
 )
+from gripmon.laser.world import LEAST_NOISE_PX
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, to_record
 from gripmon.model.provenance import Provenance
@@ -44,8 +46,6 @@ contradicts the others.
 """
 MOST_CONTRADICTING = 1.0 / 3.0
 """Part of the orientations that may contradict the rest: beyond it no one knows which are right."""
-LEAST_NOISE_PX = 0.02
-"""Of spots, however much an arm's noise explains."""
 _NOISE_ROUNDS = 8
 
 
@@ -239,7 +239,6 @@ SUSPECT_PX = 3.0
 """Noise of spots from which it is asked whether the poses are what they are taken for."""
 LEAST_FITTING = 0.7
 """Part of the spots that has to fit another reading before it is named."""
-_OFFSETS = (1, -1, 2, -2)
 
 
 def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: CalibrationError | None) -> None:
@@ -277,7 +276,7 @@ def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
         everything,
         ("the rotations are the other way round: inverted, the spots fit ({agree}); base_R_ee"),
     )
-    for offset in _OFFSETS:
+    for offset in OFFSETS:
         count = len(base_T_ee) - abs(offset)
         own = slice(max(offset, 0), max(offset, 0) + count)
         other = slice(max(-offset, 0), max(-offset, 0) + count)

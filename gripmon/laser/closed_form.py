@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibrate.robot_world import LEAST_TURN_RAD
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.planar_start import SUBSET, planar_start
 from gripmon.laser.setup import LaserSetup, basis, origin_axes
@@ -34,8 +35,6 @@ FEWEST_SHIFTS = 6
 """Spots of an orientation: twelve equations for the eleven unknowns of its matrix."""
 FEWEST_ORIENTATIONS = 3
 """Two differ by a turn about one axis."""
-LEAST_TURN_RAD = 5e-3
-"""How far a direction of the end-effector has to turn, root mean square over the orientations."""
 ON_A_LINE = 3e-3
 """Second singular value over the first below which image points count as lying on a line."""
 FLAT = 1e-3

@@ -18,8 +18,8 @@ from msgspec import Meta
 from gripmon.calibrate.tables import Row, check_scale, pose_of, rows_of
 from gripmon.model.errors import InputError
 from gripmon.model.records import Array, Frame, Image, LaserPulse, PulseFault
+from gripmon.model.records.values import NS_PER_S
 
-_NS = 1_000_000_000
 _ENDS_KEPT = 256
 _MOST_WAITING = 64
 
@@ -96,8 +96,8 @@ class Matcher:
 
     def __init__(self, settings: PulseSettings) -> None:
         self._settings = settings
-        self._margin_ns = round(settings.margin_s * _NS)
-        self._history_ns = round(settings.history_s * _NS)
+        self._margin_ns = round(settings.margin_s * NS_PER_S)
+        self._history_ns = round(settings.history_s * NS_PER_S)
         self._kept = _Kept()
         self._waiting: list[_Waiting] = []
         self._done: deque[Pulse] = deque(maxlen=_ENDS_KEPT)
@@ -360,8 +360,8 @@ def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[ReportedPulse]:
 def _checked(stamp_ns: int, until_ns: int, row: Row, place: str) -> ReportedPulse:
     if until_ns <= stamp_ns:
         raise ValueError(f"{place}: until_ns is not after stamp_ns; when the laser went on, and when it went off")
-    if until_ns - stamp_ns > LONGEST_S * _NS:
-        length_s = (until_ns - stamp_ns) / _NS
+    if until_ns - stamp_ns > LONGEST_S * NS_PER_S:
+        length_s = (until_ns - stamp_ns) / NS_PER_S
         raise ValueError(f"{place}: lasts {length_s:.4g} s; {LONGEST_S:g} s at most, both stamps in nanoseconds")
     base_T_ee = pose_of(row, place)
     try:

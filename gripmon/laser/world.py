@@ -34,7 +34,7 @@ PARAMETERS = (
 COUNT = len(PARAMETERS)
 CAMERA, PLANE, LASER = slice(0, 6), slice(6, 9), slice(9, 13)
 LEAST_NOISE_PX = 0.02
-"""Of spots, however well a calibration's own fitted."""
+"""Of spots, however well a calibration's own fitted, and however much an arm's noise explains."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,11 @@ class NoResultError(RuntimeError):
     exit_code = 3
 
 
-def in_short(error: Exception) -> str:
-    """Any exception in one line for a person."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+def one_line(error: BaseException) -> str:
+    """What an exception of another library says, in one line; its type where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def in_short(error: BaseException) -> str:
+    """Any exception in one line for a person, with its type: for what no one has foreseen."""
+    return f"{type(error).__name__}: {one_line(error)}" if str(error).strip() else type(error).__name__

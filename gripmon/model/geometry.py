@@ -13,7 +13,7 @@ import numpy as np
 
 from gripmon.model.records import Array, Transform
 
-_SMALL_RAD = 1e-8
+SMALL_RAD = 1e-8
 _IDENTITY = np.eye(4)
 _THREE_HALVES = 1.5 * np.eye(3)
 
@@ -31,7 +31,7 @@ def exp_rotation(omega: Array) -> Array:
     x, y, z = float(omega[0]), float(omega[1]), float(omega[2])
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
-    if angle < _SMALL_RAD:
+    if angle < SMALL_RAD:
         s, c = 1.0 - squared / 6.0, 0.5 - squared / 24.0
     else:
         s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / squared
@@ -48,7 +48,7 @@ def log_rotation(rotation: Array) -> Array:
     """Rotation matrix (3, 3) -> rotation vector (3,), angle in [0, pi]."""
     x, y, z, w = quaternion_xyzw(rotation)
     sine = math.sqrt(x * x + y * y + z * z)
-    factor = 2.0 * math.atan2(sine, w) / sine if sine > _SMALL_RAD else 2.0 / w
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > SMALL_RAD else 2.0 / w
     return np.array([factor * x, factor * y, factor * z])
 
 

@@ -20,7 +20,9 @@ _SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
 IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
 LARGEST_BYTES = 1 << 30
 """More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+"""How such a file begins."""
+_PNG_END = b"IEND"
 _PNG_END_BYTES = 8
 """The last chunk's name and checksum."""
 
@@ -104,7 +106,7 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
         return None, f"the file can't be read: {error.strerror}"
     if not data:
         return None, "the file is empty"
-    if data.startswith(_PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
+    if data.startswith(PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
         return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
     try:
         # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.

@@ -45,6 +45,15 @@ class Minimum(Generic[S]):
     converged: bool
 
 
+def chi_square_limit(chance: float, dimensions: int = 6) -> float:
+    """Squared normalised size that so many normal errors exceed with the probability ``chance``."""
+    return float(chdtri(dimensions, chance))
+
+
+CONTRADICTION_SQUARE = chi_square_limit(1e-5)
+"""Of six numbers that contradict each other: noise exceeds it once in 100,000 frames, the default integrity risk."""
+
+
 def minimise(
     start: S,
     cost: Callable[[S], float],

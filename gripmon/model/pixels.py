@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import Frame, Image, Refusal
 
+BLUE, GREEN, RED = 0.114, 0.587, 0.299
+"""Luma weights of ITU-R BT.601."""
+
+GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
+"""The same in OpenCV's channel order."""
+
 
 class Pixels(NamedTuple):
     """How a pixel lies in memory.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the way to

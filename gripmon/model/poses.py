@@ -11,9 +11,8 @@ import numpy as np
 
 from gripmon.model import geometry
 from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.geometry import SMALL_RAD
 from gripmon.model.records import Array, Transform
-
-_SMALL_RAD = 1e-8
 
 
 @compiled
@@ -55,7 +54,7 @@ def _turn_between(from_T: Array, to_T: Array) -> Array:
 def _perturbation_between(from_T: Array, to_T: Array) -> Array:
     x, y, z, w = quaternion_of(_turn_between(from_T, to_T))
     sine = math.sqrt(x * x + y * y + z * z)
-    factor = 2.0 * math.atan2(sine, w) / sine if sine > _SMALL_RAD else 2.0 / w
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > SMALL_RAD else 2.0 / w
     out = np.empty(6)
     for i in range(3):
         out[i] = to_T[i, 3] - from_T[i, 3]
@@ -68,7 +67,7 @@ def _perturb(a_T_b: Array, xi: Array) -> Array:
     x, y, z = xi[3], xi[4], xi[5]
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
-    if angle < _SMALL_RAD:
+    if angle < SMALL_RAD:
         s, c = 1.0 - squared / 6.0, 0.5 - squared / 24.0
     else:
         s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / squared

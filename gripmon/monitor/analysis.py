@@ -7,22 +7,21 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from gripmon.judge.causes import CauseJudge
+from gripmon.judge.stream import CALM_FRAMES
 from gripmon.model.errors import in_short
 from gripmon.model.records import Array, Cause, EdgeEvidence, Explanation, Frame
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 
-CALM_FRAMES, LULL_FRAMES = 30, 3
-"""Frames in a row in which nothing looks wrong after which the evidence is forgotten, and up to which an explanation
-holds.
-"""
-
-FEWEST_FRAMES = 5
-"""Frames that must look wrong before it is said why: a change of light spoils one or two."""
+LULL_FRAMES = 3
+"""Frames in a row in which nothing looks wrong up to which an explanation holds."""
 
 GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
 """Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn,
 and after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
 """
+
+FEWEST_FRAMES = CONCLUDED_AT[0]
+"""Frames that must look wrong before it is said why: a change of light spoils one or two."""
 
 CONFIRMED_AFTER_S = 1.0
 """From a further conclusion's frame to the one that it counts in, where a cause is known, so that it isn't urgent; and

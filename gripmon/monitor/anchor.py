@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import MOST_SCATTER, SMALLEST_VARIANCE_RATIO
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 from gripmon.monitor.refits import SIGMA_INFLATION, Refits
@@ -22,9 +23,6 @@ from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, tell
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
-
-DISPLACED_SQUARE = 33.1
-"""Squared normalised distance that six normal errors exceed once in 100,000 times (chi-square)."""
 
 YOUNG_VARIANCE_RATIO = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
@@ -131,7 +129,7 @@ class Anchor:
         at = perturbation_between(self._base_T, cam_T_grip)
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
-        told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, DISPLACED_SQUARE)
+        told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
         return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
 
 

@@ -30,12 +30,10 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.standing import Standing
 from gripmon.track.edges import Measurement
+from gripmon.track.jaw import UNREPORTED_MOTION_SIGMAS
 
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
-
-JAW_SURPRISE = 5.0
-"""Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
 
 
 def flat(covariance: Array) -> tuple[float, ...]:
@@ -146,6 +144,6 @@ def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
     """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
     not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
     """
-    if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+    if abs(measurement.jaw_surprise) > UNREPORTED_MOTION_SIGMAS:
         return True
     return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY

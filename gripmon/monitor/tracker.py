@@ -18,7 +18,7 @@ from gripmon.track.edges import FingerEndsSeen, FingerMeter, FingertipMeter, Mea
 from gripmon.track.jaw import JawKnowledge
 
 USUAL_SHARE = 0.6
-"""Share of agreeing profiles that is expected before anything is known about this gripper."""
+"""Share of agreeing profiles that is expected before anything is known about this gripper, and when teaching."""
 
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""

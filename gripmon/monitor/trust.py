@@ -22,15 +22,12 @@ from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Trust, Weigher
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Trust, Weigher
 from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
 PROOF_EVERY_FRAMES = 4
-"""While the gripper is where it was, its ends are looked at in one of so many frames."""
-
-ONE_EDGE_PX = 2.0
-"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
+"""While the gripper is where it was, its ends are looked at in one of so many frames; also after one without proof."""
 
 ALONG_Z = np.array([0.0, 0.0, 1.0])
 """The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
@@ -69,6 +66,7 @@ class Integrity:
         self._frames = 0
         self._elsewhere = 0
         self._believed = False
+        self._ends_seen = False
 
     def look_state(self, reference: ReferenceRecord) -> LookRecord | None:
         """What survives a restart of the gripper's own look; None before it is learnt."""
@@ -146,10 +144,11 @@ class Integrity:
         weigh = self._weigher.weigh
         cam_T_grip, covariance = self._tracker.update(measurement)
         trust = weigh(measurement, cam_T_grip, None, now_s)
-        due = self._frames % PROOF_EVERY_FRAMES == 0
+        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+            self._ends_seen = trust.proven
         here = _Candidate(measurement, cam_T_grip, covariance, trust)
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)

@@ -16,9 +16,10 @@ from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import DISPLACED_SQUARE, Anchor, Lasting
+from gripmon.monitor.anchor import Anchor, Lasting
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -45,6 +46,9 @@ MISREAD_PROBABILITY = 0.1
 border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
 """
 
+ONE_EDGE_PX = 2.0
+"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
+
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
 
@@ -69,7 +73,8 @@ class Trust:
     ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
     ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
     explains that, too.  ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis;
-    None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
+    None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of, without the ends where it
+    needs none; None where no edge is seen.
     """
 
     protection: Protection
@@ -153,30 +158,39 @@ class Weigher:
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses = fits.hypotheses
         # What would need a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= DISPLACED_SQUARE
+        holds = anchored.surprise <= CONTRADICTION_SQUARE
         displaced = not holds[0] and explained is None
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else 1.0 if slid else MISREAD_PROBABILITY ** self.confirmations(measurement, ends, kept)
-        if displaced and not (proven or slid) and ends is not None:
-            proven = self._needs_no_ends(fits, cam_T_grip)
+        misread = 0.0 if proven else 1.0 if slid else self._misread(measurement, ends, kept)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
-        if self.anchor is None:
-            # A finger is taken to be straight at first; the ends may have been something else from that on.
-            lasting = ~hypotheses.sudden
-            lasting[hypotheses.ends] = True
-            now = protection_of(fits.doubts(cam_T_grip, prior).among(lasting), risk)
-            if displaced:
-                now = larger(now, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
-            return Trust(now, proven, displaced, ends=ends, fits=fits)
-        jumped = self._knocked(now_s - self.anchor.now_s, hidden=True) * prior[hypotheses.ends] > risk
-        if displaced or jumped:
-            all_along = fits.doubts(cam_T_grip, prior)  # what knocks the mount bends a finger, too
+        # How probable it is that only the frame tells where the fingers are along themselves.
+        alone = 1.0 if displaced or self.anchor is None else self._knocked(now_s - self.anchor.now_s, hidden=True)
+        jumped = alone * prior[hypotheses.ends] > risk
+        made_of = fits
+        if displaced or jumped or self.anchor is None:
+            counts = np.ones_like(hypotheses.sudden)  # what knocks the mount bends a finger, too
+            if self.anchor is None:
+                counts = ~hypotheses.sudden  # a finger is taken to be straight at first
+            rows = counts.copy()
+            rows[hypotheses.ends] = True
+            all_along = fits.doubts(cam_T_grip, prior).among(rows)
+            if jumped:
+                without, more = self._without_ends(measurement)
+                if displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
+                    proven, made_of = True, without
+                besides = alone * prior[hypotheses.ends] * hypotheses.prior
+                all_along += without.doubts(cam_T_grip, besides).among(counts & more)
         else:
             # The ends belong to where it was: what else may have been wrong all along the average knows, too.
             all_along = self.anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        if self.anchor is None:
+            now = protection_of(all_along, risk)
+            if displaced:
+                now = larger(now, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
+            return Trust(now, proven, displaced, ends=ends, fits=made_of)
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
@@ -185,7 +199,7 @@ class Weigher:
         if self._unexplained is not None:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        return Trust(protection, proven, displaced, ambiguous, most_probable, ends, fits)
+        return Trust(protection, proven, displaced, ambiguous, most_probable, ends, made_of)
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
@@ -195,7 +209,7 @@ class Weigher:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is not a vibration, but what rings after it is.
             noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, DISPLACED_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
+            self.swing = self.swing + (np.minimum(square, CONTRADICTION_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
         elif trust.displaced:
             # Knocked while no one watched, or marks on the fingers, or a wrong model: a person has to say.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
@@ -226,10 +240,22 @@ class Weigher:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
         further corner.  ``kept`` (v,): the measured edges that count.
         """
-        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
-        edge = edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
-        by_edge = set(self._gripper.edge_finger[edge].tolist())
+        by_edge = set(self._gripper.edge_finger[self._at_ends(measurement, kept)].tolist())
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
+
+    def _at_ends(self, measurement: Measurement, kept: NDArray[np.bool_] | None) -> NDArray[np.intp]:
+        """The edges at the fingers' ends that are seen."""
+        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+        return edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
+
+    def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
+        """Probability that ends that are seen where they are expected are none.  A single straight border shows what
+        edges on one line do, of whatever fingers they are.
+        """
+        times = self.confirmations(measurement, ends, kept)
+        if ends is not None and not ends.seen.any() and _on_one_line(measurement, self._at_ends(measurement, kept)):
+            times = min(times, 1)
+        return MISREAD_PROBABILITY**times
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
@@ -242,14 +268,17 @@ class Weigher:
         knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
-    def _needs_no_ends(self, fits: Refits, cam_T_grip: Array) -> bool:
-        """Whether a pose (4, 4) is as certain as it has to be though all that was taken for the fingers' ends is
-        something else: curved fingers tell by themselves where they are along themselves.
+    def _without_ends(self, measurement: Measurement) -> tuple[Refits, NDArray[np.bool_]]:
+        """The fits where all that was taken for the fingers' ends is something else, and (h,) which have more wrong."""
+        hypotheses, more = self._about(measurement.normal.edge)[0].without_ends()
+        return Refits(measurement, hypotheses, self._floor, self._model), more
+
+    def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
+        """Whether a pose (4, 4) is as certain as it has to be by some fits: by those without the ends it needs none.
+        Curved and tapered fingers tell by themselves where they are along themselves.
         """
-        hypotheses, policy = fits.hypotheses, self._policy
-        prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = 1.0
-        return past_alert_limit(protection_of(fits.doubts(cam_T_grip, prior), policy.integrity_risk), policy) is None
+        bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
+        return past_alert_limit(bound, self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The bound by what the first frames differ from the reference, ``away`` (6,)."""
@@ -300,6 +329,16 @@ def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
         return False
     expected = not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
     return ends.sure or expected or (again and ends.at_each)
+
+
+def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
+    """Whether some edges are seen on one straight line of the image."""
+    prediction = measurement.prediction
+    uv_px = prediction.uv_px[np.isin(prediction.layout.edge, edges) & prediction.ok]
+    if len(uv_px) == 0:
+        return True
+    off_px = uv_px - uv_px.mean(axis=0)
+    return bool(np.abs(off_px @ np.linalg.svd(off_px, full_matrices=False)[2][-1]).max() < ONE_EDGE_PX)
 
 
 def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:

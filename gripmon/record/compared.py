@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from gripmon.model.errors import one_line
 from gripmon.model.records import Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord
 from gripmon.record.columns import (
     APPLICATION_ID,
@@ -112,7 +113,7 @@ class ComparedRecorder(NullRecorder):
         try:
             self._stream.flush(timeout_sec=max(timeout_s, _FLUSH_TIMEOUT_S))
         except Exception as error:  # noqa: BLE001 - rerun raises its own kinds
-            self.failure = f"can't write {self._path}: {' '.join(str(error).split())}"
+            self.failure = f"can't write {self._path}: {one_line(error)}"
         self._stream.disconnect()
 
     def _has_space(self) -> bool:

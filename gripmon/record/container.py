@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gripmon.model.errors import one_line
+
 MAGIC = b"RRF2"
 _FILE_HEADER_BYTES = 12
 _MESSAGE = struct.Struct("<QQ")
@@ -193,8 +195,7 @@ class RrdFile:
 
     def _distrust_footer(self, error: Exception) -> None:
         self.has_footer = False
-        reason = " ".join(str(error).split()) or type(error).__name__
-        self.faults.append(f"has a footer that can't be used ({reason}); its messages were read one by one")
+        self.faults.append(f"has a footer that can't be used ({one_line(error)}); its messages were read one by one")
 
     def _note_where_it_ends(self, offset: int, damaged: bool) -> None:
         if damaged:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from gripmon import __version__
 from gripmon.model.atomic import opened_atomically, remove_leftovers
 from gripmon.model.errors import NoResultError
+from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import ReferenceRecord
 from gripmon.record.read import FrameTable, Recording, open_recordings, recording_files
 from gripmon.record.recordings import file_number
@@ -41,7 +42,6 @@ _CAUSES = pa.list_(pa.struct([("cause", pa.string()), ("probability", pa.float64
 _Column = tuple[str, pa.DataType, str, str]
 _DOUBLE, _INTEGER, _TEXT, _TRUTH = pa.float64(), pa.int64(), pa.string(), pa.bool_()
 
-_POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 _AXES = ("x", "y", "z")
 
 
@@ -49,7 +49,7 @@ def _pose_columns(name: str, what: str) -> list[_Column]:
     units = ("m",) * 3 + ("1",) * 4
     return [
         (f"{name}_{part}", _DOUBLE, unit, f"{what}: position of the TCP in camera axes, unit quaternion x, y, z, w")
-        for part, unit in zip(_POSE, units, strict=True)
+        for part, unit in zip(POSE_NAMES, units, strict=True)
     ]
 
 
@@ -340,7 +340,7 @@ def frame_rows(frames: FrameTable, recording_id: str, file_number: int) -> pa.Ta
     with np.errstate(invalid="ignore"):  # what is not a covariance has no deviation
         sigma_m = np.sqrt(np.diagonal(frames.covariance, axis1=1, axis2=2)[:, :3])
     axes = [f"{axis}_m" for axis in _AXES]
-    poses = (("cam_T_grip", frames.cam_T_grip, _POSE), ("smoothed", frames.smoothed, _POSE),
+    poses = (("cam_T_grip", frames.cam_T_grip, POSE_NAMES), ("smoothed", frames.smoothed, POSE_NAMES),
              ("tcp_shift", frames.tcp_shift_m, axes), ("sigma", sigma_m, axes))  # fmt: skip
     columns: dict[str, Any] = {
         "time": pa.array(frames.stamp_ns, pa.int64()).cast(_TIME),
@@ -383,7 +383,7 @@ def reference_row(reference: ReferenceRecord) -> pa.Table:
     row |= {"stamp_ns": stamp_ns, "time": stamp_ns, "frames_used": inputs.pop("frames", None), **inputs}
     pose = reference.cam_T_grip
     values = (*pose.translation_m, *pose.rotation_xyzw)
-    row |= {f"cam_T_grip_{part}": value for part, value in zip(_POSE, values, strict=True)}
+    row |= {f"cam_T_grip_{part}": value for part, value in zip(POSE_NAMES, values, strict=True)}
     row |= {"covariance": [reference.covariance[i] for i in UPPER]}
     return _table("references", [row])
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import rerun as rr
 
+from gripmon.model.errors import one_line
 from gripmon.record.columns import APPLICATION_ID, AnyRow, Writer
 from gripmon.record.container import free_closed_streams, is_complete
 from gripmon.record.keeping import (
@@ -319,7 +320,7 @@ class FileSeries:
             free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
         except OSError as missing:
             free = str(missing.strerror)
-        return f"can't write {path} ({free}): {' '.join(str(error).split())}"
+        return f"can't write {path} ({free}): {one_line(error)}"
 
     def _room_missing(self) -> str:
         try:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
+from gripmon.judge.policy.alerts import RANK
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from gripmon.record.columns import AnyRow
 
 PIN_SUFFIX = ".pinned"
-_RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 _MOMENTS_KEPT = 64
 _ALERTS_KEPT = 256
 _BUDGET_FREE_FRACTION = 0.1  # free when a file begins, or files would become ever smaller
@@ -56,7 +56,7 @@ class Trigger:
         self._rank: dict[str, int] = {}
 
     def by(self, alert: Alert | AlertRecord) -> bool:
-        rank = _RANK[alert.severity]
+        rank = RANK[alert.severity]
         if alert.event is AlertEvent.CLEARED:
             self._rank.pop(alert.alert_id, None)
             return False

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 from gripmon.record.container import MAGIC, RrdFile, UnreadableFileError
 from gripmon.record.contents import Contents, LineFile, read_contents, read_lines
@@ -176,8 +176,7 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
         faults.append(f"{path}: {error.strerror or error}; not used")
         return []
     except Exception as error:  # noqa: BLE001 - a file from anywhere must not end the reading of the others
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        faults.append(f"{path}: can't be read ({what:.200}); not used")
+        faults.append(f"{path}: can't be read ({in_short(error):.200}); not used")
         return []
     ours = [contents for contents in found if contents.is_ours and not contents.is_of_spots]
     if not ours and any(contents.is_of_spots for contents in found):

@@ -21,6 +21,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from gripmon.model.errors import in_short, one_line
 from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
 from gripmon.record.columns import APPLICATION_ID, AnyRow, Picture, Row, SpotRow, Writer
 from gripmon.record.files import FileSeries, make_writer
@@ -71,7 +72,7 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
         loop = RecordingLoop(scene, status_descriptor, memory_descriptor)
         loop.run(unframer, payloads[1:])
     except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
-        sys.stderr.write(f"recording process: {type(error).__name__}: {error}\n")
+        sys.stderr.write(f"recording process: {in_short(error)}\n")
         code = 1
     if loop is None or not loop.hangs:
         del loop  # a stream that is let go waits until its file is whole, or for ever if its writer has died
@@ -334,8 +335,7 @@ class LiveStream:
             self._stream = self._writer = None
             self._stalled = False
             self._retry_at = now_s + _RETRY_S
-            reason = " ".join(str(error).split())
-            self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({reason})"
+            self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({one_line(error)})"
 
     def _flush(self, stream: rr.RecordingStream) -> None:
         """Wait until it has been sent; a server that is gone fails at once, one that is held up in time."""

@@ -67,7 +67,7 @@ HANDOVER_PERIOD_S = 0.05
 LONGEST_RESTART_PAUSE_S = 30.0
 _BATCH_FRAMES = 16
 _FRAMES_A_TURN = 4  # before the interpreter lock is let go
-_ROOM_POLL_S = 0.002
+ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
 _LOSSES_PERIOD_S = 60.0  # between two lines about them
 _EVENTS_KEPT = 4096  # while the process is away
@@ -233,7 +233,7 @@ class ProcessRecorder:
     def _wait_for_room(self) -> None:
         end = time.monotonic() + self._patience_s
         while not self.has_room and time.monotonic() < end:
-            time.sleep(_ROOM_POLL_S)
+            time.sleep(ROOM_POLL_S)
 
     def _image_is_due(self, stamp_ns: int) -> bool:
         every = self._settings.image_every
@@ -246,11 +246,11 @@ class ProcessRecorder:
 
     def _run(self) -> None:
         try:
-            while not self._closing.wait(HANDOVER_PERIOD_S if self._patience_s == 0.0 else _ROOM_POLL_S):
+            while not self._closing.wait(HANDOVER_PERIOD_S if self._patience_s == 0.0 else ROOM_POLL_S):
                 self._hand_over()
             self._hand_over()
             while self._frames and self._worker is not None and time.monotonic() < self._close_before:
-                time.sleep(_ROOM_POLL_S)
+                time.sleep(ROOM_POLL_S)
                 self._hand_over()
         except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
             _log.exception("recording stopped")

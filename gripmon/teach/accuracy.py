@@ -18,9 +18,10 @@ from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
-from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind, see
+from gripmon.teach.visibility import Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.kernel import FEWEST_EDGES
+from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 from gripmon.track.edges.profiles import Candidates, Edgels
 from gripmon.track.edges.robust_fit import RobustFit
 from gripmon.track.edges.uncertainty import Uncertainty, assess

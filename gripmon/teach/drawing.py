@@ -74,7 +74,7 @@ def enlargement(largest_px: float, to_px: float) -> int:
 
 
 _ENLARGED_TO_PX = 12.0  # the largest offset is drawn at most so long
-_SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
+_SHARP_BGR, OUTLINE_BGR, CREASE_BGR, CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
 _TEXT_BGR = (255, 255, 255)
 _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
 _MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
@@ -94,7 +94,7 @@ def draw_taught(
     largest_px = max((float(np.nanmax(np.abs(shift))) for _, shift in lines.values()), default=0.0)
     enlarged = enlargement(largest_px, _ENLARGED_TO_PX)
     for edge, (uv_px, shift_px) in lines.items():
-        colour = _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR
+        colour = CREASE_BGR if taught.crease[edge] else OUTLINE_BGR
         canvas.line(uv_px, _SHARP_BGR)
         canvas.line(uv_px + enlarged * shift_px, colour)
         middle, shift = uv_px[len(uv_px) // 2], shift_px[len(uv_px) // 2]
@@ -105,11 +105,11 @@ def draw_taught(
         f"offsets in px, drawn {enlarged} times as large",
     )
     for name, corner in model.corners.items():
-        canvas.circle(np.array(corner.uv_px), 5.0, _CORNER_BGR)
-        labels.put(name, canvas.pixel(np.array(corner.uv_px)), _CORNER_BGR)
+        canvas.circle(np.array(corner.uv_px), 5.0, CORNER_BGR)
+        labels.put(name, canvas.pixel(np.array(corner.uv_px)), CORNER_BGR)
     for edge, (uv_px, shift_px) in lines.items():
         text = f"{gripper.edge_ids[edge]} {np.linalg.norm(shift_px[len(uv_px) // 2]):.2f}"
-        labels.put(text, canvas.pixel(uv_px[len(uv_px) // 2]), _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR)
+        labels.put(text, canvas.pixel(uv_px[len(uv_px) // 2]), CREASE_BGR if taught.crease[edge] else OUTLINE_BGR)
     return canvas.picture
 
 

@@ -62,7 +62,7 @@ class Placed:
     """Outlines in space at unit depth of the TCP.  ``points`` for each finger (v, 3) in the camera frame, NaN where
     not known; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some are taken to
-    lie in the plane of their sides.
+    lie in the plane of their sides; ``by_motion``: depths are from how fingers moved with the jaws.
     """
 
     points: tuple[Array, ...]
@@ -72,6 +72,7 @@ class Placed:
     flat: bool
     sigma_rad: Array
     round_tips: bool = False
+    by_motion: bool = False
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
@@ -96,7 +97,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     ]
     tips = [sorted(tip) for tip, _ in runs]
     if rotation is None or tcp is None:
-        inner = _innermost([p[t] for p, t in zip(points, tips, strict=True)])
+        inner = innermost([p[t] for p, t in zip(points, tips, strict=True)])
         # Between the fingers, where they end: what is innermost of round tips lies farther back.
         tcp = np.mean(inner, axis=0)
         tcp = tcp + direction * float(direction @ (plane_at - tcp))
@@ -299,7 +300,7 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         outwards = np.sum([f.outwards for f in fingers], axis=0)
         direction = np.array([*outwards, 0.0]) - facing * float(facing[:2] @ outwards)
         direction /= np.linalg.norm(direction)
-        inner = _innermost(points) if len(points) > 1 else [points[0][tips[0]]]
+        inner = innermost(points) if len(points) > 1 else [points[0][tips[0]]]
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, facing)
@@ -307,7 +308,7 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
     return Placed(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, True, sigma)
 
 
-def _innermost(tips: Sequence[Array]) -> list[Array]:
+def innermost(tips: Sequence[Array]) -> list[Array]:
     """Middle (3,) of what each finger's tip (v, 3) shows nearest to the others, first and last; of one its own."""
     points = [tip[np.isfinite(tip).all(axis=1)] for tip in (tips[0], tips[-1])]
     if len(tips) == 1:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -25,10 +26,12 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
 from gripmon.teach.finger_depth import Placed, place
 from gripmon.teach.image_drawing import draw_outlines
-from gripmon.teach.image_model import Seen, build_model, finger_outlines, tip_width
-from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, motion_of
+from gripmon.teach.image_model import Seen, as_gaps, build_model, finger_outlines, tip_width
+from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, check_opened, motion_of
 from gripmon.teach.image_outline import OpeningSeen, see_opening
-from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, smallest_noise
+from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
+from gripmon.teach.motion_depth import place_by_motion
+from gripmon.teach.prongs import apart_by_motion
 from gripmon.track.edges.taught import gripper_digest
 
 MOST_IMAGES = 200
@@ -132,14 +135,15 @@ def gripper_from_images(
     taken = list(images_of_one_camera(images))
     for file, image in taken:
         check_size(file, image, camera.width_px, camera.height_px)
-    groups = _groups(openings_m, len(taken))
-    first, *others = groups
     least = smallest_noise(taken[0][1])
+    grey = [grey_levels(image) for _, image in taken]
+    groups = _groups(openings_m, grey, least)
+    first, *others = groups
     notes: list[str] = []
     left_out: dict[str, str] = {}
 
     def see(indices: Sequence[int]) -> OpeningSeen:
-        found = see_opening(made, [grey_levels(taken[k][1]) for k in indices], least, step)
+        found = see_opening(made, [grey[k] for k in indices], least, step)
         left_out.update({taken[indices[k]][0]: why for k, why in found.left_out.items()})
         return found
 
@@ -153,17 +157,28 @@ def gripper_from_images(
                 )
                 continue
             around[opening] = see(groups[opening])
+        pronged = apart_by_motion(made, seen, around.values())
+        if pronged is not None:
+            seen = pronged
+            notes.append("what joins the fingers in the image, and stays where it is as they move, isn't used")
         outlines = finger_outlines(made, seen)
         pose = None if reference is None else reference[0]
-        placed = place(
-            outlines,
-            None if pose is None else pose[:3, :3],
-            None if pose is None else pose[:3, 3] / pose[2, 3],
-        )
+        at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
+        placed = place(outlines, *(at or (None, None)))
+        if placed.flat:
+            placed = place_by_motion(made, outlines, seen, list(around.values()), at) or placed
         moved = _motions(made, seen, placed, around, notes)
         step()
+    if openings_m is None and around:
+        check_opened(moved, [len(own) for own in groups.values()])
     opening_m = first if openings_m is not None else None
     scale = _scale(placed, distance_m, finger_width_m, reference, moved, opening_m)
+    if openings_m is None and moved:
+        opening_m, moved = as_gaps(placed, moved, scale[0])
+        notes.append(
+            f"openings: the gap between the fingertips, as the images show it, {1e3 * min(opening_m, *moved):.2f} to "
+            f"{1e3 * max(opening_m, *moved):.2f} mm; what the jaws report may be another number"
+        )
     described = Seen(made, seen, outlines, placed, moved, scale[0], opening_m)
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
@@ -220,11 +235,13 @@ def _spread(openings_m: Sequence[float | None]) -> float:
     return max(values) - min(values) if values else 0.0
 
 
-def _groups(openings_m: Sequence[float | None] | None, count: int) -> dict[float, list[int]]:
-    """Indices of the images of each opening; the one with most images first."""
+def _groups(
+    openings_m: Sequence[float | None] | None, grey: Sequence[NDArray[np.float32]], least_noise: float
+) -> dict[float, list[int]]:
+    """Indices of the images of each opening; the one with most images first.  Unknown openings have numbers."""
     if openings_m is None:
-        return {0.0: list(range(count))}
-    order = sorted(range(count), key=lambda k: openings_m[k] or 0.0)
+        return {float(k): own for k, own in enumerate(image_sets(grey, least_noise))}
+    order = sorted(range(len(grey)), key=lambda k: openings_m[k] or 0.0)
     runs: list[list[int]] = [[order[0]]]
     for k in order[1:]:
         apart = (openings_m[k] or 0.0) - (openings_m[runs[-1][0]] or 0.0)
@@ -244,9 +261,9 @@ def _groups(openings_m: Sequence[float | None] | None, count: int) -> dict[float
 
 def _motions(
     camera: Camera, seen: OpeningSeen, placed: Placed, around: Mapping[float, OpeningSeen], notes: list[str]
-) -> dict[float, list[FingerMoved]]:
+) -> dict[float, Sequence[FingerMoved]]:
     """How each finger moved to each other opening; openings at which one isn't found are left out, and noted."""
-    out = {}
+    out: dict[float, Sequence[FingerMoved]] = {}
     for opening, other in around.items():
         moved = [
             motion_of(camera, finger.mask, finger.outwards, points, kept, seen, other)
@@ -321,6 +338,8 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
         )
+    if placed.by_motion:
+        notes.append("depths are from the fingers' motion: both are taken to move equally far, against each other")
     if placed.round_tips:
         notes.append(
             "round fingertips are taken to lie in the plane of their sides. Corrections of the camera's tilt, and of "

@@ -72,15 +72,33 @@ def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
 
 def tip_width(placed: Placed) -> float:
     """Of a fingertip across the jaws at unit depth: mean over the fingers."""
-    widths = []
-    for points in placed.points:
-        local = (points[np.isfinite(points).all(axis=1)] - placed.tcp) @ placed.rotation
-        # What lies within a tenth of the finger's length of its tip.
-        tip = local[local[:, 2] > local[:, 2].max() - 0.1 * float(np.ptp(local[:, 2]))]
-        widths.append(float(np.ptp(tip[:, 0])))
+    widths = [float(np.ptp(across)) for across in _tips_across(placed)]
     if not min(widths) > 0.0:
         raise NoResultError("no fingertip's width is seen; --distance M, or --reference FILE")
     return float(np.mean(widths))
+
+
+def as_gaps(
+    placed: Placed, moved: Mapping[float, Sequence[FingerMoved]], depth_m: float
+) -> tuple[float, dict[float, Sequence[FingerMoved]]]:
+    """The gap between the fingertips (m) that was shown, and the motions by the gaps at the other openings."""
+    first, *_, last = _tips_across(placed)
+    gap = float(last.min() - first.max())
+    by_gap = {}
+    for fingers in moved.values():
+        more = float((fingers[-1].shift - fingers[0].shift) @ placed.rotation[:, 0])
+        by_gap[round(max(gap + more, 0.0) * depth_m, 6)] = fingers
+    return round(gap * depth_m, 6), by_gap
+
+
+def _tips_across(placed: Placed) -> list[Array]:
+    """Where the vertices of each finger's tip lie across the jaws, at unit depth."""
+    out = []
+    for points in placed.points:
+        local = (points[np.isfinite(points).all(axis=1)] - placed.tcp) @ placed.rotation
+        # What lies within a tenth of the finger's length of its tip.
+        out.append(local[local[:, 2] > local[:, 2].max() - 0.1 * float(np.ptp(local[:, 2])), 0])
+    return out
 
 
 def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: list[str]) -> GripperModel:

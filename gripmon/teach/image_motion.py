@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,16 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
+from gripmon.teach.matte import sets_refused
 from gripmon.teach.silhouette import FOLDS, Stations, in_image, inner_side, measure_transitions
 from gripmon.teach.straight_pieces import jackknife_sigma
 
 SAME_OPENING_M = 5e-5
 """Openings this close are one: some 0.2 px of each finger, 100 mm away."""
 FEWEST_STATIONS = 20
+STATIONS = 40
+"""On each edge."""
 TIP_SHARE = 0.35
 """Of a finger's length: its tip, which is at one depth."""
+ROUGH_STEP_PX = 2.0
+"""Of a shift that is only roughly known: it is found in images of half the size."""
 _FAR_PX = 260
 """How far a finger is searched for, each way."""
 
@@ -50,11 +57,9 @@ def motion_of(
     """The motion of a finger from one opening to another: its ``mask`` (h, w), ``outwards`` (2,) and ``points`` (v, 3)
     at unit depth of the first, camera frame.  None where the other opening doesn't show it.
     """  # fmt: skip
-    rough = _rough_shift_px(mask, outwards, first, other)
-    if rough is None:
-        return None
+    rough = rough_shift_px(mask, outwards, first, other)
     at = _samples(points, pieces)
-    normal = _normals(camera, at, mask)
+    normal = normals(camera, at, mask)
     shift = np.array([rough[0], rough[1], 0.0]) / camera.fx_px * float(np.median(at[:, 2]))
     folds, rms = np.zeros((FOLDS, 3)), np.inf
     for turn in range(4):
@@ -72,10 +77,35 @@ def motion_of(
     return FingerMoved(shift, folds, rms)
 
 
-def _rough_shift_px(mask: NDArray[np.bool_], outwards: Array, first: OpeningSeen, other: OpeningSeen) -> Array | None:
-    """Whole pixels by which the finger's tip moved: what is nearer to the camera moves by more."""
+def check_opened(moved: Mapping[float, Sequence[FingerMoved]], counts: Sequence[int]) -> None:
+    """Raise :class:`~gripmon.model.errors.NoResultError` where sets of so many images (``counts``), which stay the same
+    in different places, aren't of one gripper at several openings: at those its fingers move against each other.
+    """
+    if len(moved) + 1 < len(counts):
+        raise sets_refused(counts)
+    for fingers in moved.values():
+        shifts = np.array([finger.shift for finger in fingers])
+        together = float(np.linalg.norm(0.5 * (shifts.min(axis=0) + shifts.max(axis=0))))
+        if together > float(np.linalg.norm(np.ptp(shifts, axis=0))):
+            raise NoResultError(
+                f"the images fall into sets of {' and '.join(map(str, counts))}, between which all that stays has "
+                "moved together: the camera moved; a camera fixed to the gripper, jaws alone that move"
+            )
+
+
+def rough_shift_px(
+    mask: NDArray[np.bool_],
+    outwards: Array,
+    first: OpeningSeen,
+    other: OpeningSeen,
+    part: tuple[float, float] = (0.0, TIP_SHARE),
+) -> Array:
+    """Whole pixels by which a part of the finger moved, of its length from its tip on: what is nearer to the camera
+    moves by more.
+    """
     ahead = np.indices(mask.shape)[::-1].transpose(1, 2, 0) @ outwards
-    tip = ahead > float(ahead[mask].max()) - TIP_SHARE * float(np.ptp(ahead[mask]))
+    behind = (float(ahead[mask].max()) - ahead) / float(np.ptp(ahead[mask]))
+    tip = (behind >= part[0]) & (behind <= part[1])
     mask = mask & tip
     outline = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     known = (mask | (tip & (cv2.dilate(outline, np.ones((17, 17), np.uint8)) > 0))).astype(np.uint8)
@@ -93,20 +123,20 @@ def _rough_shift_px(mask: NDArray[np.bool_], outwards: Array, first: OpeningSeen
         half[0].astype(np.float32), half[1].astype(np.float32), cv2.TM_SQDIFF, mask=(half[2] > 127).astype(np.float32)
     )
     _, _, best, _ = cv2.minMaxLoc(score)
-    return np.array([2.0 * best[0] - _FAR_PX, 2.0 * best[1] - _FAR_PX])
+    return np.array([ROUGH_STEP_PX * best[0] - _FAR_PX, ROUGH_STEP_PX * best[1] - _FAR_PX])
 
 
 def _samples(points: Array, pieces: tuple[tuple[int, int], ...]) -> Array:
     """Rows of a point in space and the direction of its edge (n, 6), evenly along the edges."""
     out = []
     for a, b in pieces:
-        share = np.linspace(0.03, 0.97, 40)[:, None]
+        share = np.linspace(0.03, 0.97, STATIONS)[:, None]
         way = points[b] - points[a]
         out.append(np.column_stack([points[a] + share * way, np.tile(way, (len(share), 1))]))
     return np.vstack(out)
 
 
-def _normals(camera: Camera, at: Array, mask: NDArray[np.bool_]) -> Array:
+def normals(camera: Camera, at: Array, mask: NDArray[np.bool_]) -> Array:
     """Across the edges in the image (n, 2), away from the finger."""
     uv, d_uv = camera.project_with_jacobian(at[:, :3])
     tangent = np.einsum("nij,nj->ni", d_uv, at[:, 3:])

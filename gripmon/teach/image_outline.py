@@ -87,6 +87,19 @@ def see_opening(
     return OpeningSeen(matte, fingers, left_out, found.blur_px)
 
 
+def see_parts(
+    camera: Camera, seen: OpeningSeen, parts: Sequence[NDArray[np.bool_]], outwards: Sequence[Array]
+) -> OpeningSeen:
+    """The same images with ``parts`` (h, w) of what stays as the fingers, and the ways (2,) to their tips: where one
+    is cut off from the rest isn't outline.
+    """
+    contours = [(part, contour) for part in parts for contour in trace(part, SHORTEST_CONTOUR_PX)]
+    rest = seen.matte.still & ~np.any(parts, axis=0)
+    fingers = _fingers(camera, seen.matte, contours, seen.blur_px, lambda: None, rest)
+    ways = {id(part): way for part, way in zip(parts, outwards, strict=True)}
+    return replace(seen, fingers=tuple(replace(f, outwards=ways[id(f.mask)]) for f in fingers))
+
+
 def _parts(still: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     count, labels = cv2.connectedComponents(still.astype(np.uint8), connectivity=4)
     return [labels == k for k in range(1, count)]
@@ -145,12 +158,20 @@ def _fingers(
     contours: list[tuple[NDArray[np.bool_], Array]],
     blur_px: float,
     step: Callable[[], None],
+    rest: NDArray[np.bool_] | None = None,
 ) -> tuple[FingerSeen, ...]:
-    """Each part with its chains, those with one at least, from left to right (or from top to bottom)."""
+    """Each part with its chains, those with one at least, from left to right (or from top to bottom); ``rest`` (h, w)
+    of what stays, that a part was cut off from.
+    """
     chains: dict[int, list[Chain]] = {}
     masks: dict[int, NDArray[np.bool_]] = {}
     for part, contour in contours:
         stations = stations_along(contour, part, BORDER_PX)
+        if rest is not None:
+            ahead = np.clip(
+                np.rint(contour + BORDER_PX * stations.normal).astype(int), 0, np.array(rest.shape[::-1]) - 1
+            )
+            stations = replace(stations, inside=stations.inside & ~rest[ahead[:, 1], ahead[:, 0]])
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         for run, closed in runs(found.usable, points):
@@ -190,6 +211,12 @@ def _outwards(mask: NDArray[np.bool_]) -> Array:
         root = centre.copy()
         nearest = int(gaps.argmin())
         root[nearest % 2] = 0.0 if nearest < 2 else last[nearest % 2]
+    return outwards_from(mask, root)
+
+
+def outwards_from(mask: NDArray[np.bool_], root: Array) -> Array:
+    """Way (2,) in the image from a part's root (2,) to what is farthest from there."""
+    points = np.argwhere(mask)[:, ::-1].astype(float)
     # The outermost hundredth: one pixel is not a tip.
     away = np.linalg.norm(points - root, axis=1)
     tip = points[away >= np.quantile(away, 0.99)].mean(axis=0)

@@ -13,10 +13,10 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import TUKEY, tukey_weights
 from gripmon.model.records import Array
 from gripmon.track.edges.prediction import STRETCH
+from gripmon.track.edges.robust_fit import GATE_PX
 
 _START_PX = 1.0  # half width of a line while it is looked for: two lines closer than this are one to a blurred image
 _FLOOR_PX = 0.05  # the scatter of edge points is never taken to be less: pixels are that coarse
-_GATE_PX = 0.5  # a profile shows the line if it has an edge point closer to it
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
 _FEWEST = 6
@@ -114,7 +114,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
     # Neighbours see the same pixels and the same texture: a whole stretch of them is worth one.
     rms_px = float(np.sqrt(np.mean(np.square(residual[inlier]))))
     covariance = np.linalg.inv(design[inlier].T @ design[inlier]) * max(rms_px, scale) ** 2 * STRETCH
-    shown = np.unique(points.profile[np.abs(residual) < _GATE_PX])
+    shown = np.unique(points.profile[np.abs(residual) < GATE_PX])
     return Line(ends_px, covariance, inlier, rms_px, len(shown) / max(int(points.profiles.sum()), 1))
 
 

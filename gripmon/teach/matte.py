@@ -7,16 +7,20 @@ the background doesn't.  Robust statistics over images throughout: a shadow or a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import linkage
+from scipy.spatial.distance import squareform
 
 from gripmon.model.errors import NoResultError
+from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.profiles import GREY_BGR, full_scale, quantum
+from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 10
 """Images of one opening: the scatter of ten is known to 24 % (1 / sqrt(2 (n - 1)))."""
@@ -29,6 +33,11 @@ FEWEST_STILL_SHARE = 0.005
 """Of the image: less is not a fingertip that could be tracked (0.5 % of 640 x 480 px is 40 x 38 px)."""
 ALIKE_SHARE = 0.8
 """Part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
+MOST_DILUTION = 0.01
+"""Of a gain, by noise: over 100 grey levels between a finger's faces one grey level."""
+_MEDIAN_VARIANCE = 1.57
+"""Of a median over that of a mean."""
+_AROUND = np.ones((3, 3), np.uint8)
 _STEP = 3
 _ROUNDS = 3
 _MAD = 1.4826
@@ -93,40 +102,75 @@ def find_matte(
                 "stand, sharp images"
             )
         stack, kept = stack[~bad], kept[~bad]
-    _check_one_set(stack, noise)
+    sets = _sets(np.ascontiguousarray(stack[:, :: _STEP + 1, :: _STEP + 1]), noise)
+    if len(sets) > 1:
+        raise sets_refused([len(own) for own in sets])
     return Matte(mean, scatter, still, noise, stack, tuple(kept.tolist()), left_out)
 
 
-def _check_one_set(stack: NDArray[np.float32], noise: float) -> None:
-    """Raise :class:`NoResultError` where the images fall into two sets, each of which stays the same in places where
-    the other one doesn't: what both share is then no gripper.
+def sets_refused(counts: Sequence[int]) -> NoResultError:
+    """Of so many images each, that are not of one gripper."""
+    said = " and ".join(map(str, counts))
+    return NoResultError(
+        f"the images fall into {len(counts)} sets, of {said}, in which different parts stay the same; images of one "
+        "gripper, a camera fixed to it, each before another background"
+    )
+
+
+def image_sets(images: Sequence[NDArray[np.float32]], least_noise: float) -> list[list[int]]:
+    """Indices of images (h, w) in which the same stays, the largest set first: of several jaw openings, as a rule.
+    A set has :data:`FEWEST_IMAGES` at least; fewer that are unlike all others stay with some, whose matte names them.
     """
-    small = stack[:, :: _STEP + 1, :: _STEP + 1].reshape(len(stack), -1)
-    limit = NOISE_FACTOR * noise
-    alike = np.array([(np.abs(small - image) < 2.0**0.5 * limit).mean(axis=1) for image in small])
-    np.fill_diagonal(alike, 0.0)
-    centred = alike - alike.mean(axis=0)
-    side = np.linalg.eigh(centred @ centred.T)[1][:, -1]
-    for chosen in (side > 0.0, _nearer(alike)):
-        sets = [small[chosen], small[~chosen]]
-        if min(len(part) for part in sets) < 3:
-            continue
-        each = [_still_share(part, limit) for part in (*sets, small)]
-        if min(each[:2]) > each[2] + 4.0 * FEWEST_STILL_SHARE and min(each[:2]) > 1.1 * each[2]:
-            raise NoResultError(
-                f"the images fall into two sets, of {len(sets[0])} and {len(sets[1])}, in which different parts "
-                "stay the same; images of one gripper at one opening, a camera fixed to it, each before another "
-                "background"
-            )
+    small = np.stack([image[:: _STEP + 1, :: _STEP + 1] for image in images])
+    noise = _levelled(small, least_noise)[3]
+    if len(images) > FEWEST_IMAGES:
+        # What is noise shows within a set: by the images most like one of them.
+        alike = _alikeness(small, noise)
+        core = np.argsort(-alike, axis=1)[:, : FEWEST_IMAGES - 1]
+        first = int(np.take_along_axis(alike, core, axis=1).sum(axis=1).argmax())
+        noise = min(noise, _levelled(small[[first, *core[first]]], least_noise)[3])
+    return _sets(small, noise)
 
 
-def _nearer(alike: Array) -> NDArray[np.bool_]:
-    """(n,) which images are more like the one that is least like the first."""
-    first = int(alike.sum(axis=1).argmax())
-    other = int(np.where(np.arange(len(alike)) == first, np.inf, alike[first]).argmin())
-    chosen = alike[other] > alike[first]
-    chosen[[first, other]] = False, True
-    return np.asarray(chosen)
+def _sets(small: NDArray[np.float32], noise: float) -> list[list[int]]:
+    """The same of images (n, h, w) at common grey levels: merged from the most alike on, but for two sets of enough
+    images each of which stays the same in places where the other one doesn't.
+    """
+    apart = 1.0 - _alikeness(small, noise)
+    np.fill_diagonal(apart, 0.0)
+    flat, limit = small.reshape(len(small), -1), NOISE_FACTOR * noise
+    nodes = [[[k]] for k in range(len(small))]
+    for i, j in linkage(squareform(apart, checks=False), "average")[:, :2]:
+        one, other = nodes[int(i)], nodes[int(j)]
+        both = [*one, *other]
+        if len(both) == 2 and not _differ(flat[both[0]], flat[both[1]], limit):
+            both = [both[0] + both[1]]
+        nodes.append(both)
+    found = [part for part in nodes[-1] if len(part) >= FEWEST_IMAGES]
+    for part in nodes[-1]:
+        if len(part) < FEWEST_IMAGES:
+            min(found, key=lambda own: float(apart[np.ix_(part, own)].mean())).extend(part)
+    return sorted(map(sorted, found), key=lambda own: (-len(own), own[0]))
+
+
+def _differ(one: NDArray[np.float32], other: NDArray[np.float32], limit: float) -> bool:
+    """Whether more stays the same in each of two sets of images (n, p) than in both."""
+    if min(len(one), len(other)) < FEWEST_IMAGES:
+        return False
+    least = min(_still_share(one, limit), _still_share(other, limit))
+    both = _still_share(np.concatenate([one, other]), limit)
+    return least > both + 4.0 * FEWEST_STILL_SHARE and least > 1.1 * both
+
+
+def _alikeness(small: NDArray[np.float32], noise: float) -> Array:
+    """(n, n) part of two images (n, h, w) that is the same.  Backgrounds agree in a pixel here and there, by chance;
+    what stays does with those around it.
+    """
+    alike = np.zeros((len(small), len(small)))
+    for i, j in itertools.combinations(range(len(small)), 2):
+        same = cv2.absdiff(small[i], small[j]) < 2.0**0.5 * NOISE_FACTOR * noise
+        alike[i, j] = alike[j, i] = cv2.erode(same.view(np.uint8), _AROUND).mean()
+    return alike
 
 
 def _still_share(part: NDArray[np.float32], limit: float) -> float:
@@ -140,14 +184,7 @@ def _statistics(
     stack: NDArray[np.float32], least_noise: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
     """Mean, scatter, what is still, and noise; ``stack`` is brought to common grey levels, in place."""
-    quiet = None
-    for _ in range(_ROUNDS):
-        _level(stack, quiet)
-        mean, scatter = _robust(stack)
-        clipped = (mean <= 1.0) | (mean >= 254.0)
-        noise = _noise(scatter, mean, clipped, least_noise)
-        still = scatter < NOISE_FACTOR * noise
-        quiet = still & ~clipped
+    mean, scatter, still, noise = _levelled(stack, least_noise)
     share = float(still.mean())
     if share > MOST_STILL_SHARE:
         raise NoResultError(
@@ -160,6 +197,21 @@ def _statistics(
             f"only {100.0 * float(still.mean()):.1f} % of the image stays the same; a camera that is fixed to the "
             "gripper, one gripper, jaws that stand, light that stays"
         )
+    return mean, scatter, still, noise
+
+
+def _levelled(
+    stack: NDArray[np.float32], least_noise: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
+    """The same of each pixel alone."""
+    quiet = None
+    for _ in range(_ROUNDS):
+        _level(stack, quiet)
+        mean, scatter = _robust(stack)
+        clipped = (mean <= 1.0) | (mean >= 254.0)
+        noise = _noise(scatter, mean, clipped, least_noise)
+        still = scatter < NOISE_FACTOR * noise
+        quiet = still & ~clipped
     return mean, scatter, still, noise
 
 
@@ -177,21 +229,30 @@ def _level(stack: NDArray[np.float32], quiet: NDArray[np.bool_] | None) -> None:
         return
     wanted = middle[chosen].astype(float)
     for k in range(len(stack)):
-        seen = small[k, chosen].astype(float)
-        weight = np.ones(len(seen))
-        gain, offset = 1.0, 0.0
-        for _ in range(6):
-            centre = np.average(seen, weights=weight), np.average(wanted, weights=weight)
-            spread = float(weight @ np.square(seen - centre[0]))
-            slope = float(weight @ ((seen - centre[0]) * (wanted - centre[1]))) / max(spread, 1e-9)
-            # Without a spread of grey levels only the product of the two is known: a gain it is.
-            known = spread > 4.0 * weight.sum()
-            gain = slope if known else centre[1] / max(centre[0], 1.0)
-            offset = centre[1] - gain * centre[0] if known else 0.0
-            off = np.abs(gain * seen + offset - wanted)
-            weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
+        gain, offset = _gain(small[k, chosen].astype(float), wanted, len(stack))
         if 0.2 < gain < 5.0:
             stack[k] = gain * stack[k] + offset
+
+
+def _gain(seen: Array, wanted: Array, count: int) -> tuple[float, float]:
+    """Gain and offset that bring grey levels (p,) to their medians (p,) over ``count`` images, robustly."""
+    weight, gain, offset = np.ones(len(seen)), 1.0, 0.0
+    for _ in range(6):
+        centre = np.average(seen, weights=weight), np.average(wanted, weights=weight)
+        off = gain * seen + offset - wanted
+        noise = _MAD * float(np.median(np.abs(off - np.median(off))))
+        spread = float(np.average(np.square(wanted - centre[1]), weights=weight))
+        if spread > noise**2 * _MEDIAN_VARIANCE / count / MOST_DILUTION:
+            # What each image shows over what all do, which has the less noise: noise makes a slope less steep.
+            slope = float(np.average((wanted - centre[1]) * (seen - centre[0]), weights=weight)) / spread
+            gain = 1.0 / max(slope, 0.1)
+            offset = float(centre[1] - gain * centre[0])
+        else:
+            # Without a spread of grey levels only the product of the two is known: a gain it is.
+            gain, offset = float(centre[1] / max(centre[0], 1.0)), 0.0
+        off = np.abs(gain * seen + offset - wanted)
+        weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
+    return gain, offset
 
 
 def _partitioned(values: NDArray[np.float32], kth: int) -> NDArray[np.float32]:

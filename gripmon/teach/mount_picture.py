@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image as Pictures
 from PIL import ImageDraw, ImageFont
 
+from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.records import Array, Image
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript
@@ -128,7 +129,7 @@ def _draw_map(draw: ImageDraw.ImageDraw, heat: _Map, rows: list[list[Trial]], le
             if not trial.works:
                 draw.polygon([(right - 15, y), (right, y), (right, y + 15)], fill=_MARK, outline=_PAPER)
             if math.isfinite(value):
-                ink = _INK if 0.299 * red + 0.587 * green + 0.114 * blue > 130 else _PAPER
+                ink = _INK if RED * red + GREEN * green + BLUE * blue > 130 else _PAPER
                 place = ((x + right) / 2, y + 0.72 * _ROW)
                 draw.text(place, f"{value:.{heat.digits}f}", ink, _font(14), anchor="mm")
     bottom = y0 + len(rows) * _ROW

@@ -20,6 +20,7 @@ from gripmon.model.records import Array, Image
 from gripmon.teach.lines import EdgePoints, Line, settle_line
 from gripmon.teach.outlines import INNERMOST, Outline
 from gripmon.teach.plate_print import PlatePrint, look_at, moves, rough_line, sharpness
+from gripmon.track.edges.kernel import FEWEST_FREE
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
     EdgeSettings,
@@ -280,7 +281,6 @@ def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Ba
     return out
 
 
-_FEWEST_FREE = 3.0
 _LEAST_PX = 0.01
 """Standard deviation of a point: no image gives it better than that."""
 
@@ -319,7 +319,7 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     squares, freedom = np.array([_stretches(edge) for edge in seen]).T
     free = float(freedom.sum())
     # Known from few stretches itself: Student's distribution has this variance.
-    student = free / (free - 2.0) if free >= _FEWEST_FREE else _FEWEST_FREE
+    student = free / (free - 2.0) if free >= FEWEST_FREE else FEWEST_FREE
     usual_px2 = student * float(squares.sum()) / max(free, 1.0)
     floor_px = RobustFitSettings().edge_floor_px
     out = []

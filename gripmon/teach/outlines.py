@@ -33,7 +33,9 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import AxisMotion, EdgeModel, FingerModel, Gripper, GripperModel, JawModel, PointModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
-from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
+from gripmon.monitor.tracker import USUAL_SHARE
+from gripmon.teach.views import EVERYWHERE
+from gripmon.track.edges import FingertipMeter, MeasurementSettings
 
 FINGERS = ("left", "right")
 SIDES = ("near", "far")
@@ -174,9 +176,6 @@ class RoughCorners(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 JAW_SIGMA_M = 2e-4
-USUAL_SHARE = 0.6
-"""Share of agreeing profiles that is expected before a plate's pattern."""
-_PATIENCE = Patience(when_doubtful=True, when_lost=True)
 _ROUGH_PX = 3.0
 
 
@@ -221,7 +220,7 @@ def measure_known(
     """
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     meter = FingertipMeter(camera, gripper, MeasurementSettings(), JAW_SIGMA_M)
-    found = meter.measure(image, expected_cam_T_grip, opening_m, USUAL_SHARE, _PATIENCE)
+    found = meter.measure(image, expected_cam_T_grip, opening_m, USUAL_SHARE, EVERYWHERE)
     if not found.trusted:
         raise CalibrationError(
             f"the gripper isn't seen where it should be ({100.0 * found.consensus.share:.0f} % of its edges' profiles "

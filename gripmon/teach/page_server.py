@@ -1,4 +1,4 @@
-"""The page's web server: this machine only, and only for who knows the address with its token.
+"""The page's web server: this machine only unless told otherwise, and only for who knows the address with its token.
 
 A page of another site that is open in the same browser can send requests here, too, or have its name resolve to
 127.0.0.1 (DNS rebinding).  So every request must name this very host, carry the token in its path, and come from this
@@ -11,6 +11,7 @@ five more packages would be installed.
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.resources
 import logging
 import os
@@ -30,7 +31,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, in_short
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
@@ -102,10 +103,12 @@ def web_files(first: str, *names: str) -> dict[str, Served]:
 
 
 class PageServer:
-    """Serves one site until it is done.  OSError from the constructor if the port is taken."""
+    """Serves one site until it is done.  OSError from the constructor if the port is taken, or ``address`` is not
+    this machine's.
+    """
 
-    def __init__(self, site: Site, port: int = 0):
-        self._http = _Http(site, port)
+    def __init__(self, site: Site, port: int = 0, address: str = ADDRESS):
+        self._http = _Http(site, port, address)
         self.done, self.port, self.url = self._http.done, self._http.server_port, self._http.url
         self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-page")
         self._thread.start()
@@ -124,14 +127,19 @@ def serve(
     *,
     open_browser: bool,
     look: Callable[[], object] = lambda: None,
+    address: str = ADDRESS,
 ) -> None:
     """Serve it until the person is done.  ``announce`` hears its address; ``look`` is called now and then.
 
-    Raises :class:`~gripmon.model.errors.InputError` for a port that is taken.
+    Raises :class:`~gripmon.model.errors.InputError` for a port that is taken, or an ``address`` that isn't this
+    machine's.
     """
     try:
-        server = PageServer(site, port)
+        server = PageServer(site, port, address)
     except OSError as error:
+        if error.errno != errno.EADDRINUSE and address != ADDRESS:
+            text = f"{address}: can't be listened on ({error.strerror}); an IPv4 address of this machine"
+            raise InputError(text, "address") from None
         raise InputError(f"{port}: can't be listened on ({error.strerror}); another one, or none", "port") from None
     try:
         announce(server.url)
@@ -150,18 +158,19 @@ class _Http(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 32
 
-    def __init__(self, site: Site, port: int):
+    def __init__(self, site: Site, port: int, address: str):
         self.site, self.done = site, threading.Event()
         self.token = secrets.token_urlsafe(_TOKEN_BYTES)
         self.encode = msgspec.json.Encoder().encode
-        super().__init__((ADDRESS, port), _Handler)
-        self.hosts = frozenset({f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"})
-        self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
+        super().__init__((address, port), _Handler)
+        names = {address, "localhost"} if address == ADDRESS else {address}
+        self.hosts = frozenset(f"{name}:{self.server_port}" for name in names)
+        self.url = f"http://{address}:{self.server_port}/{self.token}/"
 
     def server_bind(self) -> None:
         """Without the look-up of the host's name that the base class makes: it may take seconds."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = ADDRESS, int(self.server_address[1])
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that goes away in the middle is nothing to report."""
@@ -201,7 +210,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
             _log.debug("request failed", exc_info=True)
-            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(f"{type(error).__name__}: {error}")
+            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(in_short(error))
         if status is not HTTPStatus.OK:
             self.close_connection = True  # what is left of its body is not read
         with contextlib.suppress(ConnectionError, TimeoutError):

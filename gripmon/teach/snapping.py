@@ -14,8 +14,10 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image
+from gripmon.monitor.tracker import USUAL_SHARE
 from gripmon.teach.corner_pose import Placed, Prior, Snapped, SnappedCorner, place, rough_sigma_px
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.teach.views import NARROW
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 from gripmon.track.edges.settling import ZOOMS, Expected
 
 FEWEST_PUT = 4
@@ -37,10 +39,8 @@ CLEARLY = 1.25
 
 _SPREAD = 24  # poses about that of the corners
 _KEPT = (6, 3)  # of them, that are followed to the next finer zoom
-_USUAL_SHARE = 0.6
 _OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; the gain in χ² from which another is taken
 _ALIKE = 0.25  # of the smallest distance between two corners
-_NARROW = Patience(when_doubtful=False, when_lost=False)
 
 ON_A_LINE = (
     "the corners lie on a line, which leaves open how the gripper is turned about it; one more beside it, or "
@@ -150,7 +150,7 @@ class Snapper:
 
     def _measure(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, reported: bool) -> Measurement:
         meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
-        return meter.measure(image, cam_T_grip, jaw_opening_m, _USUAL_SHARE, _NARROW, reported)
+        return meter.measure(image, cam_T_grip, jaw_opening_m, USUAL_SHARE, NARROW, reported)
 
     def _misfit(self, placed: Placed, sigmas: float) -> str | None:
         """The corner that fits the others least, in words, where it is farther from them than that."""

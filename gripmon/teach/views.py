@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.model.records import Array, Image, ReferenceRecord
+from gripmon.monitor.tracker import USUAL_SHARE
 from gripmon.teach.lines import EdgePoints
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import FingertipMeter, Measurement, Patience
@@ -28,13 +29,10 @@ from gripmon.track.edges.profiles import (
 )
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
-USUAL_SHARE = 0.6
-"""Share of agreeing profiles that is expected: before clutter, or with bevels, fewer agree than in quiet images."""
-
 _CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is searched for elsewhere
 _DENSE = 4096  # profiles: as many as there are pixels along the edges
-_EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
-_NARROW = Patience(when_doubtful=False, when_lost=False)
+EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
+NARROW = Patience(when_doubtful=False, when_lost=False)
 
 
 class TeachingRefused(ValueError):
@@ -126,7 +124,7 @@ class Viewer:
         taught: TaughtEdges | None,
         cam_T_grip: Array | None = None,
         share: float = USUAL_SHARE,
-        patience: Patience = _NARROW,
+        patience: Patience = NARROW,
     ) -> Measurement:
         """The image measured as in use, from a pose, the reference if None."""
         rig = self.rig
@@ -147,10 +145,10 @@ class Viewer:
         """Raise :class:`ImageRefused` if the gripper clearly stands farther from the reference than the profiles
         reach.
         """
-        found = self.measured(image, None, None, _CLEAR_SHARE, _EVERYWHERE)
+        found = self.measured(image, None, None, _CLEAR_SHARE, EVERYWHERE)
         if found.trusted:
             # Once more from there: the first search goes by predictions at the reference, and clutter may mislead it.
-            found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, _EVERYWHERE)
+            found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, EVERYWHERE)
         away_px = self._off_reference_px(found)
         if found.trusted and away_px > self._reach_px:
             motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)

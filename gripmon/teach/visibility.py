@@ -22,16 +22,11 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.monitor import MonitorSettings
 from gripmon.track.edges import TaughtEdges
-from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
-
-FEWEST_EDGES = 3
-"""Edges that must be seen for a fit to be believed."""
+from gripmon.track.edges.kernel import FEWEST_EDGES
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, FEWEST_SAMPLES, EdgeLayout, lay_out
 
 FEWEST_CORNERS = 3
 """Corners that must be seen; a configuration that shows fewer is refused."""
-
-FEWEST_SAMPLES = 4
-"""Profiles of an edge below which it isn't used, as in the monitor's layout."""
 
 TOUCHING_M = 1e-4
 """A point that is less than this behind another finger's face lies on it."""

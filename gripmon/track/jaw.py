@@ -22,8 +22,8 @@ SYSTEMATIC_M = 2e-6
 
 _NOTHING = 1e-6  # of the prior's information: what an image must add to count
 
-_PATIENCE = 10.0  # images over which the correlation is learnt
-_CORRELATED = 0.8  # of the first images, until it is
+PATIENCE, CORRELATED = 10.0, 0.8
+"""Images, or backgrounds, over which it is learnt how alike edges err from one to the next; and before that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class JawKnowledge:
         self.exact = sigma_m == 0.0
         self._sigma_m, self._offset_sigma_m = sigma_m, 0.0 if self.exact else offset_sigma_m
         self._reported_m: float | None = None
-        self._correlation = _CORRELATED
+        self._correlation = CORRELATED
         self._seen: tuple[float, float] | None = None
         self._pending: tuple[float, float, bool] | None = None
         self._forget()
@@ -140,7 +140,7 @@ class JawKnowledge:
         if self._seen is not None:
             before_m, before = self._seen
             differing = (error_m - before_m) ** 2 / (variance + before)
-            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / _PATIENCE
+            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / PATIENCE
         self._seen = error_m, variance
         correlation = min(max(self._correlation, 0.0), 0.98)
         variance *= (1.0 + correlation) / (1.0 - correlation)

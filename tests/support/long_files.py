@@ -21,6 +21,8 @@ LONGEST = (
     "test_plane",
     "test_sampling",
     "test_simulated_sources",
+    "test_fleet_page",
+    "test_readers",
     "test_bench_wire",
     "test_onboarding",
     "test_motion",

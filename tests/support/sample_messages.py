@@ -310,7 +310,13 @@ SAMPLES: dict[str, msgspec.Struct] = {
         "recalibration-3-1f0c9a2b",
         3,
         MONITOR,
-        Snapshot(MEASURED, 0.0125, 0.034, SnapshotImage("png", 768, 576, "mono8", 301234)),
+        Snapshot(
+            MEASURED,
+            0.0125,
+            0.034,
+            SnapshotImage("png", 768, 576, "mono8", 301234),
+            (((401.25, 310.5), (398.0, 402.75)),),
+        ),
     ),
     "error": CommandError(
         CommandFault.TIMEOUT, "the monitor has not answered within 2 s; it may still be carried out, ask for the state"

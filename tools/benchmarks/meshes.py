@@ -140,7 +140,18 @@ class MeshCamera:
         v, u = (int(self._rng.integers(0, n - m)) for n, m in zip(self._table.shape, (height, width), strict=True))
         table = self._table[v : v + height, u : u + width]
         table = self._covered(table, behind)
-        passes, light = np.ones((height, width)), np.zeros((height, width))
+        passes, light = self._fingers(cam_T_grip, offsets_m)
+        image = self._covered(table * passes + light, before) + self._rng.normal(0.0, 1.5, passes.shape)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+    def coverage(self, cam_T_grip: np.ndarray, offsets_m: Sequence[np.ndarray] | None = None) -> np.ndarray:
+        """Part (h, w) of each pixel that the fingers hide."""
+        return np.asarray(1.0 - self._fingers(cam_T_grip, offsets_m)[0], np.float32)
+
+    def _fingers(self, cam_T_grip: np.ndarray, offsets_m: Sequence[np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
+        """Part of the background that passes by them, and their light."""
+        shape = self._camera.height_px, self._camera.width_px
+        passes, light = np.ones(shape), np.zeros(shape)
         for k, vertices, faces, normals, gain in self._meshes:
             shift = np.zeros(3) if offsets_m is None else offsets_m[k]
             cam = (vertices + shift) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
@@ -157,8 +168,7 @@ class MeshCamera:
                     light[part] += level[t] * mask.mask
         # Masks of a hundred slivers are off by a per cent where they meet.
         assert passes.min() > -0.05, "faces of a finger cover each other in this view: the picture would be wrong"
-        image = self._covered(table * passes + light, before) + self._rng.normal(0.0, 1.5, passes.shape)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return passes, light
 
     def _covered(self, image: np.ndarray, things: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
         image = image.copy()

@@ -13,10 +13,9 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from gripmon.analyse.dataset import Measured
-from gripmon.daemon.config import Config
-from gripmon.daemon.dataset.measuring import failed, measure
+from gripmon.daemon.dataset.measuring import Configs, failed, measure
 from gripmon.io.sources.episodes import Episode
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, one_line
 
 AHEAD = 2
 """Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
@@ -24,26 +23,26 @@ DIED = "the process that measured it died, also when it was alone (out of memory
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _RAY_TRIES = 3
 
-_given: tuple[Config, str] | None = None
+_given: tuple[Configs, str] | None = None
 
 
-def _begin(config: Config, lens: str) -> None:
+def _begin(configs: Configs, lens: str) -> None:
     """In a worker: what all its episodes need."""
     global _given
     import cv2
 
     cv2.setNumThreads(1)
-    _given = config, lens
+    _given = configs, lens
 
 
 def _work(episode: Episode) -> Measured:
     assert _given is not None, "a worker begins with _begin"
-    config, lens = _given
-    return measure(config, episode, lens)
+    configs, lens = _given
+    return measure(configs, episode, lens)
 
 
 def local(
-    config: Config,
+    configs: Configs,
     episodes: Sequence[Episode],
     lens: str,
     workers: int,
@@ -58,7 +57,7 @@ def local(
     while waiting or suspects:
         alone = bool(suspects)
         queue, count = (suspects, 1) if alone else (waiting, workers)
-        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (config, lens)) as pool:
+        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (configs, lens)) as pool:
             flying: dict[Future[Measured], Episode] = {}
             try:
                 while queue or flying:
@@ -78,7 +77,7 @@ def local(
                 yield from (future.result() for future in finished)
                 left = [episode for future, episode in flying.items() if future not in finished]
                 if alone:
-                    yield from (failed(config, episode, DIED) for episode in left)
+                    yield from (failed(configs, episode, DIED) for episode in left)
                 else:
                     suspects.extend(left)
             except GeneratorExit:
@@ -86,7 +85,7 @@ def local(
                 raise
 
 
-def ray_cluster(config: Config, episodes: Sequence[Episode], lens: str, address: str | None) -> Iterator[Measured]:
+def ray_cluster(configs: Configs, episodes: Sequence[Episode], lens: str, address: str | None) -> Iterator[Measured]:
     """On the Ray cluster at ``address``, the one that Ray finds, or one of this machine alone.  Ray tries an episode
     again whose worker died; one that kills three is given up.
 
@@ -100,11 +99,12 @@ def ray_cluster(config: Config, episodes: Sequence[Episode], lens: str, address:
         try:
             ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
-            text = " ".join(str(error).split())
-            raise InputError(f"no Ray cluster at {address or 'this machine'} ({text:.200})", "address") from None
+            raise InputError(
+                f"no Ray cluster at {address or 'this machine'} ({one_line(error):.200})", "address"
+            ) from None
     environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
     task: Any = ray.remote(num_cpus=1, max_retries=_RAY_TRIES - 1, runtime_env=environment)(_on_ray)
-    shared = ray.put((config, lens))
+    shared = ray.put((configs, lens))
     waiting, flying = deque(episodes), dict[Any, Episode]()
     resources: Any = ray.cluster_resources
     while waiting or flying:
@@ -117,9 +117,9 @@ def ray_cluster(config: Config, episodes: Sequence[Episode], lens: str, address:
             try:
                 yield ray.get(done)
             except ray.exceptions.RayError:
-                yield failed(config, episode, DIED)
+                yield failed(configs, episode, DIED)
 
 
-def _on_ray(given: tuple[Config, str], episode: Episode) -> Measured:
+def _on_ray(given: tuple[Configs, str], episode: Episode) -> Measured:
     _begin(*given)
     return _work(episode)

@@ -14,6 +14,7 @@ from gripmon.analyse.stretches import stretches_of
 from gripmon.daemon.api import Monitor
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.checks import view_fault
+from gripmon.daemon.dataset.fitting import chosen, fit_of, spread
 from gripmon.io.sources import FolderSettings, Source, SourceError, VideoSettings, open_source
 from gripmon.io.sources.episodes import Episode
 from gripmon.judge.references import CommandRefused
@@ -37,26 +38,30 @@ PICTURE_WIDTH_PX = 320
 _JPEG_QUALITY = 75
 
 Pictured = tuple[Image, MeasurementTrace]
+Configs = tuple[Config, ...]
+"""One for each gripper file that may be in view, alike in all else."""
 
 
-def measure(config: Config, episode: Episode, lens: str = "file") -> Measured:
+def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
     """An episode's stretches, whatever is wrong with it: then ``fault`` says so.
+
+    Of several ``configs`` that counts whose gripper the episode shows; where none is, or several alike, none does.
 
     The episode's reference is its own: the monitor gets the command to recalibrate with its first measured frame, and
     begins again from there; where it isn't recalibrated, the configuration's reference stays.  ``lens``: "file" for the
     camera calibration that comes with the frames, where one does, "config" for the configuration's in any case.
     """
     try:
-        return _measured(config, episode, lens)
+        return _measured(configs, episode, lens)
     except SourceError as error:
-        return failed(config, episode, str(error))
+        return failed(configs, episode, str(error))
     except Exception as error:  # noqa: BLE001  one bad episode must not end the others
-        return failed(config, episode, in_short(error))
+        return failed(configs, episode, in_short(error))
 
 
-def failed(config: Config, episode: Episode, fault: str) -> Measured:
+def failed(configs: Configs, episode: Episode, fault: str) -> Measured:
     """The answer for an episode that gives nothing."""
-    return Measured(episode.name, _camera(config, episode), episode.key, episode.version, fault=fault)
+    return Measured(episode.name, _camera(configs[0], episode), episode.key, episode.version, fault=fault)
 
 
 def _camera(config: Config, episode: Episode, source: Source | None = None) -> str:
@@ -66,14 +71,29 @@ def _camera(config: Config, episode: Episode, source: Source | None = None) -> s
     return str(getattr(source, "topic", None) or episode.source.camera or "unknown")
 
 
-def _measured(config: Config, episode: Episode, lens: str) -> Measured:
+def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
     source = open_source(episode.source)
-    camera, from_file = _camera(config, episode, source), getattr(source, "camera", None)
+    camera, from_file = _camera(configs[0], episode, source), getattr(source, "camera", None)
     if lens == "file" and from_file is not None:
-        settings = msgspec.structs.replace(config.settings, camera=from_file)
-        config = dataclasses.replace(config, settings=settings, camera=make_camera(from_file))
-        if (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
-            raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
+        configs = tuple(
+            dataclasses.replace(
+                one, settings=msgspec.structs.replace(one.settings, camera=from_file), camera=make_camera(from_file)
+            )
+            for one in configs
+        )
+    config = configs[0]
+    if len(configs) > 1:
+        frames = spread(_frames(source))
+        found = chosen([fit_of(one, frames) for one in configs])
+        if isinstance(found, str):
+            return Measured(episode.name, camera, episode.key, episode.version, fault=found)
+        config, source = configs[found], open_source(episode.source)
+    elif (
+        lens == "file"
+        and from_file is not None
+        and (fault := view_fault(config.view(), config.gripper, config.camera)) is not None
+    ):
+        raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
     run = _Run(config)
     renewed = run.until_renewed(_frames(source))
     if renewed is not None:
@@ -84,7 +104,7 @@ def _measured(config: Config, episode: Episode, lens: str) -> Measured:
     table = run.table()
     plain = Measured(
         episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=renewed is not None,
-        lens="file" if lens == "file" and from_file is not None else "configuration",
+        gripper=config.gripper_path.stem, lens="file" if lens == "file" and from_file is not None else "configuration",
     )  # fmt: skip
     try:
         stretches = tuple(stretches_of(table, run.alerts, run.reasons))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 
 from gripmon import __version__
-from gripmon.analyse.dataset import Journal, Written, write_dataset
-from gripmon.daemon.config import Config, load_config
+from gripmon.analyse.dataset import Journal, Rows, Written, write_dataset
+from gripmon.analyse.dataset_annotations import Annotations
+from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.dataset.engines import local, ray_cluster
+from gripmon.daemon.dataset.measuring import Configs
 from gripmon.daemon.replaying import as_configured
 from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError
 from gripmon.io.sources.episodes import Episode, find_episodes, hash_of
@@ -49,6 +51,8 @@ def measure_dataset(
     level: float = 0.01,
     tolerance_m: float = 0.0,
     tolerance_rad: float = 0.0,
+    annotate: str | Path | None = None,
+    grippers: Sequence[str | Path] = (),
     step: Callable[[int], None] = lambda _total: None,
 ) -> Survey:
     """Measure every episode of a folder or URL by every one of ``cameras`` (topics, features), and write the table and
@@ -56,33 +60,42 @@ def measure_dataset(
 
     ``config`` has the gripper, a camera, a rough reference, and in its source how the state gives the opening.
     ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: processes (None: as
-    many as there are cores).  ``step`` is called with their number after each episode.  Called again with the same
-    ``out`` it measures what is new, has changed or was interrupted.
+    many as there are cores).  ``annotate``: a folder or URL for the results in the dataset's own format, see
+    :class:`gripmon.analyse.dataset_annotations.Annotations`.  ``grippers``: files beside the configuration's; each
+    episode is measured by the one that its frames show, and by none where none, or not one alone, fits
+    (:func:`gripmon.daemon.dataset.fitting.chosen`).  ``step`` is called with their number after each episode.
+    Called again with the same ``out`` it measures what is new, has changed or was interrupted.
 
     Raises :class:`InputError`: nothing to measure, several cameras of which none is named, an ``out`` that holds
     another configuration's results, an engine that isn't there.
     """
     config = config if isinstance(config, Config) else load_config(config, check_source=False)
+    configs = (config, *(_with_gripper(config, Path(path)) for path in grippers))
+    if len({one.gripper_path.stem for one in configs}) < len(configs):
+        raise InputError("two files of one name, or the configuration's own again; each file once", "gripper")
     try:
         episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
     except SourceError as error:
         raise InputError(str(error)) from None
+    annotations = None if annotate is None else Annotations(episodes, str(annotate))
     folder = writable_folder(Path(out))
-    with Journal(folder, _fingerprint(config, lens)) as journal:
+    with Journal(folder, _fingerprint(configs, lens)) as journal:
         versions = {episode.key: episode.version for episode in episodes}
         journal.keep(versions)
         left = [episode for episode in episodes if episode.key not in journal]
         for _ in range(len(episodes) - len(left)):
             step(len(episodes))
         if engine == "ray":
-            results = ray_cluster(config, left, lens, address)
+            results = ray_cluster(configs, left, lens, address)
         else:
-            results = local(config, left, lens, workers or len(os.sched_getaffinity(0)))
+            results = local(configs, left, lens, workers or len(os.sched_getaffinity(0)))
         for measured in results if left else ():
             journal.add(measured)
             step(len(episodes))
         order = [episode.key for episode in episodes]
         written = write_dataset(journal, order, folder, str(dataset), level, tolerance_m, tolerance_rad)
+        if annotations is not None:
+            annotations.write(Rows(journal, written))
     return Survey(written, len(episodes), len(left))
 
 
@@ -95,10 +108,17 @@ def _configured(episode: Episode, config: Config) -> Episode:
     return msgspec.structs.replace(episode, source=settings)
 
 
-def _fingerprint(config: Config, lens: str) -> str:
+def _with_gripper(config: Config, path: Path) -> Config:
+    """What was taught is of the configuration's own gripper."""
+    return replace(config, gripper=read_gripper(path), gripper_path=path, taught=None)
+
+
+def _fingerprint(configs: Configs, lens: str) -> str:
     """Of all that a result depends on beside the episode."""
+    config = configs[0]
     settings = config.settings
     opening = getattr(settings.source, "opening", None)
-    parts = [settings.camera, settings.monitor, settings.jaw, opening, config.reference, config.gripper.model]
+    parts = [settings.camera, settings.monitor, settings.jaw, opening, config.reference]
+    parts += [one.gripper.model for one in configs]
     taught = "" if config.taught is None else to_json(config.taught)
     return hash_of([__version__, lens, taught, *(msgspec.json.encode(part) for part in parts)])

@@ -18,7 +18,7 @@ from gripmon.daemon.setup.views import MOVED_PX, Coverage, View, Viewer, coverag
 from gripmon.io.sources import Source, Waiting
 from gripmon.io.sources.files import COLUMNS, TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, in_short
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image
 from gripmon.model.records import Frame, Image
 from gripmon.model.targets import Target
@@ -188,7 +188,7 @@ class Capture:
                 if not source.live and not self._wait_for_order(source):
                     return
         except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
-            self._note = f"{type(error).__name__}: {error}; start the camera again"
+            self._note = f"{in_short(error)}; start the camera again"
             return
         with self._lock:
             self._ended, self._itself = True, False

@@ -17,22 +17,18 @@ import numpy as np
 
 from gripmon.client import Ambiguous, Client, NotCarriedOut
 from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
-from gripmon.model.geometry import from_record
 from gripmon.model.images import read_image
 from gripmon.model.records import FrameRecord, Image
-from gripmon.teach.drawing import Canvas, Colour
 from gripmon.teach.messages import BadRequest
-from gripmon.teach.snapping import outlines_px
 
 _LINES = 200
 _ASK_EVERY_S, _ANSWER_S, _ENDS_S = 0.2, 2.0, 20.0
 _STAMP = re.compile(r"^\d{4}-\d\d-\d\d \S+ ")
 _OWN_QUESTIONS = "command snapshot: done"
-_OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
-_LOST: Colour = (80, 80, 255)
-_CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
+_PICTURE_PX = 1000
 _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor has this name", 130: "stopped"}
 
 
@@ -146,7 +142,7 @@ class MonitorProcess:
                     self._record = reply.snapshot.record
                     image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
                     if image is not None:
-                        self._picture = overlay(config, reply.snapshot.record, np.asarray(image))
+                        self._picture = _picture(config, reply.snapshot.record, np.asarray(image))
                         self._shown += 1
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_ASK_EVERY_S)
@@ -162,21 +158,9 @@ class MonitorProcess:
             if isinstance(source, FolderSettings) and record.name is not None:
                 image, _ = read_image(config.directory / source.path / record.name)
                 if image is not None:
-                    self._picture = overlay(config, record, image)
+                    self._picture = _picture(config, record, image)
                     self._shown += 1
 
 
-def overlay(config: Config, record: FrameRecord, image: Image) -> bytes:
-    """JPEG: the gripper's visible edges where the transform has them, green if it is valid, orange if suspect, and the
-    corners, yellow where they were used.
-    """
-    canvas = Canvas(image, max(1, round(1000 / image.shape[1])))
-    gripper, camera = config.gripper, config.camera
-    if record.cam_T_grip is not None:
-        cam_T_grip, opening_m = from_record(record.cam_T_grip), record.jaw_opening_m if gripper.has_jaw else None
-        for uv_px in outlines_px(camera, gripper, cam_T_grip, opening_m, 33).values():
-            canvas.line(uv_px, _OUTLINE.get(record.verdict.value, _LOST), 2)
-    for corner in record.corners:
-        if corner.uv_px is not None:
-            canvas.circle(np.array(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)
-    return bytes(cv2.imencode(".jpg", canvas.picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes())
+def _picture(config: Config, record: FrameRecord, image: Image) -> bytes:
+    return overlay(image, record, outlines_of(config.camera, config.gripper, record), _PICTURE_PX)

@@ -16,7 +16,7 @@ from gripmon.daemon.setup.project import Line, Project, StepState
 from gripmon.daemon.setup.running import MonitorProcess, Seen
 from gripmon.daemon.setup.steps import STEPS, grippers
 from gripmon.daemon.teaching import outline_session, page_session, read_inputs
-from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.teach.messages import BadRequest, Nothing, Request
 from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite, web_files
 from gripmon.teach.session import TeachSession
@@ -187,7 +187,7 @@ class SetupSite:
         except (InputError, NoResultError) as error:
             self._errors[step] = str(error)
         except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
-            self._errors[step] = f"{type(error).__name__}: {error}"
+            self._errors[step] = in_short(error)
         finally:
             self._busy = None
 

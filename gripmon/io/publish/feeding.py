@@ -9,13 +9,12 @@ from typing import Literal
 import numpy as np
 import zenoh
 
-from gripmon.io.sources import Source
+from gripmon.io.sources import USUAL_FPS, Source
 from gripmon.io.wire import Link
 from gripmon.model.records import Frame, FrameNote, Image, to_json
 
 _LOOK_AGAIN_S = 0.05
 _LAST_WORD_S = 0.2
-_USUAL_FPS = 25.0
 
 
 class Feeder:
@@ -79,7 +78,7 @@ def _paced(begin: Callable[[], Source], fps: float | None, loop: bool) -> Iterat
         if not loop or source.live or count == 0:
             return
         # The last frame lasts as long as the others do.
-        passed_s += since_s * count / max(count - 1, 1) if count > 1 else 1.0 / (fps or _USUAL_FPS)
+        passed_s += since_s * count / max(count - 1, 1) if count > 1 else 1.0 / (fps or USUAL_FPS)
 
 
 FrameFormat = Literal["raw", "jpeg", "png"]

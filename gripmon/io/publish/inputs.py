@@ -17,6 +17,7 @@ from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state,
 from gripmon.io.wire import Link
 from gripmon.io.wire.link import Malformed
 from gripmon.laser.matching import ReportedPulse, of_message
+from gripmon.model.errors import in_short
 from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_json, largest_bytes
 
 _log = logging.getLogger(__name__)
@@ -111,7 +112,7 @@ class _Input:
         except (MessageRefused, ValueError) as error:
             self._malformed.add(str(error))
         except Exception as error:  # noqa: BLE001  Zenoh would swallow it, and it would stay unknown
-            self._malformed.add(f"{type(error).__name__}: {error}")
+            self._malformed.add(in_short(error))
             _log.debug("message on %s", self._key, exc_info=error)
 
     def _take(self, payload: zenoh.ZBytes) -> bool:

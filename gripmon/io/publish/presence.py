@@ -133,7 +133,7 @@ _AT_ONCE = 2
 _WAITING_MOST = 64
 _REFUSED_MOST = 4096
 """Queries beyond the waiting ones that get the answer that too many wait: seconds of a flood, at some bytes each."""
-_CLOSE_WITHIN_S = 1.0
+CLOSE_WITHIN_S = 1.0
 
 
 class Answers:
@@ -176,7 +176,7 @@ class Answers:
         """Give what is under way a second."""
         with self._lock:
             self._closed, under_way = True, set(self._under_way)
-        wait(under_way, _CLOSE_WITHIN_S)
+        wait(under_way, CLOSE_WITHIN_S)
         self._pool.shutdown(wait=False)
         self._refusals.shutdown(wait=False)
 

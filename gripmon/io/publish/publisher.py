@@ -14,6 +14,7 @@ import zenoh
 
 from gripmon.io.publish.presence import Answers, Presence
 from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
+from gripmon.model.errors import one_line
 from gripmon.model.records import (
     AlertRecord,
     ClockReading,
@@ -338,7 +339,7 @@ class Publishers:
         try:
             put(*values)
         except Exception as error:  # noqa: BLE001  said here and in the state
-            text = f"{name} fails: {' '.join(str(error).split()) or type(error).__name__}"
+            text = f"{name} fails: {one_line(error)}"
             if self._faults.get((name, what)) != text:
                 _log.error("%s", text)
                 _log.debug("%s", name, exc_info=error)

@@ -26,8 +26,10 @@ from msgspec import Meta
 
 from gripmon.io.ros2.names import DEFAULT_QOS, EndpointKind, NodeName, Qos, endpoint_token, node_token, topic_key
 from gripmon.io.wire import Link
+from gripmon.model.images import JPEG, PNG
 from gripmon.model.pixels import ENCODINGS, unpacked
 from gripmon.model.records import Image
+from gripmon.model.records.values import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -211,8 +213,6 @@ MOST_IMAGE_BYTES = 1 << 28
 """256 MiB: 89 million pixels in three colours."""
 MOST_JOINT_STATE_BYTES = 1 << 18
 """Some thousand joints."""
-_NS = 1_000_000_000
-_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 
 class MessageError(ValueError):
@@ -260,7 +260,7 @@ def decode_compressed_image(payload: bytes) -> tuple[int, str, bytes]:
     data = message.data.tobytes()
     if "compressedDepth" in message.format:
         raise MessageError(COMPRESSED_IMAGE, "format", f"{message.format[:40]!r} is a depth image; give jpeg or png")
-    for name, beginning in (("jpeg", _JPEG), ("png", _PNG)):
+    for name, beginning in (("jpeg", JPEG), ("png", PNG)):
         if data.startswith(beginning):
             return _stamp_ns(COMPRESSED_IMAGE, message.header.stamp), name, data
     what = f"begins with {data[:8].hex() or 'nothing'}, format {message.format[:40]!r}; give jpeg or png"
@@ -339,6 +339,6 @@ def _decoded(type_name: str, payload: bytes, most_bytes: int) -> Any:
 
 
 def _stamp_ns(type_name: str, stamp: Any) -> int:
-    if stamp.sec < 0 or stamp.nanosec >= _NS:
+    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise MessageError(type_name, "header.stamp", f"{stamp.sec} s and {stamp.nanosec} ns is no time")
-    return int(stamp.sec) * _NS + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)

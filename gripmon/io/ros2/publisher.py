@@ -28,6 +28,7 @@ from gripmon.model.records import (
     Transform,
     Verdict,
 )
+from gripmon.model.records.values import NS_PER_S
 
 if TYPE_CHECKING:
     import zenoh
@@ -37,7 +38,6 @@ _log = logging.getLogger(__name__)
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
 
-_NS = 1_000_000_000
 _OF_VERDICT = {Verdict.VALID: OK, Verdict.SUSPECT: WARN, Verdict.UNKNOWN: ERROR}
 _OF_SEVERITY = {Severity.INFO: OK, Severity.WARNING: WARN, Severity.ERROR: ERROR}
 
@@ -83,7 +83,7 @@ class Messages:
 
     def header(self, stamp_ns: int, frame: str | None = None) -> Any:
         """``std_msgs/Header`` in the parent frame, or another."""
-        return self._header(self._time(*divmod(stamp_ns, _NS)), self._parent if frame is None else frame)
+        return self._header(self._time(*divmod(stamp_ns, NS_PER_S)), self._parent if frame is None else frame)
 
     def tf(self, header: Any, transform: Transform) -> Any:
         """``tf2_msgs/TFMessage``: the child's pose in the parent."""

@@ -53,7 +53,7 @@ __all__ = [
     "settings_for_text",
 ]
 
-_USUAL_FPS = 25.0
+USUAL_FPS = 25.0
 
 
 def open_source(
@@ -116,7 +116,7 @@ def settings_for_text(text: str, fps: float | None = None) -> FolderSettings | L
     """
     path = Path(text)
     if path.is_dir():
-        return FolderSettings(path=text, fps=fps or _USUAL_FPS)
+        return FolderSettings(path=text, fps=fps or USUAL_FPS)
     if path.is_file():
         return VideoSettings(path=text)
     if not (text.isdecimal() or text.startswith("/dev/") or "://" in text or "!" in text):

@@ -28,10 +28,10 @@ from gripmon.io.sources.stored import (
     needed,
     opened,
     openings_at,
-    short,
     there,
 )
 from gripmon.model.camera import LensSettings
+from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Frame, FrameNote, Image
 
 _IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
@@ -101,7 +101,7 @@ class _Mcap:
                 try:
                     record = next(found, None)
                 except Exception as error:  # noqa: BLE001  as above
-                    raise _CutShort(short(error)) from None
+                    raise _CutShort(one_line(error)[:200]) from None
                 if record is None:
                     return
                 yield record
@@ -150,7 +150,7 @@ class _Rosbag2:
             with Reader(self._path) as reader:
                 self.types = {connection.topic: connection.msgtype for connection in reader.connections}
         except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
-            raise SourceError(f"path: {path} can't be read ({short(error)}); a whole rosbag2") from None
+            raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole rosbag2") from None
 
     def messages(self, topics: list[str]) -> Iterator[_Message]:
         """In order of their log times."""
@@ -161,7 +161,7 @@ class _Rosbag2:
                     name = connection.msgtype
                     yield _Message(connection.topic, _kind(name), log_ns, functools.partial(_from_cdr, data, name))
         except Exception as error:  # noqa: BLE001  as above
-            raise _CutShort(short(error)) from None
+            raise _CutShort(one_line(error)[:200]) from None
 
 
 def open_messages(path: str) -> _Mcap | _Rosbag2:
@@ -279,7 +279,7 @@ class BagSource:
             stamp_ns = _stamp_ns(found) or stamp_ns
             image, fault = self._image(found, message.kind)
         except Exception as error:  # noqa: BLE001  whatever a damaged message does, the others are sound
-            image, fault = None, f"the message can't be decoded ({short(error)})"
+            image, fault = None, f"the message can't be decoded ({one_line(error):.200})"
         if stamp_ns <= self._last_stamp_ns:
             image, fault = None, "its time stamp does not rise"
         if len(self._stamps_ns):

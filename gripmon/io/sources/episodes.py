@@ -13,9 +13,12 @@ from gripmon.io.sources.bags import BagSettings
 from gripmon.io.sources.base import SourceError
 from gripmon.io.sources.files import FolderSettings, VideoSettings
 from gripmon.io.sources.lerobot import INFO, LeRobotSettings, open_dataset
-from gripmon.io.sources.stored import file_system, short
+from gripmon.io.sources.stored import file_system
+from gripmon.model.errors import one_line
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key
 
+ANNOTATION_SUFFIX = ".gripmon.mcap"
+"""Of what ``gripmon dataset --annotate`` writes beside recordings: not an episode."""
 _VIDEOS = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
 
 
@@ -46,8 +49,12 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
     try:
         files: dict[str, dict[str, Any]] = system.find(inside, detail=True)
     except Exception as error:  # noqa: BLE001  each store has its own
-        raise SourceError(f"path: {root} can't be listed ({short(error)})") from None
-    files = {path: one for path, one in files.items() if not _hidden(path[len(inside) :])}
+        raise SourceError(f"path: {root} can't be listed ({one_line(error):.200})") from None
+    files = {
+        path: one
+        for path, one in files.items()
+        if not _hidden(path[len(inside) :]) and not path.endswith(ANNOTATION_SUFFIX)
+    }
     if not files:
         raise SourceError(f"path: there is nothing in {root}; a folder or a URL with episodes")
     remote = "://" in root

@@ -19,6 +19,7 @@ from gripmon.model.images import natural_key as natural_key
 from gripmon.model.images import read_image as read_image
 from gripmon.model.images import regular_bytes
 from gripmon.model.records import Frame
+from gripmon.model.records.values import NS_PER_S
 
 if TYPE_CHECKING:
     from _csv import Reader as _Lines
@@ -27,7 +28,6 @@ _log = logging.getLogger(__name__)
 
 TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
-_NS = 1_000_000_000
 
 
 class FolderSettings(
@@ -83,7 +83,7 @@ class FolderSource:
             names = sorted(rows, key=natural_key)
             _check_order(table, names, rows)
         else:
-            rows = {name: TableRow(round(i * _NS / settings.fps), None) for i, name in enumerate(names)}
+            rows = {name: TableRow(round(i * NS_PER_S / settings.fps), None) for i, name in enumerate(names)}
         if not names:
             raise SourceError(f"path: no image in {self._folder}; files such as *.png, *.jpg, *.tif, *.pgm")
         self._names, self._rows = names, rows
@@ -246,7 +246,7 @@ class VideoSource:
 
     def _stamp(self) -> tuple[int, str | None]:
         if self._fps is not None:
-            return round(self._seq * _NS / self._fps), None
+            return round(self._seq * NS_PER_S / self._fps), None
         stamp_ms = self._capture.get(self._stamp_property)
         stamp_ns = round(stamp_ms * 1e6) if math.isfinite(stamp_ms) else -1
         if stamp_ns <= self._last_stamp_ns:

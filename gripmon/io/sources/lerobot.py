@@ -17,7 +17,8 @@ import numpy as np
 
 from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources.base import SourceError
-from gripmon.io.sources.stored import decoded_file, file_system, joined, needed, opened, short, there
+from gripmon.io.sources.stored import decoded_file, file_system, joined, needed, opened, there
+from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Frame, Image
 
 INFO = "meta/info.json"
@@ -96,7 +97,7 @@ def open_dataset(path: str) -> LeRobotDataset:
     except (KeyError, ValueError, TypeError) as error:
         if isinstance(error, SourceError):
             raise
-        raise SourceError(f"path: {path} is no LeRobot dataset ({short(error)}); a whole one") from None
+        raise SourceError(f"path: {path} is no LeRobot dataset ({one_line(error):.200}); a whole one") from None
     return LeRobotDataset(path, info, {int(row["episode_index"]): row for row in episodes})
 
 
@@ -175,7 +176,7 @@ class LeRobotSource:
                     at = [dataset.joints.index(name) for name in opening.joints]
                     openings_m = opening.offset_m + opening.scale * state[:, at].sum(axis=1)
             except (OSError, ValueError, KeyError, IndexError) as error:
-                raise SourceError(f"path: {path} can't be read ({short(error)}); a whole table") from None
+                raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole table") from None
         if not len(time_s) or (np.diff(time_s) <= 0.0).any():
             raise SourceError(f"path: {path}: episode {self._episode} has no rows, or time stamps that don't rise")
         return time_s, openings_m, None if is_video else table[self._camera].to_pylist()
@@ -228,7 +229,7 @@ def _video_frames(path: str, begin_s: float) -> Iterator[tuple[float, Any]]:
                     if frame.time is not None and frame.time >= begin_s:
                         yield frame.time, frame
         except (av.error.FFmpegError, OSError, IndexError) as error:
-            raise SourceError(f"{path} can't be decoded ({short(error)}); is it truncated?") from None
+            raise SourceError(f"{path} can't be decoded ({one_line(error):.200}); is it truncated?") from None
 
 
 def is_lerobot(path: str) -> bool:

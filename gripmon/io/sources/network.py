@@ -11,8 +11,6 @@ import msgspec
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.io.sources.payload import (
-    JPEG,
-    PNG,
     PayloadError,
     WrongSizeError,
     check_size,
@@ -23,6 +21,7 @@ from gripmon.io.sources.payload import (
 from gripmon.io.wire import Link
 from gripmon.io.wire.link import Malformed
 from gripmon.io.wire.session import KEY_PATTERN
+from gripmon.model.images import JPEG, PNG
 from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
 
 if TYPE_CHECKING:

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gripmon.model.errors import one_line
+from gripmon.model.images import PNG
 from gripmon.model.pixels import ENCODINGS, unpacked
 from gripmon.model.records import FrameNote, Image, MessageRefused, from_json
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
-
-JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-"""How such a file begins."""
 
 MOST_SCANS = 100
 """A progressive JPEG has some ten; each one costs as much as the whole image, whatever few bytes it takes."""
@@ -91,10 +90,8 @@ def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
     except PayloadError:
         raise
     except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
-        what = " ".join(str(error).split()) or type(error).__name__
-        raise PayloadError(
-            f"damaged {'PNG' if payload.startswith(PNG) else 'JPEG'} file ({what}); a whole one"
-        ) from None
+        kind = "PNG" if payload.startswith(PNG) else "JPEG"
+        raise PayloadError(f"damaged {kind} file ({one_line(error)}); a whole one") from None
 
 
 def _open_file(payload: bytes) -> ImageFile:

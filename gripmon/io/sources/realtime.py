@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.model.errors import in_short
 from gripmon.model.records import Frame, Image
+from gripmon.model.records.values import NS_PER_S
 
 _log = logging.getLogger(__name__)
-_NS = 1_000_000_000
 _SLOTS = 12  # a frame stays readable for at least 12 - MOST_PROCESSES frame periods after it was announced
 MOST_PROCESSES = 4
 _WRITING = -1
@@ -81,7 +82,7 @@ class SimulatedCamera:
                 renderer.await_ready()
                 self._poll.register(renderer.announcements, select.POLLIN)
             start = time.monotonic(), time.time_ns()
-            self._stamps_ahead_ns = start[1] - round(_NS * start[0])  # of the monotonic clock
+            self._stamps_ahead_ns = start[1] - round(NS_PER_S * start[0])  # of the monotonic clock
             for renderer in self._all:
                 renderer.commands.send(start)
         except BaseException:
@@ -274,7 +275,7 @@ def _render(maker: FrameMaker, ring: _Ring, schedule: _Schedule, announce: Conne
     except Exception as error:  # noqa: BLE001  the parent raises it
         _log.exception("rendering failed")
         os.set_blocking(announce.fileno(), True)
-        announce.send(f"{type(error).__name__}: {error}"[:1000])
+        announce.send(in_short(error)[:1000])
 
 
 def _deliver(
@@ -292,7 +293,7 @@ def _deliver(
             return
         # A full pipe: it was not read for long.  This frame counts as dropped, like the older ones that it overwrote.
         with contextlib.suppress(BlockingIOError):
-            announce.send(_Announcement(index, start_ns + round(index * _NS / schedule.fps), opening_m))
+            announce.send(_Announcement(index, start_ns + round(index * NS_PER_S / schedule.fps), opening_m))
         index = schedule.following(index, time.monotonic() - start_s)
         if schedule.end is None or index < schedule.end:
             opening_m = _draw(maker, ring, index)

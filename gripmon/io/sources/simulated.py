@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from gripmon.io.sources.base import Source, SourceError
+from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Frame
 
 if TYPE_CHECKING:
@@ -79,8 +80,9 @@ def _load_scenario(settings: SimulatedSettings, relative_to: Path) -> Scenario:
     try:
         return msgspec.yaml.decode(path.read_bytes(), type=Scenario)
     except (OSError, msgspec.DecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise SourceError(f"scenario: {path} can't be used ({reason}); a file with the keys of a scenario") from error
+        raise SourceError(
+            f"scenario: {path} can't be used ({one_line(error)}); a file with the keys of a scenario"
+        ) from error
 
 
 class SimulatedSequence:

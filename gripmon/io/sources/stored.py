@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gripmon.io.ros2.node import opening_between
 from gripmon.io.sources.base import SourceError
+from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Image
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def opened(path: str) -> IO[bytes]:
     except FileNotFoundError:
         raise SourceError(f"path: there is no file {path}") from None
     except Exception as error:  # noqa: BLE001  each store has its own
-        raise SourceError(f"path: {path} can't be read ({short(error)})") from None
+        raise SourceError(f"path: {path} can't be read ({one_line(error):.200})") from None
 
 
 def there(path: str) -> bool:
@@ -73,11 +74,6 @@ def needed(package: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise SourceError(f"path: needs the package {error.name}; {EXTRA}") from None
-
-
-def short(error: BaseException) -> str:
-    """An error of another library in one line."""
-    return f"{' '.join(str(error).split()) or type(error).__name__:.200}"
 
 
 def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int) -> float:
@@ -123,7 +119,7 @@ class VideoDecoder:
         try:
             frames = self._context.decode(self._packet(data))
         except self._error as error:
-            return None, f"the video frame can't be decoded ({short(error)})"
+            return None, f"the video frame can't be decoded ({one_line(error):.200})"
         if not frames:
             return None, "the video frame can't be decoded (none before the first key frame)"
         return frames[-1].to_ndarray(format="gray"), None

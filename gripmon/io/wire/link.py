@@ -247,7 +247,7 @@ CALM_S = 3.0
 _LONGEST_REASON = 200
 _MOST_KINDS = 8  # of reasons; a stranger may make up any number
 _OTHERS = "any other"
-_FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
+FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 
 
 class Malformed:
@@ -302,7 +302,7 @@ class Malformed:
     def _kind(self, reason: str) -> str:
         """What is counted together: the reason without figures; the rest, where there are too many."""
         text = _for_people(reason)
-        kind = _FIGURES.sub("", text)
+        kind = FIGURES.sub("", text)
         if kind not in self._examples and len(self._examples) >= _MOST_KINDS:
             kind = _OTHERS
         self._examples.setdefault(kind, text)

@@ -9,21 +9,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.causes.models import JAW_UNREPORTED_SIGMA_M, Errors, Knowledge, Suspect, Weighed, suspects, weigh
+from gripmon.judge.causes.models import Errors, Knowledge, Suspect, Weighed, suspects, weigh
 from gripmon.judge.causes.pooling import Baseline, Pooled
 from gripmon.judge.causes.state import EdgeView, State
+from gripmon.judge.drift.kinds import SIGNIFICANT_SIGMAS
+from gripmon.judge.recalibrate.edges import STRETCH_PX
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M
 
 Key = tuple[Cause | None, int | None]
 """A cause and the finger that it is about; None for the cause: nothing moved."""
 
 FOLLOWED = (Cause.CAMERA_MOUNT, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 """Causes by which the whole gripper shows elsewhere, however far."""
-
-PIECE_SIGMA_PX = 0.015
-"""Standard deviation of a piece's place that nothing else explains."""
 
 BASELINE_ERROR_SHARE = 0.1
 """Part of what a whole edge is off by that is left when it is compared with itself before."""
@@ -35,7 +35,7 @@ MODEL_M = 3e-5
 """How exactly a gripper's file says where its edges lie, which counts as long as there is no baseline."""
 
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
-SETTLED_JAW_M = 5e-6
+SETTLED_JAW_M = float(SETTLED_SIGMA[0])
 """Of the pose (m and rad) and the opening that a baseline knows."""
 
 LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
@@ -49,9 +49,6 @@ ABSENT_PROBABILITY = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNK
 """How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
 several things happened; with every other cause it is a ``STRAY_PROBABILITY``."""
 STRAY_PROBABILITY = 0.02
-
-STANDS_SIGMAS = 4.0
-"""Standard deviations within which a piece of an edge stands at a place: one in 16,000 is farther off by chance."""
 
 BLOCKED_VIEW_PROBABILITY = 0.15
 """Probability of a blocked view beforehand, where a finger isn't seen."""
@@ -95,7 +92,7 @@ def compare(
     reported = evidence.jaw_reported_m is not None
     opening_m = evidence.jaw_opening_m if evidence.jaw_reported_m is None else evidence.jaw_reported_m
     start = State(ref_cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
-    sigma_px: Array = np.hypot(evidence.sigma_px, PIECE_SIGMA_PX)
+    sigma_px: Array = np.hypot(evidence.sigma_px, STRETCH_PX)
     bias_px: Array = np.zeros(len(evidence.edge))
     model_px = MODEL_M / (evidence.per_px * float(ref_cam_T_grip[2, 3]))
     spread_px: Array = np.hypot(np.hypot(evidence.spread_px, EDGE_SIGMA_PX), model_px)
@@ -172,7 +169,7 @@ def _shared_px(residual_px: Array, sigma_px: Array) -> float:
 def _elsewhere(fits: Mapping[Key, Weighed], sigma_px: Array, finger: NDArray[np.intp], fingers: int) -> Array:
     """See :class:`Comparison`; ``sigma_px`` (s,) of the pieces by themselves, ``finger`` (s,) of each."""
     shares = np.zeros(fingers)
-    stands = {key: np.abs(fit.residual_px) <= STANDS_SIGMAS * sigma_px for key, fit in fits.items()}
+    stands = {key: np.abs(fit.residual_px) <= SIGNIFICANT_SIGMAS * sigma_px for key, fit in fits.items()}
     for part in range(fingers):
         own = finger == part
         if (Cause.FINGER_BENT, part) in stands and own.any():

@@ -19,10 +19,12 @@ from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.models import Weighed
 from gripmon.judge.causes.pooling import Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
+from gripmon.judge.causes.watches import LEARNT
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
 from gripmon.track.edges import finger_of_ends
+from gripmon.track.edges.evidence import FINGER_SEEN_SHARE
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""
@@ -30,15 +32,16 @@ FEWEST_PIECES = 4
 SCATTERED_PX = 0.4
 """Standard deviation of most pieces' places beyond which they are not believed: they usually have 0.03 to 0.3."""
 
-ENOUGH, SETTLED = 20, 6
-"""Frames in which all was well that make a baseline, and with which a first one is made if it is asked for earlier."""
+SETTLED = 6
+"""Frames in which all was well with which a first baseline is made, if it is asked for before :data:`LEARNT`."""
 
 CONTRADICTION_LOG_EVIDENCE = 8.0
 """Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
 
-BLIND_CAUSES = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
+_NEARLY_SURE, _LIKELY = (0.93, 0.05, 0.02), (0.7, 0.3)
+BLIND_CAUSES = dict(zip((Cause.VIEW_BLOCKED, Cause.UNKNOWN, Cause.CAMERA_MOUNT), _NEARLY_SURE, strict=True))
 """Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
-BAD_IMAGE_CAUSES = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
+BAD_IMAGE_CAUSES = dict(zip((Cause.IMAGE_BAD, Cause.UNKNOWN, Cause.VIEW_BLOCKED), _NEARLY_SURE, strict=True))
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
 MUCH_NOISE, LEAST_NOISE, DARK, BRIGHT = 4.0, 0.02, 0.08, 0.95
 
@@ -47,11 +50,6 @@ STEADY, ALIKE, MOSTLY = 0.02, 0.05, 0.7
 """Part of the usual steepness to which the steepest edges of an image must have sunk for its focus to be in doubt; and
 by how much its cells may have wandered before, and may differ now, parts of the full scale, so that so many of those
 that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
-"""
-
-FINGER_AGREEING_SHARE = 0.5
-"""Share of a finger's profiles that must agree with where it is said to be.  What fewer show may be anything that has
-an edge or two: a shadow, a finger's other side, what lies behind.
 """
 
 FINGER_GONE_SHARE = 2.0 / 3.0
@@ -112,7 +110,7 @@ class CauseJudge:
     @property
     def wants_baseline(self) -> bool:
         """Whether frames in which all is well still teach anything."""
-        return len(self._well) < ENOUGH
+        return len(self._well) < LEARNT
 
     def well(self, evidence: EdgeEvidence) -> None:
         """A frame in which all seems well."""
@@ -132,7 +130,7 @@ class CauseJudge:
         pooled = pool(self._frames, self._camera, self._gripper)
         blind = len(pooled.piece) < FEWEST_PIECES
         scatter_px = 0.0 if blind else float(np.median(pooled.evidence.sigma_px))
-        ill_seen = bool((pooled.share < FINGER_AGREEING_SHARE).any())
+        ill_seen = bool((pooled.share < FINGER_SEEN_SHARE).any())
         # What the image itself explains needs no other cause.
         if blind or (baseline is not None and (ill_seen or scatter_px > SCATTERED_PX)):
             spoilt = _spoilt(pooled, baseline)
@@ -140,10 +138,10 @@ class CauseJudge:
                 return self._told(BAD_IMAGE_CAUSES, spoilt)
         if blind and baseline is not None and _unsharp(pooled, baseline):
             text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
-            return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
+            return self._told(dict(zip((Cause.LENS, Cause.UNKNOWN), _LIKELY, strict=True)), text)
         if blind and pooled.cells.min() > BRIGHT:
             text = f"no part of the image is below {100.0 * BRIGHT:.0f} % of the full scale: too much light, or hidden"
-            return self._told({Cause.IMAGE_BAD: 0.7, Cause.UNKNOWN: 0.3}, text)
+            return self._told(dict(zip((Cause.IMAGE_BAD, Cause.UNKNOWN), _LIKELY, strict=True)), text)
         if blind:
             return self._told(
                 BLIND_CAUSES, "no finger is seen where it should be, nor near it; hidden, or far out of place"
@@ -242,9 +240,9 @@ def _ill_founded(key: Key, pooled: Pooled, unseen: NDArray[np.bool_]) -> bool:
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
-        return part not in pooled.absent and (not pooled.share[part] >= FINGER_AGREEING_SHARE or bool(unseen[part]))
+        return part not in pooled.absent and (not pooled.share[part] >= FINGER_SEEN_SHARE or bool(unseen[part]))
     several = min(len(pooled.share), 2)
-    return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_AGREEING_SHARE).sum()) < several
+    return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_SEEN_SHARE).sum()) < several
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

@@ -20,17 +20,20 @@ from numpy.typing import NDArray
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State, finger_lever_m, finger_slice
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M
 
-MOUNT_SIZES_M = np.geomspace(5e-5, 1e-2, 8)
-FINGER_SIZES_M = np.geomspace(5e-5, 3e-3, 6)
-JAW_SIZES_M = np.geomspace(5e-5, 3e-3, 6)
+SMALLEST_M = 5e-5
+"""The smallest motion that is worth telling."""
+
+MOUNT_SIZES_M = np.geomspace(SMALLEST_M, 1e-2, 8)
+PART_SIZES_M = np.geomspace(SMALLEST_M, 3e-3, 6)
 FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
-"""How far things move when they move: shift of the TCP, of a finger, of the opening; relative focal length."""
+"""How far things move when they move: shift of the TCP; of a finger or the opening; relative focal length."""
 
-JAW_UNREPORTED_SIGMA_M = 0.02
-"""What is known about an opening that no one reports."""
-
-_MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.3, 0.1, 0.1
+_MOUNT, _FINGER, _JAW, _RARE = 0.3, 0.25, 0.15, 0.1
+"""Probabilities beforehand, given that something looks wrong: of a mount that moved, or another camera after a pause;
+of a bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,22 +83,22 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
 
     pose = np.array([1.0] * 3 + [1.0 / distance_m] * 3)
     out = [
-        Suspect(None, None, _NOTHING, Model(held, freed(), np.zeros(0))),
+        Suspect(None, None, _RARE, Model(held, freed(), np.zeros(0))),
         Suspect(Cause.CAMERA_MOUNT, None, _MOUNT, Model(held, freed((POSE, pose)), MOUNT_SIZES_M)),
-        Suspect(Cause.LENS, None, _LENS, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
+        Suspect(Cause.LENS, None, _RARE, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
     ]
     if interrupted:
         # Another camera in its place: an image of another scale from nearly the same place.
         model = Model(held, freed((POSE, pose), (FOCAL, 5.0)), MOUNT_SIZES_M)
-        out.append(Suspect(Cause.CAMERA_REPLACED, None, _REPLACED, model))
+        out.append(Suspect(Cause.CAMERA_REPLACED, None, _MOUNT, model))
     if gripper.has_jaw and known.jaw_reported:
-        out.append(Suspect(Cause.JAW_OPENING, None, _JAW, Model(held, freed((JAW, 1.0)), JAW_SIZES_M)))
+        out.append(Suspect(Cause.JAW_OPENING, None, _JAW, Model(held, freed((JAW, 1.0)), PART_SIZES_M)))
     if fingers > 1:
         for finger in range(fingers):
-            model = Model(held, freed(bent(finger)), FINGER_SIZES_M)
+            model = Model(held, freed(bent(finger)), PART_SIZES_M)
             out.append(Suspect(Cause.FINGER_BENT, finger, _FINGER / fingers, model))
     every = freed((POSE, pose), (FOCAL, 5.0), *(bent(finger) for finger in range(fingers)))
-    out.append(Suspect(Cause.UNKNOWN, None, _SEVERAL, Model(held, every, MOUNT_SIZES_M)))
+    out.append(Suspect(Cause.UNKNOWN, None, _RARE, Model(held, every, MOUNT_SIZES_M)))
     return out
 
 

@@ -12,6 +12,9 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from gripmon.judge.causes.models import SMALLEST_M
+from gripmon.judge.causes.pooling import FEWEST_EDGES
+from gripmon.judge.drift.kinds import SIGNIFICANT_SIGMAS
 from gripmon.model.records import Array
 
 LEARNT, NEWEST = 20, 5
@@ -23,13 +26,12 @@ CHANGED_PX, CHANGED = 0.25, 0.3
 FINGER_MISSING_RATIO = 0.8
 """Part of the usual share of a finger's profiles that agree, below which the finger may be elsewhere."""
 
+RESIDUAL_PX = 0.05
+"""By how much the mean residuals of edges must differ from the usual ones at least, px."""
 
-RESIDUAL_PX, RESIDUAL_SIGMAS, FEWEST_EDGES = 0.05, 4.0, 2
-"""By how much the mean residuals of so many edges must differ from the usual ones: px, and standard deviations."""
-
-JAW_M, JAW_SIGMAS = 5e-5, 3.0
-"""By how much the opening must differ from the report otherwise than usually: m, and standard deviations of one frame,
-of which five have to agree.
+JAW_SIGMAS = 3.0
+"""Standard deviations of one frame, of which five have to agree, by which the opening must differ from the report
+otherwise than usually; and by no less than what counts as a motion at all.
 """
 
 
@@ -107,7 +109,7 @@ class ResidualWatch:
             self._first.append(residual_px)
             if len(self._first) == LEARNT:
                 # Means of five frames before a background that stands still scatter as much as one.
-                allowed_px = np.maximum(RESIDUAL_PX, RESIDUAL_SIGMAS * np.std(self._first, axis=0))
+                allowed_px = np.maximum(RESIDUAL_PX, SIGNIFICANT_SIGMAS * np.std(self._first, axis=0))
                 self._usual = np.mean(self._first, axis=0), allowed_px
             return False
         usual_px, allowed_px = self._usual
@@ -126,7 +128,7 @@ class JawWatch:
         if reported_m is None:
             return False
         now_m, usual_m = self._error_m.add(seen_m - reported_m), self._error_m.usual
-        return usual_m is not None and abs(now_m - usual_m) > max(JAW_M, JAW_SIGMAS * self._error_m.scatter)
+        return usual_m is not None and abs(now_m - usual_m) > max(SMALLEST_M, JAW_SIGMAS * self._error_m.scatter)
 
 
 class Watches:

@@ -189,35 +189,6 @@ def slide(ring: Array, newest: int, values: Array, lengths: Ints) -> tuple[Array
 
 
 @compiled
-def _beyond(
-    mean: Array,
-    difference: Array,
-    frames: Ints,
-    lengths: Ints,
-    whitening: Array,
-    limit: Array,
-    most_tolerated: Array,
-    tolerated: Array,
-    worth: float,
-    sweeps: int,
-) -> Array:
-    """See :func:`decide`."""
-    out = np.zeros(limit.shape)
-    for k in range(len(lengths)):
-        for s in range(len(frames)):
-            if frames[s] >= lengths[k]:
-                found, least = _square(whitening[0, k, s], mean[k, s]), limit[0, k, s]
-                surely = math.sqrt(least) + most_tolerated[k, s]
-                # What is tolerated can only matter between these two.
-                if worth * least < found <= surely * surely:
-                    found = _square_beyond(whitening[0, k, s], mean[k, s], tolerated, sweeps)
-                out[0, k, s] = found / least
-            if frames[s] >= 2 * lengths[k]:
-                out[1, k, s] = _square(whitening[1, k, s], difference[k, s]) / limit[1, k, s]
-    return out
-
-
-@compiled
 def decide(
     mean: Array,
     difference: Array,
@@ -235,10 +206,18 @@ def decide(
     reach back too far.  And what a :class:`~gripmon.judge.drift.sequential.Finding` holds, by windows from the number
     ``first`` on.
     """
-    beyond = _beyond(
-        mean, difference, frames, lengths, whitening, limit, most_tolerated, tolerated, worth, sweeps
-    )  # fmt: skip
-    streams = beyond.shape[2]
+    beyond, streams = np.zeros(limit.shape), len(frames)
+    for k in range(len(lengths)):
+        for s in range(streams):
+            if frames[s] >= lengths[k]:
+                found, least = _square(whitening[0, k, s], mean[k, s]), limit[0, k, s]
+                surely = math.sqrt(least) + most_tolerated[k, s]
+                # What is tolerated can only matter between these two.
+                if worth * least < found <= surely * surely:
+                    found = _square_beyond(whitening[0, k, s], mean[k, s], tolerated, sweeps)
+                beyond[0, k, s] = found / least
+            if frames[s] >= 2 * lengths[k]:
+                beyond[1, k, s] = _square(whitening[1, k, s], difference[k, s]) / limit[1, k, s]
     moved, stepped = np.zeros(streams, dtype=np.bool_), np.zeros(streams, dtype=np.bool_)
     length, excess = np.full(streams, lengths[first]), np.zeros(streams)
     for s in range(streams):

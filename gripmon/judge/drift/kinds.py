@@ -16,19 +16,21 @@ BLOCK_S = 0.5
 """Seconds over which frames are averaged; a change of the mean that took no longer is a step."""
 
 KEPT_BLOCKS = 256
-
-FEWEST_BLOCKS = 6
-"""Blocks below which a creep isn't told from a step."""
+"""Blocks in which the beginning of a motion is looked for: two minutes."""
 
 LASTING_BLOCKS = 3
 """Blocks that must have come after a step."""
+
+FEWEST_BLOCKS = 2 * LASTING_BLOCKS
+"""Blocks below which a creep isn't told from a step: as many before it."""
 
 EXPLAINED_SQUARES_RATIO = 0.6
 """A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
 
 SIGNIFICANT_SIGMAS = 4.0
-"""Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero, and a
-first shift from the reference on some axis is more than the reference's error.
+"""Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero,
+a first shift from the reference on some axis is more than the reference's error, an edge contradicts the fit otherwise
+than usually, and a piece of an edge doesn't stand at a place.
 """
 
 
@@ -146,10 +148,11 @@ def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array
 KEPT_FRAMES = 128
 """Frames that are looked at: two seconds at 60 frames/s."""
 
-LOOK_FRAMES = 32
-"""Looked at once in so many frames."""
-
 PARTS = 4
+"""In which it is looked for, each by itself."""
+
+LOOK_FRAMES = KEPT_FRAMES // PARTS
+"""Looked at once in so many frames: when a part is new."""
 
 VIBRATION_VARIANCE_RATIO = 6.0
 """Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""

@@ -14,6 +14,8 @@ import numpy as np
 from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT_SIGMAS, History, VibrationWatch, goes_on
 from gripmon.judge.drift.sequential import SequentialTest
 from gripmon.judge.drift.settings import DriftSettings
+from gripmon.judge.drift.statistics import BLOCK_FRAMES
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
 
@@ -60,8 +62,8 @@ LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
 is the mean.
 """
 
-USUAL_SQUARE = 12.6
-"""Squared normalised distance that six normal errors exceed once in twenty times (chi-square): with a shift below it
+USUAL_SQUARE = chi_square_limit(0.05)
+"""Squared normalised distance that normal errors exceed once in twenty times: with a shift below it
 the camera counts as back, so that between this and the test's threshold an alert stays.
 """
 
@@ -73,8 +75,8 @@ BIAS_CHANGED = 0.2
 standard deviation.
 """
 
-VIBRATING_FRAMES = 256
-"""While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone; over
+VIBRATING_FRAMES = BLOCK_FRAMES
+"""While it vibrates: frames of the shortest window that decides, for over a block a vibration is nearly gone; over
 twice as many the mean tells whether the camera is back.
 """
 

@@ -82,28 +82,6 @@ def slide(ring: Array, newest: int, values: Array, lengths: Ints) -> tuple[Array
     return mean, mean - (ago - twice_ago) / count
 
 
-def _beyond(
-    mean: Array,
-    difference: Array,
-    frames: Ints,
-    lengths: Ints,
-    whitening: Array,
-    limit: Array,
-    most_tolerated: Array,
-    tolerated: Array,
-    worth: float,
-    sweeps: int,
-) -> Array:
-    full = np.stack([frames >= lengths[:, None], frames >= 2 * lengths[:, None]])
-    found = np.stack([squares(whitening[0], mean), squares(whitening[1], difference)])
-    # What is tolerated can only matter between these two.
-    surely = np.sqrt(limit[0]) + most_tolerated
-    some = full[0] & (found[0] > worth * limit[0]) & (found[0] <= surely * surely)
-    if some.any():
-        found[0, some] = least_squares(whitening[0, some], mean[some], tolerated, sweeps)
-    return np.where(full, found / limit, 0.0)
-
-
 def decide(
     mean: Array,
     difference: Array,
@@ -117,7 +95,14 @@ def decide(
     sweeps: int,
     first: int,
 ) -> tuple[Array, tuple[Bools, Ints, Bools, Array]]:
-    every = _beyond(mean, difference, frames, lengths, whitening, limit, most_tolerated, tolerated, worth, sweeps)
+    full = np.stack([frames >= lengths[:, None], frames >= 2 * lengths[:, None]])
+    found = np.stack([squares(whitening[0], mean), squares(whitening[1], difference)])
+    # What is tolerated can only matter between these two.
+    surely = np.sqrt(limit[0]) + most_tolerated
+    some = full[0] & (found[0] > worth * limit[0]) & (found[0] <= surely * surely)
+    if some.any():
+        found[0, some] = least_squares(whitening[0, some], mean[some], tolerated, sweeps)
+    every = np.where(full, found / limit, 0.0)
     beyond = every[:, first:]
     excess = beyond.max(axis=(0, 1))
     # The shortest window that is beyond its threshold dates the motion best.

@@ -32,23 +32,26 @@ from gripmon.judge.drift.statistics import (
     Scatter,
     Windows,
 )
+from gripmon.judge.smoothing import LEARN_EVERY
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 
 SWEEPS = 8
 """Rounds over the axes; each can only come closer, and after none of them the answer is too small."""
 
 
-REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
-"""Frames after which covariances are inverted and thresholds reckoned again, and after which scatter is learnt."""
+REFRESH_FRAMES = 16
+"""Frames after which covariances are inverted and thresholds reckoned again."""
 
 FREEDOM, FREEDOM_GROWTH = 9.0, 1.0 / 3.0
 """Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
 number of frames with which those of a mean grow: the mean of many is more nearly normal.
 """
 
-TAIL, TAIL_WINDOWS, NORMAL_SQUARE = 0.01, 500.0, 16.8
+TAIL, TAIL_WINDOWS = 0.01, 500.0
+NORMAL_SQUARE = chi_square_limit(TAIL)
 """How far out the noise's own distribution is compared with the normal one, over how many windows, and where that is
-for six normal errors (chi-square).
+for normal errors.
 """
 
 STUDENT_TAIL, HEAVY = 1.6, (0.25, 1.5)
@@ -64,10 +67,10 @@ THRESHOLD_MARGIN = 1.55
 streams simulated after images the contract needed 1.2 to 1.5).
 """
 
-SHORT_LENGTHS = 9
+SHORT_LENGTHS = LENGTHS.index(BLOCK_FRAMES) + 1
 """Lengths, 1 to 256 frames, whose limits are learnt: of longer windows a stream shows too few."""
 
-ALIKE_FRAMES = 512.0
+ALIKE_FRAMES = 2.0 * BLOCK_FRAMES
 """Frames over which a background stays, at least, and bursts come and go: their extremes count as one together."""
 
 OUTLIER_LIMIT_RATIO = 2.0
@@ -195,7 +198,7 @@ class SequentialTest(ByArithmetic):
         if self._frames % EXTREME_FRAMES == 0:
             usable = np.stack(self.windows.full()) & (beyond[1] <= OUTLIER_LIMIT_RATIO).all(axis=0)
             self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
-        if self._frames % LEARNING_FRAMES == 0:
+        if self._frames % LEARN_EVERY == 0:
             # An offset that stays says nothing against what differences show.
             usable = self.windows.full()[1] & ~(beyond[1] > 1.0).any(axis=0)
             self._learn(difference, usable if learn is None else usable & learn)
@@ -238,20 +241,20 @@ class SequentialTest(ByArithmetic):
     def _learn(self, difference: Array, usable: np.ndarray) -> None:
         """What differences (k, s, 6) show of the noise, where they are usable (k, s)."""
         normalised = self._by.squares(self._learnt_whitening, difference)
-        self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
+        self.scatter.learn(difference, normalised, usable, LEARN_EVERY)
         self._learn_surge(normalised, usable)
         self._learn_tail(normalised, usable)
 
     def _learn_surge(self, normalised: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
-        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * COUNT), 0.0)
+        rate = np.where(usable, LEARN_EVERY / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * COUNT), 0.0)
         self._surge += rate * (np.minimum(normalised / 6.0, LARGEST_SQUARE) - self._surge)
 
     def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
         """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
         ones.
         """
-        share = np.minimum(LEARNING_FRAMES / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
+        share = np.minimum(LEARN_EVERY / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
         beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 

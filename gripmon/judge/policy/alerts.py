@@ -11,7 +11,7 @@ import msgspec
 
 from gripmon.model.records import Alert, AlertEvent, Cause, OpenAlert, Severity
 
-_RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
+RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +86,9 @@ class AlertBook:
             event=AlertEvent.UPDATED,
             alert_id=known.alert_id,
             since_ns=known.since_ns,
-            acknowledged=known.acknowledged and _RANK[alert.severity] <= _RANK[known.severity],
+            acknowledged=known.acknowledged and RANK[alert.severity] <= RANK[known.severity],
         )
-        worse = _RANK[alert.severity] > _RANK[known.severity]
+        worse = RANK[alert.severity] > RANK[known.severity]
         explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
         due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
         if worse or (due and (news or _differ(known, updated))):

@@ -11,12 +11,10 @@ from scipy.special import fdtrc
 from gripmon.judge.recalibrate.stills import StillFrame
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, EdgeSums
+from gripmon.track.edges.kernel import FEWEST_FREE
 
 STRETCH_PX, EDGE_PX = 0.015, 0.03
 """Standard deviations that last and that nothing explains, px: of a stretch's mean, and of a whole edge."""
-
-FEWEST_FREE = 3
-"""Stretches beyond the unknowns from which their residuals say anything."""
 
 UNDETERMINED_VARIANCE = 1.0
 """Variance of a pose that isn't determined without one of its edges, m² and rad²."""

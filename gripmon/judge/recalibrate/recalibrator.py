@@ -27,7 +27,6 @@ from gripmon.judge.recalibrate.pnp import (
 )
 from gripmon.judge.recalibrate.settings import RecalibrationSettings
 from gripmon.judge.recalibrate.stills import (
-    OUTLYING_ERROR_SQUARE,
     Average,
     MeanCorners,
     StillFrame,
@@ -37,13 +36,16 @@ from gripmon.judge.recalibrate.stills import (
 )
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
 from gripmon.model.gripper import Gripper
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 
-OUTLIER_FRAME_SHARE = 0.25
-"""Part of the frames whose pose may lie far from the others' while the camera counts as standing still."""
+OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
+"""Squared normalised error that normal errors exceed once in a thousand times."""
 
-OUTLIER_CORNER_SHARE = 0.25
-"""Part of the corners that may be left out because the others contradict them; at least one."""
+OUTLIER_SHARE = 0.25
+"""Part of the frames whose pose may lie far from the others' while the camera counts as standing still; and of the
+corners that may be left out because the others contradict them, at least one.
+"""
 
 RETRY_FRAMES = 5
 """Frames until what waits for more frames is looked at again."""
@@ -211,7 +213,7 @@ class Recalibrator:
         return asks
 
     def _check_still(self, tracked: Average) -> None:
-        if tracked.outlying > OUTLIER_FRAME_SHARE:
+        if tracked.outlying > OUTLIER_SHARE:
             raise _Refused(
                 RefusalReason.NOT_STILL, f"{100 * tracked.outlying:.0f} % of the frames show the gripper elsewhere"
             )
@@ -278,7 +280,7 @@ class Recalibrator:
 
     def _agreeing(self, corners: MeanCorners, every: list[Recalibration]) -> tuple[MeanCorners, list[Recalibration]]:
         """Without the corner, or the few, that the others contradict: whichever leaves the smallest residuals."""
-        for _ in range(max(1, int(OUTLIER_CORNER_SHARE * len(corners.corner)))):
+        for _ in range(max(1, int(OUTLIER_SHARE * len(corners.corner)))):
             count = len(corners.corner)
             if _rms(every[0], count) <= self._settings.worst_weighted_rms:
                 break

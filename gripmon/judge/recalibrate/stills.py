@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, EdgeSums
 
@@ -22,12 +23,6 @@ NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
 """Frames in a row that count as one at least, since their changing errors are alike, too; and the largest correlation
 of neighbours that a few frames can tell.
 """
-
-OUTLYING_ERROR_SQUARE = 22.46
-"""Squared normalised error that six normal errors exceed once in a thousand times (chi-square)."""
-
-OUTLYING_FRAME_SQUARE = 37.7
-"""The same for once in a million times: from there on one frame doesn't belong to the others."""
 
 FIRST_FRAMES = 3
 """First frames, whose claims are taken for those of all if they are larger."""
@@ -77,7 +72,7 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
     xis = np.array([perturbation_between(middle_T, f.cam_T_grip) for f in frames])
     weights = np.array([np.linalg.inv(f.covariance) for f in frames])
     centre = np.median(xis, axis=0)
-    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > OUTLYING_FRAME_SQUARE
+    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > GATE_SQUARE
     outlying = float(far.mean())
     if np.count_nonzero(~far) >= 4:
         xis, weights = xis[~far], weights[~far]

@@ -77,7 +77,7 @@ class Gripper:
         at_corner = (self.edge_points[None] == self.corner_points[:, None, None]).any(axis=2)
         self._edges_at_corner = [np.flatnonzero(at_it & ~self.edge_curved) for at_it in at_corner]
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
-        self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
+        self.edge_polarity = np.array([POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self.edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
         self.notes: list[str] = []
         self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
@@ -341,7 +341,7 @@ class Gripper:
                 )
 
 
-_POLARITY = {"any": 0, "right": 1, "left": -1}
+POLARITY = {"any": 0, "right": 1, "left": -1}
 
 
 def on_a_line(points_m: Array) -> bool:

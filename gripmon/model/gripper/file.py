@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import yaml
 
+from gripmon.model.errors import one_line
 from gripmon.model.gripper.core import Gripper
 from gripmon.model.gripper.model import GripperError, GripperModel
 
@@ -33,6 +34,6 @@ def load_gripper(path: Path | str) -> Gripper:
         value = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
         return gripper_from_dict(value)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GripperError(f"not YAML: {' '.join(str(error).split())}; see configs/grippers for examples") from None
+        raise GripperError(f"not YAML: {one_line(error)}; see configs/grippers for examples") from None
     except msgspec.ValidationError as error:
         raise GripperError(str(error)) from None

@@ -88,6 +88,10 @@ class SnapshotImage(msgspec.Struct, frozen=True):
     size_bytes: Annotated[int, Meta(description="of the attachment")]
 
 
+Outlines = tuple[tuple[tuple[float, float], ...], ...]
+"""Lines in an image, each through its points (u, v), px."""
+
+
 class Snapshot(msgspec.Struct, frozen=True):
     """The newest frame: what the monitor made of it, and its image."""
 
@@ -97,6 +101,10 @@ class Snapshot(msgspec.Struct, frozen=True):
         float | None, Meta(description="the opening that the robot had reported, m; null if none")
     ]
     image: Annotated[SnapshotImage | None, Meta(description="null if the frame has none that can be kept")]
+    outlines_px: Annotated[
+        Outlines,
+        Meta(description="the gripper's visible edges where the record's transform has them, each through its points"),
+    ] = ()
 
 
 class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reply/1"):

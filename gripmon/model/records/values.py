@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 else:  # these are for annotations alone: who only reads messages needn't load NumPy
     Array = Image = Any
 
+NS_PER_S = 1_000_000_000
+
 Translation = Annotated[tuple[float, float, float], Meta(description="x, y, z of the TCP in camera axes, m")]
 Rotation = Annotated[
     tuple[float, float, float, float], Meta(description="unit quaternion x, y, z, w, gripper to camera")

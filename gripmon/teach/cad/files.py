@@ -12,7 +12,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, one_line
 from gripmon.model.gripper.faces import triangles as cut_into_triangles
 from gripmon.model.records import Array
 
@@ -64,8 +64,9 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.intp)
     except Exception as error:  # noqa: BLE001  # its readers raise whatever a damaged file leads to
-        text = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: can't be read as a mesh ({text}); STL, OBJ or PLY with triangles") from None
+        raise InputError(
+            f"{path}: can't be read as a mesh ({one_line(error):.120}); STL, OBJ or PLY with triangles"
+        ) from None
     if not len(triangles):
         raise InputError(f"{path}: has no triangles; a mesh of the fingers' surface")
     if len(triangles) > LARGEST_TRIANGLES:

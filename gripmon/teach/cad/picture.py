@@ -8,10 +8,10 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
-from gripmon.teach.drawing import Canvas, Labels
+from gripmon.teach.drawing import CORNER_BGR, CREASE_BGR, OUTLINE_BGR, Canvas, Labels
 
 _PAPER = 60
-_OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR, _JOINT_BGR = (60, 170, 255), (90, 220, 120), (60, 230, 240), (200, 200, 200)
+_JOINT_BGR = (200, 200, 200)
 _WIDTH_PX = 1200
 
 
@@ -32,7 +32,7 @@ def draw_gripper(camera: Camera, gripper: Gripper, cam_T_grip: Array, image: Ima
         line = camera.project(lines[edge])
         line = line[np.isfinite(line).all(axis=1) & (np.abs(line) < 1e4).all(axis=1)]
         if len(line) > 1:
-            canvas.line(line, _CREASE_BGR if view.crease[edge] else _OUTLINE_BGR)
+            canvas.line(line, CREASE_BGR if view.crease[edge] else OUTLINE_BGR)
             ends_seen |= {a, b}
     corners = set(gripper.corner_points.tolist())
     labels = Labels(canvas.picture)
@@ -42,7 +42,7 @@ def draw_gripper(camera: Camera, gripper: Gripper, cam_T_grip: Array, image: Ima
     )
     for p in sorted(ends_seen):
         if np.isfinite(uv_px[p]).all() and (np.abs(uv_px[p]) < 1e4).all():
-            canvas.circle(uv_px[p], 5.0 if p in corners else 2.0, _CORNER_BGR if p in corners else _JOINT_BGR)
+            canvas.circle(uv_px[p], 5.0 if p in corners else 2.0, CORNER_BGR if p in corners else _JOINT_BGR)
             if p in corners:
-                labels.put(gripper.point_ids[p], canvas.pixel(uv_px[p]), _CORNER_BGR)
+                labels.put(gripper.point_ids[p], canvas.pixel(uv_px[p]), CORNER_BGR)
     return canvas.picture

@@ -9,12 +9,14 @@ Where little shows of a rounding it is like a corner, at which neither of its tw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Image
+from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
@@ -53,14 +55,6 @@ by, px.
 
 CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
-
-CONTINUATION_SHARE = 0.5
-"""Share of the probes that must show it: half of them, as for an edge beside a corner."""
-
-TURN_SEEN_SHARE = 0.5
-"""Share of the profiles on a stretch of the curve that must agree for a turn to be seen, and over the rest of its side
-that of the side's end: half, as for an edge beside a corner.
-"""
 
 
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
@@ -158,6 +152,7 @@ class _Places:
         return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, *columns[2:])
 
 
+@lru_cache(maxsize=8)
 def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
     """(s,) the finger of each place at which one may end: corners, where sides turn into curves, roundings."""
     return FingerEnds(gripper, EdgeSettings()).finger
@@ -172,6 +167,7 @@ class FingerEnds:
         self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
+        self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
 
     @property
     def finger(self) -> NDArray[np.intp]:
@@ -212,7 +208,7 @@ class FingerEnds:
             if places.rounding[number] < 0:
                 usual[0] = consensus.edge_share[places.side[number]]
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
-            measured[number] = seen and (shown >= TURN_SEEN_SHARE * usual).all()
+            measured[number] = seen and (shown >= SHOWN_BESIDE * usual).all()
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.place) and measured.any():
             goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
@@ -234,7 +230,7 @@ class FingerEnds:
         shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
-        goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > CONTINUATION_SHARE
+        goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > SHOWN_BESIDE
         return np.asarray(goes_on | shown[:, :PROBES_AT_CORNER].all(axis=1) if strict else goes_on)
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
@@ -287,10 +283,14 @@ class FingerEnds:
 
     def _rounded(self, prediction: Prediction) -> dict[int, Rounding]:
         """The roundings that this view has, where it isn't seen how a side turns into a curve."""
+        if self._kept_roundings is not None and self._kept_roundings[0] is prediction:
+            return self._kept_roundings[1]
         places, profiles = self._places, prediction.profiles
         turning = (places.side >= 0) & (profiles[places.side] > 0) & (profiles[places.curve] > 0)
         pairs = np.column_stack([places.side, places.curve])[turning].tolist()
-        return self._roundings.seen_in(prediction, {frozenset(pair) for pair in pairs})
+        seen = self._roundings.seen_in(prediction, {frozenset(pair) for pair in pairs})
+        self._kept_roundings = prediction, seen
+        return seen
 
     def _turn(
         self, prediction: Prediction, number: int, here: int, clear_px: Array

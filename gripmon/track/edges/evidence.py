@@ -23,9 +23,10 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
 from gripmon.track.edges.ends import FingerEnds
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
+from gripmon.track.edges.prediction import FEWEST_SAMPLES
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
-from gripmon.track.edges.settling import Expected, Measurement, Settler
+from gripmon.track.edges.settling import ZOOMS, Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
@@ -34,16 +35,15 @@ FINGER_ELSEWHERE_RATIO = 1.2
 """Factor by which more profiles of a finger must agree elsewhere than where the gripper as a whole shows."""
 
 FINGER_SEEN_SHARE = 0.5
-"""Share of a finger's profiles below which it is looked for farther away."""
+"""Share of a finger's profiles that must agree with where it is said to be, or it is looked for farther away.  What
+fewer show may be anything that has an edge or two: a shadow, a finger's other side, what lies behind.
+"""
 
 FINGER_FOUND_SHARE = 0.55
 """Share of a finger's profiles that must agree there: other things have a straight edge or two as well."""
 
-WIDE_ZOOMS = (2, 4)
-"""Zooms with which it is looked for there."""
-
-FEWEST_POINTS, FEWEST_SHARE = 4, 0.4
-"""Points of a stretch, and part of its profiles, that must agree for it to count as seen."""
+FEWEST_SHARE = 0.4
+"""Part of a stretch's profiles, and no fewer than an edge needs, that must agree for it to count as seen."""
 
 _STEP_PX = 2.0
 _REFINED = 3
@@ -125,7 +125,7 @@ class FingerMeter(Settler):
         if best is None or best.share >= FINGER_SEEN_SHARE:
             return best
         opening_m = prediction.jaw_opening_m
-        for zoom in WIDE_ZOOMS:
+        for zoom in ZOOMS[1:]:
             if zoom <= measurement.candidates.zoom:
                 continue
             for pose in (measurement.cam_T_grip, *elsewhere):
@@ -350,5 +350,5 @@ def _points(place: _Place) -> NDArray[np.intp]:
     number = prediction.layout.stretch
     profiles = np.bincount(number[prediction.ok], minlength=int(number.max(initial=0)) + 1)
     points = np.bincount(number[candidates.sample[index]], minlength=len(profiles))
-    good = (points >= FEWEST_POINTS) & (points >= FEWEST_SHARE * profiles)
+    good = (points >= FEWEST_SAMPLES) & (points >= FEWEST_SHARE * profiles)
     return index[good[number[candidates.sample[index]]]]

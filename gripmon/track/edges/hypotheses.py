@@ -17,6 +17,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, skew
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
+from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.reduced import (
     ORIENTATIONS,
     RANK_LEVELS,
@@ -30,9 +31,6 @@ from gripmon.track.edges.reduced import (
 
 POINTS_LENGTH_EXPONENT = 0.75
 """Exponent of the length in an edge's number of points: short edges across the fingers tell what long ones don't."""
-
-FEWEST_EDGES = 3
-"""With fewer outlines in view, lines between two faces are looked at, too."""
 
 _EDGE_MARGIN = 0.03  # of an edge at each end: the neighbour shows there
 
@@ -70,7 +68,7 @@ def outline_points(
     ends_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(ends_m, invert(cam_T_grip)[:3, 3])
     wanted = view.visible & ~view.crease
-    if np.count_nonzero(wanted) < FEWEST_EDGES:
+    if np.count_nonzero(wanted) < FEWEST_EDGES:  # then lines between two faces are looked at, too
         wanted = view.visible
     edges = np.flatnonzero(wanted)
     share = np.linspace(_EDGE_MARGIN, 1.0 - _EDGE_MARGIN, 65)

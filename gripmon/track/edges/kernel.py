@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 
 from gripmon.model.compiled import compiled
+from gripmon.model.least_squares import TUKEY
 
 SIZE = 7
 """Unknowns of a gripper with a jaw: sums of a size that is known beforehand are compiled without loops."""
-
-TUKEY = 4.685
-"""Width of the biweight in standard deviations that is 95 % efficient for normal errors."""
 
 WIDTH_DECAY = 0.4
 """What is left of the width that covers the start's error, from round to round."""
@@ -33,6 +31,9 @@ LARGEST_SPREAD_PX = 1.0
 
 LARGEST_SPREAD, SMALLEST_SPREAD_PX, FEWEST_SPREAD = 3.0, 0.05, 12
 """Bounds of the robust spread, in standard deviations and px, and residuals from which it is told."""
+
+INNER_SIGMAS, INNER_PX = 4.0, 0.3
+"""Residuals within so many standard deviations and px more tell the robust spread, however wide the weight still is."""
 
 SMALLEST_STIFFNESS = 0.2
 
@@ -185,7 +186,7 @@ def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float
     """``consensus._spread``; ``buffer`` is overwritten."""
     count = 0
     for j in range(len(residual)):
-        if abs(residual[j]) < min(width, 4.0 * sigma[j] + 0.3):
+        if abs(residual[j]) < min(width, INNER_SIGMAS * sigma[j] + INNER_PX):
             buffer[count] = abs(residual[j])
             count += 1
     if count < FEWEST_SPREAD:
@@ -193,7 +194,7 @@ def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float
     spread_px = 1.4826 * _nth(buffer, count, count // 2)
     count = 0
     for j in range(len(residual)):
-        if abs(residual[j]) < min(width, 4.0 * sigma[j] + 0.3):
+        if abs(residual[j]) < min(width, INNER_SIGMAS * sigma[j] + INNER_PX):
             buffer[count] = abs(residual[j]) / sigma[j]
             count += 1
     spread = 1.4826 * _nth(buffer, count, count // 2)

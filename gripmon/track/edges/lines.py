@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
-from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import RobustFit
 
@@ -44,10 +44,9 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 SHOWN_BESIDE = 0.5
-"""Share of agreeing profiles next to a corner, over that on the rest of the edge, from which the corner is seen."""
-
-FEWEST_BESIDE = 4
-"""Profiles next to a corner that are looked at, however far apart they are."""
+"""Share of agreeing profiles next to a corner, over that on the rest of the edge, from which the corner is seen; on
+each stretch of a turn into a curve, from which that is seen; of probes beyond an end, from which the edge goes on.
+"""
 
 _FAULTS = (
     None,
@@ -59,8 +58,6 @@ _FAULTS = (
     CornerFault.UNCERTAIN,
 )
 _OUTSIDE, _SELF_HIDDEN, _FEW_POINTS, _HIDDEN, _PARALLEL, _UNCERTAIN = range(1, len(_FAULTS))
-
-_FEWEST_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +91,7 @@ class CornerGeometry:
                 along = float((corners.xy[i] - prediction.line_origin[edge]) @ direction)
                 reach_px = float(np.linalg.norm(prediction.uv_px[last - 1] - prediction.uv_px[first]))
                 near = round(settings.neighbourhood_px / max(reach_px, 1.0) * (last - first - 1))
-                near = min(max(near, FEWEST_BESIDE), last - first)
+                near = min(max(near, FEWEST_SAMPLES), last - first)
                 at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
                 beside = (first, first + near) if at_start else (last - near, last)
                 places.append((i, slots[edge], edge, *beside, first, last))
@@ -230,7 +227,7 @@ def _fit_lines(
     for v in range(count):
         s0, s1, s2, t0, t1 = sums[v, 0], sums[v, 1], sums[v, 2], sums[v, 3], sums[v, 4]
         determinant = s0 * s2 - s1 * s1
-        if points[v] < _FEWEST_POINTS or not determinant > 0.0:
+        if points[v] < FEWEST_SAMPLES or not determinant > 0.0:
             continue
         # What an edge's points share moves the whole line.
         common = (edge_spread_px[edges[v]] ** 2 + cut_off_px[edges[v]] ** 2) * gain[first[v]] ** 2
@@ -303,7 +300,7 @@ def _shows(supported: Any, part: Any) -> bool:
         else:
             elsewhere += supported[n]
     rest = last - first - end + begin
-    usual = elsewhere / rest if rest >= FEWEST_BESIDE else 1.0
+    usual = elsewhere / rest if rest >= FEWEST_SAMPLES else 1.0
     return bool(seen >= SHOWN_BESIDE * (end - begin) * usual)
 
 

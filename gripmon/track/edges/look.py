@@ -7,14 +7,9 @@ import math
 import numpy as np
 
 from gripmon.model.records import Image
+from gripmon.track.edges.kernel import FEWEST_AGREEING
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profiles import read_profiles
-
-BESIDE_PX = (2.0, 5.0)
-"""From where to where the grey levels beside an edge are averaged, px of the zoomed image: clear of its blur."""
-
-FEWEST_PROFILES = 5
-"""Profiles of an edge from which its sides are judged."""
+from gripmon.track.edges.profiles import BESIDE_PX, read_profiles
 
 
 def unevenness(image: Image, prediction: Prediction) -> float:
@@ -33,7 +28,7 @@ def unevenness(image: Image, prediction: Prediction) -> float:
     for edge in prediction.layout.edges:
         own = (prediction.layout.edge == edge) & prediction.ok
         number = int(np.count_nonzero(own))
-        if number < FEWEST_PROFILES:
+        if number < FEWEST_AGREEING:
             continue
         square += number * min(float(right[own].var()), float(left[own].var()))
         count += number

@@ -59,7 +59,7 @@ ROWS = 3
 """Neighbouring rows of pixels along an edge that make one profile."""
 
 FEWEST_SAMPLES = 4
-"""An edge with fewer profiles has no line of its own."""
+"""With fewer profiles, an edge has no line of its own, a stretch of one is not seen, a corner has nothing beside it."""
 
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""

@@ -1,5 +1,5 @@
-"""Profiles and edge candidates in machine code: what ``profiles``, ``saturation`` and ``consensus.base_weights`` do
-with NumPy, where each step's reason stands; both are held together by a test.
+"""Profiles and edge candidates in machine code: what ``profiles`` and ``saturation`` do with NumPy, where each step's
+reason stands; both are held together by a test.
 
 n profiles of s samples, k candidates, e edges of the gripper.
 """
@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 
 from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.pixels import BLUE, GREEN, RED
 
 if COMPILES:
     from llvmlite import ir
     from numba.core import types
     from numba.extending import intrinsic
-
-BLUE, GREEN, RED = 0.114, 0.587, 0.299
-"""Luma weights of ITU-R BT.601."""
 
 SHARPNESS = -0.75
 """Slope of the interpolating cubic one pixel away: OpenCV's, which keeps steps as steep as they are."""

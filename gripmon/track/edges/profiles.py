@@ -17,15 +17,13 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.compiled import COMPILES
+from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.records import Array, Image
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profile_kernel import (
     BEYOND_PX,
-    BLUE,
     FLAT_PEAK_CURVATURE,
-    GREEN,
-    RED,
     SATURATION_SHIFT_WIDTHS,
     SHARPNESS,
 )
@@ -33,9 +31,6 @@ from gripmon.track.edges.saturation import doubt
 
 if TYPE_CHECKING:
     from gripmon.track.edges.robust_fit import RobustFitSettings
-
-GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
-"""Luma weights of ITU-R BT.601 in OpenCV's channel order."""
 
 
 class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -52,10 +47,12 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 _CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
 
-UNREST_FROM_PX, UNREST_TO_PX = 2.0, 5.0
-"""Where texture is looked for that may shift an edge, from the edge to both sides, px."""
+BESIDE_PX = (2.0, 5.0)
+"""From where to where the grey levels beside an edge are averaged, and texture is looked for that may shift it, px of
+the zoomed image: clear of its blur.
+"""
 
-_NEAR, _FAR = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
+_NEAR, _FAR = (round(way_px / STEP_PX) for way_px in BESIDE_PX)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.profiles import GREY_BGR
 
 Floats = NDArray[np.float32]
 

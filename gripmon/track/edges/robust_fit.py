@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from gripmon.model.compiled import COMPILES
+from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array
 from gripmon.track.edges import kernel
 from gripmon.track.edges.kernel import (
@@ -25,11 +26,12 @@ from gripmon.track.edges.kernel import (
     FEWEST_AGREEING,
     FEWEST_EDGES,
     FEWEST_SPREAD,
+    INNER_PX,
+    INNER_SIGMAS,
     LARGEST_SPREAD,
     LARGEST_SPREAD_PX,
     SMALLEST_SPREAD_PX,
     SMALLEST_STIFFNESS,
-    TUKEY,
     WIDTH_DECAY,
 )
 from gripmon.track.edges.prediction import Prediction
@@ -87,7 +89,7 @@ RESTART_WIDTH_PX = 0.4
 NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
 
 ROUNDS = 6
-_ROUNDS_AGAIN = 3
+_ROUNDS_AGAIN = ROUNDS // 2  # from a start that is nearly right
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +331,7 @@ def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
     deviations, at least 1, and in px.
     """
     size = np.abs(residual)
-    near = np.flatnonzero(size < np.minimum(width, 4.0 * sigma + 0.3))
+    near = np.flatnonzero(size < np.minimum(width, INNER_SIGMAS * sigma + INNER_PX))
     if len(near) < FEWEST_SPREAD:
         return 1.0, LARGEST_SPREAD_PX
     size = size[near]

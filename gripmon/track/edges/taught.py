@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
+from gripmon.model.gripper.core import POLARITY
 from gripmon.model.records import Array, Transform
 from gripmon.track.edges.profiles import EdgeSettings
 
@@ -225,7 +226,7 @@ class TaughtEdges:
             np.sqrt(np.square([e.sigma_m for e in listed]).mean(axis=1)),
             depth,
             np.array([e.depth_sigma_m for e in listed]),
-            np.array([_POLARITY[e.brighter] for e in listed], dtype=np.int8),
+            np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
         )
 
@@ -278,4 +279,3 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 _UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
-_POLARITY = {"any": 0, "right": 1, "left": -1}

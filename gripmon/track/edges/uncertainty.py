@@ -24,9 +24,9 @@ from gripmon.track.edges.robust_fit import (
 )
 
 CONTRADICTION_RATIO = 3.0
-"""Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
-
-_EXPLAINED = 1.0 / 3.0
+"""Stretches that contradict each other more than this call for an edge that is none, without which they do so by no
+more than such a part; texture gives 1 to 2.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ def without_one_edge(
     """
     without = contradictions_without if COMPILES else contradictions_without_with_numpy
     stays = without(edgels, prior, start, settings)
-    if not len(stays) or not stays.min() < _EXPLAINED * contradiction:
+    if not len(stays) or not stays.min() < contradiction / CONTRADICTION_RATIO:
         return None
     rest = _without(edgels, int(edgels.prediction.layout.edges[stays.argmin()]))
     consensus = fit_irls(rest, prior, start, settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,13 @@ class Hypotheses:
     opening: NDArray[np.bool_]
     sudden: NDArray[np.bool_]
     ends: int
+
+    def without_ends(self) -> tuple[Hypotheses, NDArray[np.bool_]]:
+        """The same where no end of a finger is what it seems besides; (h,) which doubt more than that then."""
+        name = tuple(f"{name}, and what looks like ends" for name in self.name)
+        keep = self.keep * self.keep[self.ends]
+        more = (keep != self.keep[self.ends]).any(axis=1) | self.opening
+        return replace(self, name=name, keep=keep), more
 
 
 def hypotheses_of(

@@ -19,6 +19,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.compiled import COMPILES
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.poses import to_record
 from gripmon.model.records import Array, Image, LookPixels
 from gripmon.track.look import kernel, plain
@@ -59,8 +60,6 @@ gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is le
 RENEWED = 0.5
 """Correlation of a block with what it was first, below which it shows something else."""
 
-GREY_BGR = np.array([0.114, 0.587, 0.299])
-
 ARITHMETIC: ModuleType = kernel if COMPILES else plain
 
 _KINDS = ("<u2", "<f4", "<f4", "<f4", "<f4", "<u2")
@@ -70,13 +69,12 @@ _KINDS = ("<u2", "<f4", "<f4", "<f4", "<f4", "<u2")
 @dataclass(frozen=True, slots=True)
 class LookMotion:
     """Where the look has the gripper: ``cam_T_grip`` (4, 4) with covariance (6, 6) of its error since it was learnt,
-    camera axes; the opening then; ``agree`` (f,): share of each finger that looks as learnt, NaN where none is known.
+    camera axes; the opening then.
     """
 
     cam_T_grip: Array
     covariance: Array
     jaw_opening_m: float | None
-    agree: Array
 
 
 class LookAlignment:
@@ -217,8 +215,7 @@ class LookAlignment:
         except np.linalg.LinAlgError:  # hidden, but for too little
             self._last = None
             return None
-        agree = self._agree(share)
-        if not np.isfinite(here).all() or not (agree > 0.5).any():
+        if not np.isfinite(here).all() or not (self._agree(share) > 0.5).any():
             self._last = None
             return None
         since = here - motion
@@ -228,7 +225,7 @@ class LookAlignment:
         covariance = self._covariance(information, pulls, scatter, len(share))
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = found_T[:3, :3]
-        return LookMotion(found_T, turn @ covariance[:6, :6] @ turn.T, opening_m, agree)
+        return LookMotion(found_T, turn @ covariance[:6, :6] @ turn.T, opening_m)
 
     def _covariance(self, information: Array, pulls: Array, scatter: float, patches: int) -> Array:
         """(7, 7): by how much pixels scatter, and more if those of a patch pull together."""
@@ -241,6 +238,7 @@ class LookAlignment:
         return self._measured.moved_px(motion_between(one[0], other[0], one[1], other[1])) <= LINEAR_PX
 
     def _agree(self, share: Array) -> Array:
+        """(f,) share of each finger that looks as learnt, NaN where none is known."""
         return self._finger_share @ share
 
     def _lay_out(self, grey: tuple[Image, Array], cam_T_grip: Array, jaw_opening_m: float | None) -> bool:
@@ -355,4 +353,4 @@ def _channels(image: Image) -> tuple[Image, Array]:
     quantum = {np.dtype(np.uint8): 1.0, np.dtype(np.uint16): 257.0}.get(image.dtype, 1.0 / 255.0)
     if image.ndim == 2:
         return image[..., None], np.array([1.0 / quantum])
-    return image, GREY_BGR / quantum
+    return image, np.array([BLUE, GREEN, RED]) / quantum

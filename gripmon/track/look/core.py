@@ -21,8 +21,15 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, contents_of
+from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image, LookRecord
-from gripmon.track.look.agreement import AGREEING_CORRELATION, LookAgreement, LookRefused, patch_evidence
+from gripmon.track.look.agreement import (
+    AGREEING_CORRELATION,
+    CHANCE_BOUNDS,
+    LookAgreement,
+    LookRefused,
+    patch_evidence,
+)
 from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
 
 FORGET_S = 4.0 * 3600.0
@@ -31,8 +38,10 @@ FORGET_S = 4.0 * 3600.0
 FEWEST_VIEWS = 12
 """Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
 
-KEPT_SLIDE_TRIES = 3
-"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
+MANY_VIEWS, RELEARN_S = 100, 0.1
+"""Frames learnt one after the other, what isn't the gripper's averages to a tenth; then so many seconds apart: frames
+of a fast camera show nearly the same, and forgetting takes hours.
+"""
 
 LAY_OUT_AGAIN_S = 60.0
 """Pause before fingers that weren't in view are looked for again, s: it takes as long as some frames."""
@@ -46,14 +55,14 @@ CHANGED_BACKGROUND_SHARE = 0.33
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
 """Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
 
+KEPT_SLIDE_TRIES = FEWEST_VIEWS // len(SLIDES_M)
+"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
+
 ELSEWHERE_M = 2e-3
 """From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
 
 CONSTANT_PATCH_LENGTH = 0.7
 """Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
-
-LARGEST_CHANCE = 0.3
-"""A patch that agrees more often than this where the gripper isn't tells nothing."""
 
 KEPT_PATCHES = 16
 """Most telling ones of a finger that poses are compared with: 512 points on two fingers."""
@@ -63,9 +72,6 @@ DISAGREEING_FRAME_WEIGHT = 0.125
 
 SMALLEST_CONTRAST_LEVELS = 1.0
 """Contrast (root mean square) below which a patch has none, in steps of grey."""
-
-GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
-"""Brightness of blue, green and red (ITU-R BT.601)."""
 
 _U, _V = np.meshgrid(np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS), np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS))
 _LIGHT = np.linalg.qr(np.column_stack([np.ones(POINTS), _U.ravel(), _V.ravel()]))[0]
@@ -113,34 +119,15 @@ class GripperLook:
             return f"learnt before {self.views} backgrounds, of at least {FEWEST_VIEWS}"
         return "the fingers look the same all along, or never the same twice"
 
-    @property
-    def informative(self) -> NDArray[np.intp]:
-        """(f,) patches that poses are compared with; 0 on a finger of one shade, or before enough was seen."""
-        return np.bincount(self._chosen_finger, minlength=len(self._gripper.finger_ids))
-
-    def tells_slide_m(self, risk: float) -> Array:
-        """(f,) smallest of :data:`SLIDES_M` from which on each would contradict where the finger is seen whole, at odds
-        of 1 to ``risk``; NaN for a finger that tells of none.
-        """
-        lost = self._gain - self._loss
-        fingers = len(self._gripper.finger_ids)
-        out = np.full(fingers, np.nan)
-        expected = self._hit[self._chosen] - self._chance[:, self._chosen]
-        for way_m, both in zip(SLIDES_M[::-1], expected.reshape(len(SLIDES_M), 2, -1)[::-1], strict=True):
-            odds = [np.bincount(self._chosen_finger, lost * one, fingers) for one in both]
-            tells = np.min(odds, axis=0) > -math.log(risk)
-            out = np.where(tells & (np.isfinite(out) | (way_m == SLIDES_M[-1])), way_m, out)
-            if not tells.any():
-                break
-        return out
-
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> bool:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s.  About 1 ms, the
         first time 0.1 s, when the patches are laid out.
 
         False, and nothing learnt, while the background is the same as in the last frame that was: it would be taken for
-        the gripper's; and while no finger is in view.
+        the gripper's; while no finger is in view; and soon after the last one where :data:`MANY_VIEWS` were learnt.
         """
+        if self.views >= MANY_VIEWS and self._last_s is not None and 0.0 <= now_s - self._last_s < RELEARN_S:
+            return False
         if not len(self._points):
             if now_s < self._not_before_s:
                 return False
@@ -328,7 +315,7 @@ class GripperLook:
         """The patches of each finger that tell most: always the same where they are, and another view elsewhere."""
         length = np.linalg.norm(self._mean, axis=1)
         chance = self._chance[self._far].max(axis=0)
-        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= LARGEST_CHANCE) & bool((self._tried >= 0.5).all())
+        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
         worth = np.where(tells, length - chance, -np.inf)
         best = []
         for finger in range(len(self._first)):

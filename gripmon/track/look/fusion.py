@@ -13,8 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.model.geometry import from_record
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between, to_record
 from gripmon.model.records import Array, LookBias
+from gripmon.track.jaw import CORRELATED, PATIENCE
 from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.alignment import LookMotion
 
@@ -26,11 +28,8 @@ PER_MOTION, PER_OPENING = 0.02, 2e-3
 of the camera and 0.002 after 17 mm of the jaw, where depths are interpolated between edges.
 """
 
-CONTRADICTION = 33.1
-"""Squared normalised difference of six numbers that noise exceeds once in 100,000 frames (chi-square)."""
-
-PATIENCE, CORRELATED, MOST_CORRELATED = 10.0, 0.8, 0.98
-"""Backgrounds over which it is learnt how alike the edges err from one to the next; before; and at most."""
+MOST_CORRELATED = 0.98
+"""How alike the edges are taken to err from one background to the next, at most."""
 
 
 class Fused(NamedTuple):
@@ -101,7 +100,7 @@ class LookFusion:
         of_both = covariance + known + look.covariance
         innovation = difference - self._bias
         solved = np.linalg.solve(of_both, np.column_stack([covariance, innovation]))
-        if float(innovation @ solved[:, 6]) > CONTRADICTION:
+        if float(innovation @ solved[:, 6]) > CONTRADICTION_SQUARE:
             return None
         # By this share it follows the look; what is left of the edges' error is another one before each background.
         share = solved[:, :6].T
@@ -125,7 +124,7 @@ class LookFusion:
             return
         innovation = difference - self._bias
         known = self._uncertainty(cam_T_grip, opening_m)
-        if float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation)) > CONTRADICTION:
+        if float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation)) > CONTRADICTION_SQUARE:
             self.contradicts = True
             return
         self.contradicts = False

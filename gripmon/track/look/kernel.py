@@ -11,13 +11,11 @@ import math
 import numpy as np
 
 from gripmon.model.compiled import compiled
+from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array, Image
 
 ROUNDS = 2
 """Re-weightings: a third one changed no scatter that was measured in its second digit."""
-
-BIWEIGHT = 4.685
-"""Residual, in standard deviations, from which a pixel counts for nothing: 95 % efficient on normal noise (Tukey)."""
 
 FAR = 3.0
 """Standard deviations that a residual counts for at most in the frame's own scatter."""
@@ -152,7 +150,7 @@ def align(
     sums, information = np.empty((7, 7, pixels)), np.empty((7, 7))
     for turn in range(ROUNDS + 1):
         scatter = _residuals(values, mean, weight, jacobian, motion, robust, residual)
-        beyond = 1.0 / (BIWEIGHT * BIWEIGHT * scatter * scatter)
+        beyond = 1.0 / (TUKEY * TUKEY * scatter * scatter)
         sums[:], pull[:], pulls[:] = 0.0, 0.0, 0.0
         for p in range(patches):
             off = residual[p]

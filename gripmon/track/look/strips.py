@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
+from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
 
 LENGTH_PX, REACH_PX = 64, 40
@@ -52,8 +53,6 @@ FEWEST_FRAMES, MOST_FRAMES = 3, 32
 
 RELEARN_S = 1.0
 """Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
-
-GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
 
 
 class FingerStrips:

@@ -1,0 +1,216 @@
+"""A dataset's extrinsics in its own format: an MCAP beside each recording, a copy of a LeRobot dataset with columns
+more.  What was recorded is never written to.
+
+The columns and what LeRobot keeps of them are as its ``dataset_tools.add_features`` writes them; MCAP's messages are
+JSON with a schema.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import posixpath
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from gripmon import __version__
+from gripmon.analyse.dataset import SCHEMA, Rows
+from gripmon.io.sources.episodes import ANNOTATION_SUFFIX, Episode
+from gripmon.io.sources.lerobot import INFO, LeRobotDataset, LeRobotSettings, open_dataset
+from gripmon.io.sources.stored import file_system, joined, needed, opened
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError, one_line
+from gripmon.model.lerobot_columns import POSE_NAMES, extrinsics_features, extrinsics_names
+from gripmon.model.records import Verdict
+
+_MARK = "meta/gripmon.json"
+"""In a copy: by it a copy of ours is told from anything else, and only that is replaced."""
+_JSON_TYPES = {pa.string(): "string", pa.int32(): "integer", pa.int64(): "integer", pa.bool_(): "boolean"}
+
+
+class Annotations:
+    """Where the results of ``episodes`` go below the folder or URL ``to``, which has the tree of the dataset: of a
+    LeRobot dataset a copy with columns more (on this machine only), of anything else ``NAME.gripmon.mcap``, which lies
+    beside the recording where ``to`` is the dataset itself.  Only files of ours are replaced.
+
+    Raises :class:`InputError` for a copy that would lie in what is there already, before anything is measured.
+    """
+
+    def __init__(self, episodes: Sequence[Episode], to: str) -> None:
+        self._to = to
+        self._recordings: dict[str, list[Episode]] = {}
+        self._datasets: dict[str, list[Episode]] = {}
+        for episode in episodes:
+            if isinstance(episode.source, LeRobotSettings):
+                self._datasets.setdefault(episode.source.path, []).append(episode)
+            else:
+                self._recordings.setdefault(episode.name, []).append(episode)
+        self._targets = {
+            path: _target(open_dataset(path), _cameras(each), joined(to, each[0].name.partition("#")[0]))
+            for path, each in self._datasets.items()
+        }
+
+    def write(self, rows: Rows) -> int:
+        """How many files and copies were written.  Raises :class:`InputError` where one can't be."""
+        for path, episodes in self._datasets.items():
+            _copy_with_columns(open_dataset(path), rows, episodes, self._targets[path])
+        for name, episodes in self._recordings.items():
+            _put(joined(self._to, f"{name}{ANNOTATION_SUFFIX}"), _mcap(name, rows, episodes))
+        return len(self._datasets) + len(self._recordings)
+
+
+def _cameras(episodes: Sequence[Episode]) -> list[str]:
+    return sorted({str(each.source.camera) for each in episodes if isinstance(each.source, LeRobotSettings)})
+
+
+def _put(path: str, data: bytes) -> None:
+    try:
+        if "://" in path:
+            system, inside = file_system(path)
+            system.pipe_file(inside, data)
+        else:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(Path(path), data)
+    except Exception as error:  # noqa: BLE001  each store has its own
+        raise InputError(f"{path} can't be written ({one_line(error):.200})", "annotate") from None
+
+
+def _mcap(name: str, rows: Rows, episodes: Sequence[Episode]) -> bytes:
+    """One message for each stretch, stamped with its first frame; why there is none is in the metadata."""
+    buffer = io.BytesIO()
+    writer = needed("mcap.writer").Writer(buffer)
+    writer.start("", library=f"gripmon {__version__}")
+    schema = writer.register_schema("gripmon.Stretch", "jsonschema", json.dumps(_json_schema()).encode())
+    about = {"episode": name, "version": __version__}
+    for episode in episodes:
+        measured, made = rows.of(episode.key)
+        channel = None
+        for row in made:
+            if row["start_ns"] is None:
+                about[f"reason:{measured.camera}"] = str(row["reason"])
+                continue
+            if channel is None:
+                channel = writer.register_channel(f"/gripmon/{measured.camera.strip('/')}", "json", schema)
+            row = {name: value for name, value in row.items() if name != "picture"} | {"camera": measured.camera}
+            writer.add_message(channel, row["start_ns"], json.dumps(row).encode(), row["start_ns"])
+    writer.add_metadata("gripmon", about)
+    writer.finish()
+    return buffer.getvalue()
+
+
+def _json_schema() -> dict[str, Any]:
+    """Of a row of the table, without its picture."""
+    properties: dict[str, Any] = {"camera": {"type": "string", "description": "topic of the images"}}
+    for field in SCHEMA:
+        if field.name == "picture":
+            continue
+        kind = "array" if pa.types.is_list(field.type) else _JSON_TYPES.get(field.type, "number")
+        items = {"items": {"type": "number"}} if kind == "array" else {}
+        text = field.metadata[b"description"].decode()
+        properties[field.name] = {"type": [kind, "null"], "description": text} | items
+    return {"title": "gripmon.Stretch", "type": "object", "properties": properties}
+
+
+def _target(dataset: LeRobotDataset, cameras: Sequence[str], target: str) -> Path:
+    """Where the copy goes: not into the original, nor onto anything that isn't an earlier copy."""
+    right = "a folder elsewhere on this machine"
+    names = [name for camera in cameras for name in extrinsics_features(camera)]
+    if there := sorted(set(names) & set(dataset.info["features"])):
+        raise InputError(f"{dataset.path} has a column {there[0]} already; without --annotate", "annotate")
+    if "://" in target:
+        raise InputError(
+            f"{target}: the copy of a LeRobot dataset is written on this machine only; {right}", "annotate"
+        )
+    path = Path(target).resolve()
+    if "://" not in dataset.path and path.is_relative_to(Path(dataset.path).resolve()):
+        raise InputError(f"{target}: the copy would lie in the original, which isn't touched; {right}", "annotate")
+    if path.exists() and not (path / _MARK).exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{target}: something else is there; {right}, that is empty", "annotate")
+    return path
+
+
+def _copy_with_columns(dataset: LeRobotDataset, rows: Rows, episodes: Sequence[Episode], target: Path) -> None:
+    """The tables with columns more; videos and images are links to the originals where these are on this machine."""
+    cameras = _cameras(episodes)
+    features = {name: one for camera in cameras for name, one in extrinsics_features(camera).items()}
+    info = dataset.info | {"features": dataset.info["features"] | features}
+    values = {_place(episode): _Steps(rows.of(episode.key)[1]) for episode in episodes}
+    fresh = target.with_name(f".{target.name}.tmp")
+    shutil.rmtree(fresh, ignore_errors=True)
+    try:
+        for name in _files(dataset.path):
+            original, copy = joined(dataset.path, name), fresh / name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            if name == INFO:
+                copy.write_text(json.dumps(info, indent=4, ensure_ascii=False))
+            elif name.startswith("data/") and name.endswith(".parquet"):
+                with opened(original) as file:
+                    pq.write_table(_with_columns(pq.read_table(file), cameras, values), copy)
+            elif "://" not in original and not name.startswith("meta/"):
+                copy.symlink_to(Path(original).resolve())
+            else:
+                with opened(original) as file, copy.open("wb") as to:
+                    shutil.copyfileobj(file, to)
+        (fresh / _MARK).write_text(json.dumps({"copy_of": dataset.path, "gripmon": __version__}))
+        shutil.rmtree(target, ignore_errors=True)
+        fresh.rename(target)
+    except (OSError, ValueError) as error:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise InputError(f"{target} can't be written ({one_line(error):.200})", "annotate") from None
+
+
+def _files(path: str) -> list[str]:
+    """Every file of a dataset by its path in it; hidden ones are left out."""
+    system, inside = file_system(path)
+    names = [posixpath.relpath(one, inside) for one in sorted(system.find(inside))]
+    return [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
+
+
+def _place(episode: Episode) -> tuple[int, str]:
+    assert isinstance(episode.source, LeRobotSettings) and episode.source.episode is not None
+    return episode.source.episode, str(episode.source.camera)
+
+
+class _Steps:
+    """The transform of an episode as it was at any time: constant within a stretch."""
+
+    def __init__(self, made: list[dict[str, Any]]) -> None:
+        self._rows = [row for row in made if row["start_ns"] is not None and row["cam_T_grip_tx_m"] is not None]
+
+    def at(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Transforms (n, 7), all 0 where none is known, and flags (n,): 1 where it may be used.  Within the time in
+        which the camera may have moved neither side may.
+        """
+        pose, usable = np.zeros((len(stamps_ns), 7), np.float32), np.zeros(len(stamps_ns), np.float32)
+        for row in self._rows:
+            inside = (stamps_ns >= row["start_ns"]) & (stamps_ns <= row["end_ns"])
+            pose[inside] = [row[f"cam_T_grip_{name}"] for name in POSE_NAMES]
+            usable[inside] = row["verdict"] == Verdict.VALID.value
+        for row in self._rows:
+            if row["motion_earliest_ns"] is not None:
+                usable[(stamps_ns > row["motion_earliest_ns"]) & (stamps_ns < row["motion_latest_ns"])] = 0.0
+        return pose, usable
+
+
+def _with_columns(table: pa.Table, cameras: Sequence[str], values: dict[tuple[int, str], _Steps]) -> pa.Table:
+    numbers = np.asarray(table["episode_index"])
+    stamps_ns = np.round(1e9 * np.array(table["timestamp"].to_pylist(), float).reshape(-1)).astype(np.int64)
+    for camera in cameras:
+        poses, flags = np.zeros((len(table), 7), np.float32), np.zeros(len(table), np.float32)
+        for number in np.unique(numbers).tolist():
+            if (steps := values.get((number, camera))) is not None:
+                rows = numbers == number
+                poses[rows], flags[rows] = steps.at(stamps_ns[rows])
+        pose_name, flag_name = extrinsics_names(camera)
+        table = table.append_column(pose_name, pa.FixedSizeListArray.from_arrays(pa.array(poses.ravel()), 7))
+        table = table.append_column(flag_name, pa.array(flags))
+    # The datasets library would believe its own list of columns, which lacks these.
+    return table.replace_schema_metadata(
+        {k: v for k, v in (table.schema.metadata or {}).items() if k != b"huggingface"}
+    )

@@ -1,0 +1,240 @@
+"""All monitors on the network as a page: how each is, what it sees, and the orders that an operator may give."""
+
+from __future__ import annotations
+
+import threading
+import time
+import urllib.parse
+from collections import Counter
+from typing import Annotated, Literal
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon import __version__
+from gripmon.client import Ambiguous, Condition, Fleet, MonitorName, MonitorStatus, NotCarriedOut, trouble
+from gripmon.daemon.overlay import overlay
+from gripmon.model.records import CommandName, CommandReply, StandingAlert
+from gripmon.teach.messages import BadRequest, Request
+from gripmon.teach.page_server import Action, Served, web_files
+
+CARDS_MOST = 60
+"""Monitors shown at once, the worst ones: what a person can look through.  *Find* shows others."""
+PICTURE_PX = 640
+"""Columns of a picture: as wide as a card on a large screen."""
+_KEPT_S = 8.0  # a picture: the page asks every 10 s, and several pages cost a monitor no more than one
+_PICTURES_KEPT = 4 * CARDS_MOST
+_AT_ONCE = 4  # snapshots under way: a PNG of some megabytes each
+_ANSWER_S = 5.0
+_LONGEST_TEXT = 300  # of what a monitor says: it came from the network, and has a megabyte for it
+_ALERTS_SHOWN = 8
+
+Text = Annotated[str, Meta(max_length=1000)]
+
+
+class Order(Request, frozen=True):
+    """What an operator wants of the monitor that the page showed: this start of it, and this revision."""
+
+    robot: Text
+    camera: Text
+    monitor_id: Text
+    name: Literal["accept", "reject", "undo", "acknowledge"]
+    argument: Text = ""
+    revision: int = -1
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """The monitor's own answer; ``done`` is false where it refused, and nothing has changed."""
+
+    done: bool
+    text: str
+
+
+class Card(msgspec.Struct, frozen=True, kw_only=True):
+    """One monitor: lengths in metres, times in seconds; None is unknown.  ``more_alerts``: beside those listed."""
+
+    robot: str
+    camera: str
+    monitor_id: str
+    condition: Condition
+    gone_since_ns: int | None
+    heard_s: float
+    state: str = ""
+    message: str = ""
+    drift_m: float | None = None
+    sigma_m: float | None = None
+    protection_m: float | None = None
+    alert_limit_m: float | None = None
+    frames_per_s: float | None = None
+    reference_id: str = ""
+    revision: int = -1
+    proposal_id: str = ""
+    version: str = ""
+    alerts: tuple[StandingAlert, ...] = ()
+    more_alerts: int = 0
+
+
+class Shown(msgspec.Struct, frozen=True, kw_only=True):
+    """The page: ``fault`` of the network, how many monitors there are of which condition, and the worst; ``hidden``:
+    how many more match.
+    """
+
+    version: str
+    stamp_ns: int
+    fault: str
+    counts: dict[Condition, int]
+    cards: tuple[Card, ...]
+    hidden: int
+
+
+class Picture(msgspec.Struct, frozen=True):
+    """JPEG with the overlay, when its frame was captured, and the transform's verdict in it."""
+
+    jpeg: bytes
+    stamp_ns: int
+    verdict: str
+
+
+class FleetSite:
+    """Any thread may ask.  Orders go through the fleet's own session: whoever may not command by the router's rules
+    can't here.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._files = web_files("fleet.html", "style.css", "fleet.css", "icon.svg", "fleet.js", "server.js")
+        self._pictures: dict[tuple[MonitorName, str], tuple[float, Picture | str]] = {}
+        self._under_way: dict[tuple[MonitorName, str], threading.Lock] = {}
+        self._lock = threading.Lock()  # guards both
+        self._slots = threading.BoundedSemaphore(_AT_ONCE)
+
+    def get(self, path: str) -> Served | None:
+        """The page's files, ``fleet?find=…``, ``picture?robot=…&camera=…&id=…``."""
+        path, _, query = path.partition("?")
+        if path in self._files:
+            return self._files[path]
+        asked = {name: values[-1] for name, values in urllib.parse.parse_qs(query, errors="replace").items()}
+        if path == "fleet":
+            return msgspec.json.encode(self.shown(asked.get("find", ""))), "application/json"
+        if path == "picture":
+            name = MonitorName(asked.get("robot", ""), asked.get("camera", ""))
+            return msgspec.json.encode(self.picture(name, asked.get("id", ""))), "application/json"
+        return None
+
+    def post(self, path: str) -> Action | None:
+        """Orders."""
+        return (Order, self.carry_out) if path == "order" else None
+
+    def shown(self, find: str = "") -> Shown:
+        """Monitors whose name has ``find`` in it, the worst first."""
+        monitors = self._fleet.monitors()
+        found = sorted((each for each in monitors if find.lower() in str(each.name).lower()), key=trouble)
+        fault = [f"{self._fleet.unreadable} messages can't be read"] if self._fleet.unreadable else []
+        return Shown(
+            version=__version__,
+            stamp_ns=time.time_ns(),
+            fault="; ".join(filter(None, [self._fleet.fault(), *fault])),
+            counts=dict(Counter(each.condition for each in monitors)),
+            cards=tuple(map(_card, found[:CARDS_MOST])),
+            hidden=max(0, len(found) - CARDS_MOST),
+        )
+
+    def carry_out(self, order: Order) -> Answered:
+        """Tell the monitor.  Raises :class:`BadRequest` where it isn't known what became of it, or it isn't there."""
+        name = self._known(MonitorName(order.robot, order.camera), order.monitor_id).name
+        if order.name != "undo" and not order.argument:
+            raise BadRequest(f"{order.name} names nothing; what the page showed")
+        if order.name == "undo":
+            # Without a name it goes back by one: from what was seen, or someone else has been faster.
+            now = self._ask(name, CommandName.STATE, "", order.monitor_id)[0]
+            if now.revision != order.revision:
+                text = f"revision {now.revision} is in force by now, not {order.revision}; look at it first"
+                return Answered(False, text)
+        reply, _ = self._ask(name, CommandName(order.name), order.argument, order.monitor_id)
+        return Answered(reply.done, _short(reply.text))
+
+    def picture(self, name: MonitorName, monitor_id: str) -> Picture:
+        """What it sees, at most 8 s old.  Raises :class:`BadRequest`, which says why there is none."""
+        self._known(name, monitor_id)
+        key = name, monitor_id
+        with self._lock:
+            if key not in self._under_way and len(self._under_way) >= _PICTURES_KEPT:
+                self._under_way.clear()
+                self._pictures.clear()
+            one_at_a_time = self._under_way.setdefault(key, threading.Lock())
+        with one_at_a_time:
+            made_s, found = self._pictures.get(key, (0.0, ""))
+            if not found or time.monotonic() - made_s > _KEPT_S:
+                try:
+                    with self._slots:
+                        found = self._made(name, monitor_id)
+                except BadRequest as error:
+                    found = str(error)
+                self._pictures[key] = time.monotonic(), found
+        if isinstance(found, str):
+            raise BadRequest(found)
+        return found
+
+    def _made(self, name: MonitorName, monitor_id: str) -> Picture:
+        reply, data = self._ask(name, CommandName.SNAPSHOT, "", monitor_id)
+        snapshot = reply.snapshot
+        if not reply.done or snapshot is None:
+            raise BadRequest(_short(reply.text))
+        image = None if not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise BadRequest("its newest frame has no image")
+        jpeg = overlay(np.asarray(image), snapshot.record, snapshot.outlines_px, PICTURE_PX)
+        return Picture(jpeg, snapshot.record.stamp_ns, snapshot.record.verdict.value)
+
+    def _known(self, name: MonitorName, monitor_id: str) -> MonitorStatus:
+        """Only who was seen is asked: no name that a request makes up."""
+        for each in self._fleet.monitors():
+            if each.name == name and each.monitor_id == monitor_id:
+                if each.gone_since_ns is not None:
+                    raise BadRequest(f"{name} is gone")
+                return each
+        raise BadRequest(f"{_short(str(name))} {_short(monitor_id)} isn't there any more; it may have started again")
+
+    def _ask(
+        self, name: MonitorName, command: CommandName, argument: str, monitor_id: str
+    ) -> tuple[CommandReply, bytes | None]:
+        try:
+            return self._fleet.send(name, command, argument, _ANSWER_S, monitor_id=monitor_id)
+        except (NotCarriedOut, Ambiguous, ValueError) as error:
+            raise BadRequest(_short(str(error))) from None
+
+
+def _card(status: MonitorStatus) -> Card:
+    card = Card(
+        robot=status.name.robot,
+        camera=status.name.camera,
+        monitor_id=status.monitor_id,
+        condition=status.condition,
+        gone_since_ns=status.gone_since_ns,
+        heard_s=status.state_age_s,
+    )
+    state, alerts = status.state, status.alerts
+    if state is None:
+        return card
+    return msgspec.structs.replace(
+        card,
+        state=_short(state.state),
+        message=_short(state.message),
+        drift_m=status.drift_m,
+        sigma_m=state.sigma_m,
+        protection_m=state.protection_m,
+        alert_limit_m=state.alert_limit_m,
+        frames_per_s=state.frames_per_s,
+        reference_id=_short(state.reference_id),
+        revision=state.revision,
+        proposal_id=state.proposal_id if len(state.proposal_id) <= _LONGEST_TEXT else "",
+        version=_short(state.version),
+        alerts=tuple(msgspec.structs.replace(each, text=_short(each.text)) for each in alerts[:_ALERTS_SHOWN]),
+        more_alerts=max(0, len(alerts) - _ALERTS_SHOWN),
+    )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]} …"

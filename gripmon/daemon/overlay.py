@@ -1,0 +1,48 @@
+"""A monitor's frame as a picture for a person: the image with what was measured in it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, FrameRecord, Image, Outlines
+from gripmon.teach.drawing import Canvas, Colour
+from gripmon.teach.snapping import outlines_px
+
+_POINTS = 17  # of each edge: a lens bends it
+_OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
+_LOST: Colour = (80, 80, 255)
+_CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
+_QUALITY = 85  # of JPEG, percent
+
+
+def outlines_of(camera: Camera, gripper: Gripper, record: FrameRecord) -> Outlines:
+    """The gripper's visible edges where the record's transform has them, px; none without a transform."""
+    if record.cam_T_grip is None:
+        return ()
+    opening_m = record.jaw_opening_m if gripper.has_jaw else None
+    lines = outlines_px(camera, gripper, from_record(record.cam_T_grip), opening_m, _POINTS).values()
+    return tuple(tuple((round(float(u), 2), round(float(v), 2)) for u, v in line) for line in lines)
+
+
+def overlay(image: Image, record: FrameRecord, outlines: Outlines, width_px: int) -> bytes:
+    """JPEG of about ``width_px`` columns: the outlines, green if the transform is valid, orange if suspect, and the
+    corners, yellow where they were used, red where not.
+    """
+    scale = min(1.0, width_px / image.shape[1])
+    smaller = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    canvas = Canvas(np.asarray(smaller), max(1, round(width_px / smaller.shape[1])))
+
+    def placed(points_px: object) -> Array:
+        """Centres of pixels are at whole numbers."""
+        return (np.asarray(points_px, dtype=float) + 0.5) * scale - 0.5
+
+    for line_px in outlines:
+        canvas.line(placed(line_px), _OUTLINE.get(record.verdict.value, _LOST), 2)
+    for corner in record.corners:
+        if corner.uv_px is not None:
+            canvas.circle(placed(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)
+    return bytes(cv2.imencode(".jpg", canvas.picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())

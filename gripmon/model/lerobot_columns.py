@@ -1,0 +1,26 @@
+"""The columns that extrinsics have in a LeRobot dataset, whoever writes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+POSE_NAMES = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
+"""``cam_T_grip``: position (m), quaternion; all 0, which is no rotation, where it isn't known."""
+
+
+def extrinsics_names(camera: str) -> tuple[str, str]:
+    """Of a camera (``wrist``, or its feature ``observation.images.wrist``): the feature with ``cam_T_grip``, and that
+    with its flag: 1 where it may be used.
+    """
+    name = camera.removeprefix("observation.").removeprefix("images.")
+    return f"observation.extrinsics.{name}", f"observation.extrinsics_valid.{name}"
+
+
+def extrinsics_features(camera: str) -> dict[str, dict[str, Any]]:
+    """Both as ``meta/info.json`` describes features.  A number's name is unique in the dataset, for LeRobot finds the
+    values of an observation by it.
+    """
+    pose, flag = extrinsics_names(camera)
+    values = {pose: [f"{pose.removeprefix('observation.')}.{one}" for one in POSE_NAMES]}
+    values[flag] = [flag.removeprefix("observation.")]
+    return {key: {"dtype": "float32", "shape": [len(names)], "names": names} for key, names in values.items()}

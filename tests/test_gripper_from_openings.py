@@ -1,0 +1,204 @@
+"""A gripper file from images at several jaw openings that no table says: fingers told apart, and placed, by motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from support.changing_backgrounds import CAMERA, beside_truth_px, images_of, moving_robot
+from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+
+from gripmon.model.errors import NoResultError
+from gripmon.model.geometry import from_record, invert, to_record
+from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.poses import perturbation_between
+from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.monitor import Monitor
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.teach.from_images import GripperFromImages, gripper_from_images
+from gripmon.teach.matte import grey_levels, image_sets, smallest_noise
+
+DISTANCE = (0.115, 0.002)
+GAP_M, LENGTH_M = 0.034, 0.06
+POSE = nominal_cam_T_grip()
+
+pytestmark = pytest.mark.usefixtures("tools_importable")
+
+
+def tapered() -> list[Any]:
+    """Two fingers 6 x 6 mm at their tips and 16 x 12 mm where they are hidden by the image's border."""
+    import trimesh
+
+    out = []
+    for side in (-1.0, 1.0):
+        at = [
+            [side * 0.5 * (GAP_M + 0.006) + x * width, y * thick, z]
+            for z, width, thick in ((0.0, 0.006, 0.006), (-LENGTH_M, 0.016, 0.012))
+            for x in (-0.5, 0.5)
+            for y in (-0.5, 0.5)
+        ]
+        out.append(trimesh.convex.convex_hull(np.array(at)))
+    return out
+
+
+def offsets_m(gap_m: float) -> list[Array]:
+    """Of both fingers at a gap between them."""
+    return [np.array([0.5 * side * (gap_m - GAP_M), 0.0, 0.0]) for side in (-1.0, 1.0)]
+
+
+def chains_of(found: GripperFromImages) -> list:
+    return [chain for finger in found.seen.fingers for chain in finger.chains]
+
+
+@pytest.fixture(scope="module")
+def tapered_found() -> GripperFromImages:
+    from benchmarks.meshes import MeshCamera
+
+    pictures = MeshCamera(CAMERA, tapered(), 7)
+    gaps_m = [GAP_M] * 20 + [0.022] * 10
+    order = np.random.default_rng(3).permutation(len(gaps_m))
+    images = [pictures.picture(POSE, offsets_m(gaps_m[k])) for k in order]
+    return gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+
+
+@pytest.mark.usefixtures("tools_importable")
+def test_tapered_fingers_are_placed_by_how_they_move(tapered_found: GripperFromImages) -> None:
+    """Their long edges don't meet in one point, so that perspective doesn't tell."""
+    import trimesh
+    from benchmarks.meshes import MeshCamera
+
+    found, meshes = tapered_found, tapered()
+    away = beside_truth_px(chains_of(found), MeshCamera(CAMERA, meshes).coverage(POSE))
+    assert len(away) > 300 and np.quantile(away, 0.95) <= 0.2
+    assert found.seen.matte.images.shape[0] == 20
+    # Given was the distance of what reaches farthest out; here that of the tips' middle, 3 mm of which are thickness.
+    scale = DISTANCE[0] / found.cam_T_grip[2, 3]
+    points = found.gripper.points_grip_m() @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3]
+    for finger, mesh in enumerate(meshes):
+        own = points[found.gripper.point_finger == finger] * scale
+        true = trimesh.Trimesh(mesh.vertices @ POSE[:3, :3].T + POSE[:3, 3], mesh.faces)
+        nearest = true.vertices[trimesh.grouping.unique_ordered(true.edges_unique.ravel())]
+        assert len(nearest)
+        depth = depth_of_outline(true, own)
+        assert np.abs(own[:, 2] / depth - 1.0).max() < 0.03
+    assert abs(found.gripper.jaw_nominal_m / GAP_M - 1.0) < 0.03
+    moved_m = found.gripper.jaw_max_m - found.gripper.jaw_min_m
+    assert abs(moved_m / 0.012 - 1.0) < 0.03
+    assert any("move equally far" in note for note in found.notes) and not any("flat" in note for note in found.notes)
+
+
+def depth_of_outline(mesh: Any, points: Array) -> Array:
+    """Depth (n,) of the mesh's edge that shows nearest to each point, camera frame."""
+    ends = mesh.vertices[mesh.edges_unique]
+    share = np.linspace(0.0, 1.0, 400)[:, None, None]
+    along = (ends[:, 0] + share * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)
+    shown, wanted = along[:, :2] / along[:, 2:], points[:, :2] / points[:, 2:]
+    at = np.linalg.norm(shown[None] - wanted[:, None], axis=2).argmin(axis=1)
+    return np.asarray(along[at, 2])
+
+
+def test_a_tapered_finger_is_tracked_before_other_backgrounds(tapered_found: GripperFromImages) -> None:
+    from benchmarks.meshes import MeshCamera, wandering
+
+    found, pictures = tapered_found, MeshCamera(CAMERA, tapered(), 99)
+    flat = tuple(found.covariance.ravel().tolist())
+    reference = ReferenceRecord("made", 1, 0, "configuration", to_record(found.cam_T_grip), flat)
+    monitor = Monitor(CAMERA, found.gripper, MonitorSettings(), reference)
+    true_T_made = invert(POSE) @ found.cam_T_grip
+    errors, frames = [], 40
+    for k in range(frames):
+        truth = wandering(POSE, k / frames, 0.001, 0.005)
+        image = pictures.picture(truth, offsets_m(GAP_M))
+        record = monitor.process(Frame(k, k * 33_000_000, image, found.opening_m, ""))
+        monitor.run_pending()
+        if record.verdict.value == "valid":
+            errors.append(perturbation_between(truth @ true_T_made, from_record(record.cam_T_grip)))
+            assert record.protection is not None
+            assert np.linalg.norm(errors[-1][:3]) <= record.protection.position_m
+    assert len(errors) >= 0.9 * (frames - 1)
+    assert np.quantile(np.abs(np.array(errors)[:, :2]), 0.95) < 5e-5
+    assert np.quantile(np.abs(np.array(errors)[:, 2]), 0.95) < 1.5e-4
+
+
+def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:
+    from benchmarks.meshes import MeshCamera
+
+    pictures = MeshCamera(CAMERA, tapered()[:1], 5)
+    images = [pictures.picture(POSE) for _ in range(20)]
+    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    assert found.gripper.finger_ids == ("finger",) and not found.gripper.has_jaw
+    away = beside_truth_px(chains_of(found), pictures.coverage(POSE))
+    assert len(away) > 150 and np.quantile(away, 0.95) <= 0.2
+    assert any("parallel" in note or "flat" in note for note in found.notes)
+
+
+def housed() -> Gripper:
+    """Two box fingers whose roots a housing hides, across the whole image: what stays is one part."""
+    model = yaml.safe_load(BOX_FINGERS.read_text())
+    model["fingers"]["housing"] = {"motion": {"axis": [0.0, 0.0, 0.0]}}
+    for i, x in enumerate((-0.04, 0.04)):
+        for j, y in enumerate((-0.012, -0.0085)):
+            for k, z in enumerate((-0.06, -0.03)):
+                model["points"][f"H{i}{j}{k}"] = {"finger": "housing", "xyz_m": [x, y, z]}
+    for loop in ("000 001 011 010", "100 110 111 101", "000 100 101 001", "010 011 111 110", "000 010 110 100",
+                 "001 101 111 011"):  # fmt: skip
+        names = [f"H{name}" for name in loop.split()]
+        model["faces"].append({"finger": "housing", "points": names})
+        for a, b in zip(names, names[1:] + names[:1], strict=True):
+            if a < b:
+                model["edges"][f"{a}{b}"] = {"from": a, "to": b}
+    return gripper_from_dict(model)
+
+
+def test_fingers_that_hang_together_in_the_image_are_told_apart_by_motion() -> None:
+    gripper = housed()
+    images: list[Image] = []
+    for seed, opening_m, count in ((501, 0.034, 14), (502, 0.024, 10)):
+        images += images_of(moving_robot(seed, "printed", gripper=gripper, opening_m=opening_m), count)
+    alone = gripper_from_images(images[:14], PAPER_LENS, distance_m=DISTANCE)
+    assert alone.gripper.finger_ids == ("finger",)
+    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    assert found.gripper.finger_ids == ("left", "right")
+    assert any("joins the fingers" in note for note in found.notes)
+    assert abs(found.gripper.jaw_max_m - 0.034) < 2e-4 and abs(found.gripper.jaw_min_m - 0.024) < 2e-4
+    apart = perturbation_between(POSE, found.cam_T_grip)
+    assert np.abs(apart[:3]).max() < 4e-4 and np.abs(apart[3:]).max() < np.radians(0.3)
+
+
+def test_openings_are_told_apart_without_a_table() -> None:
+    images = [
+        grey_levels(image)
+        for seed, opening_m, count in ((401, 0.034, 16), (403, 0.030, 10), (405, 0.044, 12))
+        for image in images_of(moving_robot(seed, "printed", opening_m=opening_m), count)
+    ]
+    order = np.random.default_rng(1).permutation(len(images)).tolist()
+    wanted = [set(range(16)), set(range(26, 38)), set(range(16, 26))]
+    sets = image_sets([images[k] for k in order], 0.3)
+    assert [{order[k] for k in own} for own in sets] == wanted
+    assert image_sets(images[:16], 0.3) == [list(range(16))]
+
+
+def test_levels_of_one_dull_face_say_no_offset() -> None:
+    """Noise on a face of one grey level was taken for its spread: dark faces beside it then didn't stay the same."""
+    rng = np.random.default_rng(2)
+    image = np.full((120, 160), 200.0)
+    image[:, 100:] = 130.0
+    images = [(image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32) for _ in range(16)]
+    for k, one in enumerate(images):
+        one[:, 130:] = rng.uniform(20.0, 250.0) + k
+        one[60:, 100:130] = rng.uniform(20.0, 250.0)
+    from gripmon.teach.matte import find_matte
+
+    assert smallest_noise(images[0].astype(np.uint8)) < 1.0
+    matte = find_matte(images, 0.3)
+    assert abs(float(np.median(matte.images[:, :50, 105:125])) - 130.0) < 0.5
+
+
+def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:
+    moved = nominal_cam_T_grip(tcp_m=(0.006, 0.0013, 0.115))
+    images = images_of(moving_robot(601, "printed"), 12) + images_of(moving_robot(602, "printed", cam_T_grip=moved), 11)
+    with pytest.raises(NoResultError, match=r"sets of 12 and 11.*the camera moved") as caught:
+        gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    assert "\n" not in str(caught.value)
