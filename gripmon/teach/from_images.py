@@ -123,8 +123,8 @@ def gripper_from_images(
 ) -> GripperFromImages:
     """A gripper and its reference from ten to some hundred ``images`` before changing backgrounds.
 
-    ``openings_m``: the jaw's opening in each image (None: the jaws stand); ten images at least of each opening that is
-    to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the optical axis),
+    ``openings_m``: the jaw's opening in each image (None: the images tell which are of one); ten images at least of each
+    opening that is to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the optical axis),
     ``finger_width_m`` (of a fingertip, across the jaws), a ``reference`` calibration, or from several openings.
 
     Raises :class:`~gripmon.model.errors.InputError` for what was given wrong,
@@ -337,6 +337,10 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
             "the outline is taken as flat, facing the camera: no three long edges of the fingers meet in one point. "
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
+        )
+    elif reference is None and len(placed.points) == 1:
+        notes.append(
+            "the finger's long edges are taken as parallel: a taper would be taken for another direction of it"
         )
     if placed.by_motion:
         notes.append("depths are from the fingers' motion: both are taken to move equally far, against each other")
