@@ -19,7 +19,7 @@ from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
-from gripmon.teach.matte import grey_levels, image_sets, smallest_noise
+from gripmon.teach.matte import grey_levels, image_sets
 
 DISTANCE = (0.115, 0.002)
 GAP_M, LENGTH_M = 0.034, 0.06
@@ -176,22 +176,6 @@ def test_openings_are_told_apart_without_a_table() -> None:
     sets = image_sets([images[k] for k in order], 0.3)
     assert [{order[k] for k in own} for own in sets] == wanted
     assert image_sets(images[:16], 0.3) == [list(range(16))]
-
-
-def test_levels_of_one_dull_face_say_no_offset() -> None:
-    """Noise on a face of one grey level was taken for its spread: dark faces beside it then didn't stay the same."""
-    rng = np.random.default_rng(2)
-    image = np.full((120, 160), 200.0)
-    image[:, 100:] = 130.0
-    images = [(image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32) for _ in range(16)]
-    for k, one in enumerate(images):
-        one[:, 130:] = rng.uniform(20.0, 250.0) + k
-        one[60:, 100:130] = rng.uniform(20.0, 250.0)
-    from gripmon.teach.matte import find_matte
-
-    assert smallest_noise(images[0].astype(np.uint8)) < 1.0
-    matte = find_matte(images, 0.3)
-    assert abs(float(np.median(matte.images[:, :50, 105:125])) - 130.0) < 0.5
 
 
 def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:
