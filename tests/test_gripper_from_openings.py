@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
-from gripmon.teach.matte import grey_levels, image_sets, smallest_noise
+from gripmon.teach.matte import grey_levels, image_sets
 
 DISTANCE = (0.115, 0.002)
 GAP_M, LENGTH_M = 0.034, 0.06
@@ -52,7 +53,7 @@ def chains_of(found: GripperFromImages) -> list:
     return [chain for finger in found.seen.fingers for chain in finger.chains]
 
 
-@pytest.fixture(scope="module")
+@lru_cache(maxsize=1)
 def tapered_found() -> GripperFromImages:
     from benchmarks.meshes import MeshCamera
 
@@ -63,13 +64,12 @@ def tapered_found() -> GripperFromImages:
     return gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
 
 
-@pytest.mark.usefixtures("tools_importable")
-def test_tapered_fingers_are_placed_by_how_they_move(tapered_found: GripperFromImages) -> None:
+def test_tapered_fingers_are_placed_by_how_they_move() -> None:
     """Their long edges don't meet in one point, so that perspective doesn't tell."""
     import trimesh
     from benchmarks.meshes import MeshCamera
 
-    found, meshes = tapered_found, tapered()
+    found, meshes = tapered_found(), tapered()
     away = beside_truth_px(chains_of(found), MeshCamera(CAMERA, meshes).coverage(POSE))
     assert len(away) > 300 and np.quantile(away, 0.95) <= 0.2
     assert found.seen.matte.images.shape[0] == 20
@@ -79,8 +79,6 @@ def test_tapered_fingers_are_placed_by_how_they_move(tapered_found: GripperFromI
     for finger, mesh in enumerate(meshes):
         own = points[found.gripper.point_finger == finger] * scale
         true = trimesh.Trimesh(mesh.vertices @ POSE[:3, :3].T + POSE[:3, 3], mesh.faces)
-        nearest = true.vertices[trimesh.grouping.unique_ordered(true.edges_unique.ravel())]
-        assert len(nearest)
         depth = depth_of_outline(true, own)
         assert np.abs(own[:, 2] / depth - 1.0).max() < 0.03
     assert abs(found.gripper.jaw_nominal_m / GAP_M - 1.0) < 0.03
@@ -99,10 +97,10 @@ def depth_of_outline(mesh: Any, points: Array) -> Array:
     return np.asarray(along[at, 2])
 
 
-def test_a_tapered_finger_is_tracked_before_other_backgrounds(tapered_found: GripperFromImages) -> None:
+def test_tapered_fingers_are_tracked_before_other_backgrounds() -> None:
     from benchmarks.meshes import MeshCamera, wandering
 
-    found, pictures = tapered_found, MeshCamera(CAMERA, tapered(), 99)
+    found, pictures = tapered_found(), MeshCamera(CAMERA, tapered(), 99)
     flat = tuple(found.covariance.ravel().tolist())
     reference = ReferenceRecord("made", 1, 0, "configuration", to_record(found.cam_T_grip), flat)
     monitor = Monitor(CAMERA, found.gripper, MonitorSettings(), reference)
@@ -178,22 +176,6 @@ def test_openings_are_told_apart_without_a_table() -> None:
     sets = image_sets([images[k] for k in order], 0.3)
     assert [{order[k] for k in own} for own in sets] == wanted
     assert image_sets(images[:16], 0.3) == [list(range(16))]
-
-
-def test_levels_of_one_dull_face_say_no_offset() -> None:
-    """Noise on a face of one grey level was taken for its spread: dark faces beside it then didn't stay the same."""
-    rng = np.random.default_rng(2)
-    image = np.full((120, 160), 200.0)
-    image[:, 100:] = 130.0
-    images = [(image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32) for _ in range(16)]
-    for k, one in enumerate(images):
-        one[:, 130:] = rng.uniform(20.0, 250.0) + k
-        one[60:, 100:130] = rng.uniform(20.0, 250.0)
-    from gripmon.teach.matte import find_matte
-
-    assert smallest_noise(images[0].astype(np.uint8)) < 1.0
-    matte = find_matte(images, 0.3)
-    assert abs(float(np.median(matte.images[:, :50, 105:125])) - 130.0) < 0.5
 
 
 def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:

@@ -62,12 +62,13 @@ def from_images(arguments: Arguments) -> None:
     """The outline of a gripper, its inner edges and its place, from ten to a hundred images of the wrist
     camera: the robot moves, so that the background changes, and the gripper stays.  No dimensions, no
     straight edges, no plate are needed; one length is: the distance of the fingertips from the camera, or
-    the width of a finger.  Images at several jaw openings, in metres in a timestamps.csv beside them as
-    gripmon replay takes it, tell how the fingers move, and the length, too.
+    the width of a finger.  Images at several jaw openings tell how the fingers move, and with the openings
+    in metres in a timestamps.csv beside them, as gripmon replay takes it, the length, too.
 
     Ten images at least of each opening, in focus, each before another background, lit as in use.  Where
-    the fingers' long edges meet in one point (their vanishing point) they are placed in space; else the
-    outline is taken as flat, facing the camera.  What isn't known is said and in the reference's covariance.
+    the fingers' long edges meet in one point (their vanishing point) they are placed in space, else by how
+    both fingers move between openings; with one opening the outline is then taken as flat, facing the
+    camera.  What isn't known is said and in the reference's covariance.
 
     Written are the gripper file and, with --reference-out, the reference that belongs to it.
     """

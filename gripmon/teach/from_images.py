@@ -7,7 +7,7 @@ which someone gives, a calibration knows, or the openings in metres tell.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,9 +123,10 @@ def gripper_from_images(
 ) -> GripperFromImages:
     """A gripper and its reference from ten to some hundred ``images`` before changing backgrounds.
 
-    ``openings_m``: the jaw's opening in each image (None: the jaws stand); ten images at least of each opening that is
-    to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the optical axis),
-    ``finger_width_m`` (of a fingertip, across the jaws), a ``reference`` calibration, or from several openings.
+    ``openings_m``: the jaw's opening in each image (None: the images tell which are of one); ten images at least of
+    each opening that is to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the
+    optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference`` calibration, or from several
+    openings.
 
     Raises :class:`~gripmon.model.errors.InputError` for what was given wrong,
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
@@ -138,29 +139,10 @@ def gripper_from_images(
     least = smallest_noise(taken[0][1])
     grey = [grey_levels(image) for _, image in taken]
     groups = _groups(openings_m, grey, least)
-    first, *others = groups
     notes: list[str] = []
     left_out: dict[str, str] = {}
-
-    def see(indices: Sequence[int]) -> OpeningSeen:
-        found = see_opening(made, [grey[k] for k in indices], least, step)
-        left_out.update({taken[indices[k]][0]: why for k, why in found.left_out.items()})
-        return found
-
     with progress(None, "step") as step:
-        seen = see(groups[first])
-        around = {}
-        for opening in others:
-            if len(groups[opening]) < FEWEST_IMAGES:
-                notes.append(
-                    f"opening {opening:g} m: {len(groups[opening])} images aren't used; {FEWEST_IMAGES} or more"
-                )
-                continue
-            around[opening] = see(groups[opening])
-        pronged = apart_by_motion(made, seen, around.values())
-        if pronged is not None:
-            seen = pronged
-            notes.append("what joins the fingers in the image, and stays where it is as they move, isn't used")
+        seen, around = _see_openings(made, grey, groups, [file for file, _ in taken], least, notes, left_out, step)
         outlines = finger_outlines(made, seen)
         pose = None if reference is None else reference[0]
         at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
@@ -171,6 +153,7 @@ def gripper_from_images(
         step()
     if openings_m is None and around:
         check_opened(moved, [len(own) for own in groups.values()])
+    first = next(iter(groups))
     opening_m = first if openings_m is not None else None
     scale = _scale(placed, distance_m, finger_width_m, reference, moved, opening_m)
     if openings_m is None and moved:
@@ -201,6 +184,33 @@ def gripper_from_images(
         seen,
         shown, names, float(np.sqrt(np.square(rms).mean())),
     )  # fmt: skip
+
+
+def _see_openings(
+    camera: Camera,
+    grey: Sequence[NDArray[np.float32]],
+    groups: Mapping[float, list[int]],
+    files: Sequence[str],
+    least_noise: float,
+    notes: list[str],
+    left_out: dict[str, str],
+    step: Callable[[], None],
+) -> tuple[OpeningSeen, dict[float, OpeningSeen]]:
+    """What the images of the first opening show, and those of each other one that has enough of them; ``notes`` and
+    ``left_out`` grow.
+    """
+    seen: dict[float, OpeningSeen] = {}
+    for opening, own in groups.items():
+        if seen and len(own) < FEWEST_IMAGES:
+            notes.append(f"opening {opening:g} m: {len(own)} images aren't used; {FEWEST_IMAGES} or more")
+            continue
+        seen[opening] = see_opening(camera, [grey[k] for k in own], least_noise, step)
+        left_out.update({files[own[k]]: why for k, why in seen[opening].left_out.items()})
+    first, *others = seen
+    pronged = apart_by_motion(camera, seen[first], [seen[opening] for opening in others])
+    if pronged is not None:
+        notes.append("what joins the fingers in the image, and stays where it is as they move, isn't used")
+    return pronged or seen[first], {opening: seen[opening] for opening in others}
 
 
 def _check(
@@ -337,6 +347,10 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
             "the outline is taken as flat, facing the camera: no three long edges of the fingers meet in one point. "
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
+        )
+    elif reference is None and len(placed.points) == 1:
+        notes.append(
+            "the finger's long edges are taken as parallel: a taper would be taken for another direction of it"
         )
     if placed.by_motion:
         notes.append("depths are from the fingers' motion: both are taken to move equally far, against each other")

@@ -34,9 +34,7 @@ FEWEST_STILL_SHARE = 0.005
 ALIKE_SHARE = 0.8
 """Part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
 MOST_DILUTION = 0.01
-"""Of a gain, by noise: over 100 grey levels between a finger's faces one grey level."""
-_MEDIAN_VARIANCE = 1.57
-"""Of a median over that of a mean."""
+"""Of a gain, by noise, which makes a slope less steep: over 100 grey levels between a finger's faces one grey level."""
 _AROUND = np.ones((3, 3), np.uint8)
 _STEP = 3
 _ROUNDS = 3
@@ -229,27 +227,25 @@ def _level(stack: NDArray[np.float32], quiet: NDArray[np.bool_] | None) -> None:
         return
     wanted = middle[chosen].astype(float)
     for k in range(len(stack)):
-        gain, offset = _gain(small[k, chosen].astype(float), wanted, len(stack))
+        gain, offset = _gain(small[k, chosen].astype(float), wanted)
         if 0.2 < gain < 5.0:
             stack[k] = gain * stack[k] + offset
 
 
-def _gain(seen: Array, wanted: Array, count: int) -> tuple[float, float]:
-    """Gain and offset that bring grey levels (p,) to their medians (p,) over ``count`` images, robustly."""
+def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
+    """Gain and offset that bring grey levels (p,) of an image to those of all images, robustly."""
     weight, gain, offset = np.ones(len(seen)), 1.0, 0.0
     for _ in range(6):
-        centre = np.average(seen, weights=weight), np.average(wanted, weights=weight)
-        off = gain * seen + offset - wanted
-        noise = _MAD * float(np.median(np.abs(off - np.median(off))))
-        spread = float(np.average(np.square(wanted - centre[1]), weights=weight))
-        if spread > noise**2 * _MEDIAN_VARIANCE / count / MOST_DILUTION:
-            # What each image shows over what all do, which has the less noise: noise makes a slope less steep.
-            slope = float(np.average((wanted - centre[1]) * (seen - centre[0]), weights=weight)) / spread
-            gain = 1.0 / max(slope, 0.1)
-            offset = float(centre[1] - gain * centre[0])
+        total = float(weight.sum())
+        centre = float(weight @ seen) / total, float(weight @ wanted) / total
+        spread = float(weight @ np.square(seen - centre[0])) / total
+        noise = _MAD * float(np.median(np.abs(gain * seen + offset - wanted)))
+        # Without a spread of grey levels only the product of the two is known: a gain it is.  Noise is no spread.
+        if spread > noise**2 / MOST_DILUTION:
+            gain = float(weight @ ((seen - centre[0]) * (wanted - centre[1]))) / total / spread
+            offset = centre[1] - gain * centre[0]
         else:
-            # Without a spread of grey levels only the product of the two is known: a gain it is.
-            gain, offset = float(centre[1] / max(centre[0], 1.0)), 0.0
+            gain, offset = centre[1] / max(centre[0], 1.0), 0.0
         off = np.abs(gain * seen + offset - wanted)
         weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
     return gain, offset

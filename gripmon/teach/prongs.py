@@ -17,6 +17,8 @@ from gripmon.teach.matte import FEWEST_STILL_SHARE
 
 _STEP_PX = 4
 """Between places where a part is cut across: half of what the shortest edge is long."""
+ABOUT_AS_LARGE = 0.85
+"""A finger may lose so much to a cut that runs across both of them, and not along their body."""
 _TURN_RAD, _TURN_STEP_RAD = math.radians(30.0), math.radians(3.0)
 """Between the way to a part's farthest point and the cut: by up to 30 degrees with two fingers as long as they are
 apart; a step of 3 degrees is 4 px on a finger 80 px wide."""
@@ -50,23 +52,26 @@ def _against_each_other(own: list[NDArray[np.bool_]], ways: list[Array], seen: O
 
 
 def prongs(mask: NDArray[np.bool_], outwards: Array) -> list[NDArray[np.bool_]]:
-    """Parts into which a mask falls where it is cut straight across, about square to ``outwards`` (2,), so that the
-    smallest is as large as can be; itself alone where it is one everywhere.
+    """Parts into which a mask falls where it is cut straight across, about square to ``outwards`` (2,): by the shortest
+    of all cuts that leave the smallest part about as large as can be; itself alone where it is one everywhere.
     """
     small = mask[::_STEP_PX, ::_STEP_PX]
     at = np.indices(small.shape)[::-1].transpose(1, 2, 0)
-    best: tuple[int, Array, float] | None = None
+    cuts: list[tuple[int, int, Array, float]] = []
     for turn in np.arange(-_TURN_RAD, _TURN_RAD + 0.5 * _TURN_STEP_RAD, _TURN_STEP_RAD).tolist():
         way = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ outwards
         ahead = at @ way
         for level in np.arange(float(ahead[small].max()), float(ahead[small].min()), -1.0).tolist():
-            smallest = min((int(part.sum()) for part in _large(small & (ahead > level))[1:]), default=0)
-            if smallest > (0 if best is None else best[0]):
-                best = smallest, way, level
-    if best is None:
+            parts = _large(small & (ahead > level))
+            if len(parts) > 1:
+                along = np.any(parts, axis=0) & (ahead <= level + 1.0)
+                cuts.append((int(parts[-1].sum()), int(along.sum()), way, level))
+    if not cuts:
         return [mask]
-    ahead = np.indices(mask.shape)[::-1].transpose(1, 2, 0) @ best[1]
-    found = _large(mask & (ahead > _STEP_PX * (best[2] + 1.0)))
+    enough = ABOUT_AS_LARGE * max(smallest for smallest, *_ in cuts)
+    _, _, way, level = min((cut for cut in cuts if cut[0] >= enough), key=lambda cut: cut[1])
+    ahead = np.indices(mask.shape)[::-1].transpose(1, 2, 0) @ way
+    found = _large(mask & (ahead > _STEP_PX * (level + 1.0)))
     return found if len(found) > 1 else [mask]
 
 

@@ -33,6 +33,7 @@ LONGEST = (
     "test_fleet_load",
     "test_network_camera",
     "test_gripper_from_images",
+    "test_gripper_from_openings",
     "test_run_on_the_network",
     "test_simulator_pictures",
     "test_smoothing",
