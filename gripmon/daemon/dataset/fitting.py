@@ -20,10 +20,9 @@ from gripmon.model.records import Array, Frame, FrameRecord, MeasurementTrace, V
 FRAMES = 24
 """Of an episode, evenly spread: with 24 the sign test at 1/1000 bears four that disagree, with 10 none."""
 _PLACES = 33
+"""Along an outline, evenly."""
 _EDGE_PX = 1.0
 """What lies farther from an edge isn't on it: edges of a sharp image are located to some tenths of a pixel."""
-_ALONG_PX = 4.0
-"""An edge point speaks for the outline as far as this; search lines stand closer."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +116,18 @@ def _seen(config: Config, record: FrameRecord, trace: MeasurementTrace) -> dict[
     points_cam_m = points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     lines_m = gripper.outlines_m(points_cam_m, edges, _PLACES, cam_T_grip[:3, :3])
     lines_px = config.camera.project(lines_m.reshape(-1, 3)).reshape(len(edges), _PLACES, 2)
-    last_px = np.array([config.camera.width_px, config.camera.height_px]) - 1.0 - _ALONG_PX
+    last_px = np.array([config.camera.width_px, config.camera.height_px]) - 1.0
+    lengths_px = np.nan_to_num(np.linalg.norm(np.diff(lines_px, axis=1), axis=2)).sum(axis=1)
+    # The search lines are shared out among the outlines by the roots of their lengths.
+    apart_px = np.sqrt(lengths_px) * np.sqrt(lengths_px).sum() / config.settings.monitor.corners.sampling.samples
     out = {}
-    for edge, line_px in zip(edges.tolist(), lines_px, strict=True):
-        inside = np.isfinite(line_px).all(axis=1) & ((line_px >= _ALONG_PX) & (line_px <= last_px)).all(axis=1)
+    for edge, line_px, reach_px in zip(edges.tolist(), lines_px, apart_px + _EDGE_PX, strict=True):
+        inside = np.isfinite(line_px).all(axis=1) & ((line_px >= 0.0) & (line_px <= last_px)).all(axis=1)
         if 2 * inside.sum() < _PLACES:
             continue
         mine = trace.edge_used & (trace.edge_index == edge)
         worth = np.clip(1.0 - (trace.edge_residual_px[mine] / _EDGE_PX) ** 2, 0.0, None)
-        near = np.linalg.norm(line_px[inside][:, None] - trace.edge_uv_px[mine], axis=2) < _ALONG_PX
+        near = np.linalg.norm(line_px[inside][:, None] - trace.edge_uv_px[mine], axis=2) < reach_px
         best = np.where(near, worth, 0.0).max(axis=1, initial=0.0)
         out[edge] = float(near.any(axis=1).mean()), float(best.mean())
     return out
