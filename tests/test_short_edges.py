@@ -17,8 +17,11 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import prediction_kernel, prediction_plain
+from gripmon.track.edges.ends import along_fingers
 from gripmon.track.edges.prediction import ROWS, SHORTEST_PX, SamplingSettings, independent_part, lay_out
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, profile_offsets_px, read_profiles
+from gripmon.track.look import FingerStrips
+from gripmon.track.look.strips import FEWEST_FRAMES
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
@@ -125,7 +128,21 @@ def test_tips_of_short_edges_are_measured_as_exactly_as_is_said(tip: str):
     assert np.mean(nees) < 3.0 * 6.0 and np.median(nees) < 2.0 * 5.35, "chi-square of six: mean and median"
 
 
-VALID = {"half round": 0.7, "three facets": 0.4}
+VALID = {"half round": 0.7, "three facets": 0.35}
+
+
+def test_what_shows_along_fingers_is_learnt_where_their_sides_are_made_of_several_edges():
+    """The first straight piece behind the tip is 11 px long; a strip along the finger needs 16."""
+    model, solids = fingers("half round")
+    along = along_fingers(model)[1]
+    first = [e for e in np.flatnonzero(along) if model.edge_ids[e] in ("left_edge1", "left_edge2")]
+    assert first, "facets that run along the finger"
+    simulator = Simulator(make_camera(PAPER_LENS), solids, nominal_cam_T_grip(), Scenario(fps=2.0, duration_s=4.0), 1)
+    strips = FingerStrips(make_camera(PAPER_LENS), model, along)
+    for i in range(FEWEST_FRAMES):
+        truth = simulator.truth(i)
+        strips.learn(simulator.render(i), truth.cam_T_grip, truth.jaw_opening_m, truth.time_s)
+    assert strips.ready
 
 
 # --- what only looks like such tips ---
