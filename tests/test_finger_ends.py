@@ -117,7 +117,7 @@ def test_where_a_tone_of_the_fingers_begins_is_not_their_end(from_tip_m: float, 
     scenario = toned(from_tip_m, gain)
     found, ends = looked_at(scenario, -from_tip_m)
     assert found.trusted and abs(slide_of(found) + from_tip_m) < 1e-3
-    assert found.corners.usable.sum() >= 4, "corners are seen"
+    assert found.corners.usable.sum() >= 2, "corners are seen"
     assert not ends.sure and ends.seen.max() < 2
     assert looked_at(scenario)[1].sure, "the true ends are"
 

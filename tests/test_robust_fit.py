@@ -331,7 +331,7 @@ def test_candidates_of_the_wrong_sign_do_not_count_even_where_they_lie_right():
 
 
 def test_points_of_one_edge_together_are_worth_no_more_than_the_edge_itself():
-    """Variance of their mean: the edge's own, plus that of independent points over their number."""
+    """Variance of their mean: the edge's own, plus that of points over the number of independent ones."""
     spread_px = np.full(EDGES, 0.03)
     spread_px[int(PREDICTION.layout.edge[-1])] = 0.3
     found = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), sigma_px=0.12)
@@ -339,7 +339,8 @@ def test_points_of_one_edge_together_are_worth_no_more_than_the_edge_itself():
     consensus = fit_irls(votes_for(found, settings, edge_spread_px=spread_px), REPORTED, np.zeros(7), settings)
     for e in np.unique(PREDICTION.layout.edge):
         mine = PREDICTION.layout.edge[found.sample] == e
-        variance = spread_px[e] ** 2 + (0.12**2 + 0.05**2) / np.count_nonzero(mine)
+        independent = np.count_nonzero(mine) * PREDICTION.independence[e]
+        variance = spread_px[e] ** 2 + (0.12**2 + 0.05**2) / independent
         assert consensus.weight[mine].sum() == pytest.approx(1.0 / variance)
 
 

@@ -15,8 +15,10 @@ from gripmon.model.gripper import Gripper, gripper_from_dict
 Array = NDArray[np.float64]
 
 THICK_M, LENGTH_M, GAP_M = 0.003, 0.045, 0.030
-FAR_SHARE = 0.6
-"""Width of the far face over the near one's: of 8 mm, no side is seen at up to 28 degrees."""
+FAR_SHARE, THINNER_FROM_M = 0.6, 0.008
+"""Width of the far face over the near one's: of 8 mm, no side is seen at up to 28 degrees.  What is narrower is as much
+thinner.
+"""
 
 MOTION = {"left": {"motion": {"axis": [-0.5, 0.0, 0.0]}}, "right": {"motion": {"axis": [0.5, 0.0, 0.0]}}}
 JAW = {"nominal_m": GAP_M, "min_m": 0.01, "max_m": 0.06}
@@ -39,9 +41,20 @@ def outline_m(width_m: float, radius_m: float, step_m: float) -> Array:
     return np.vstack([left, flat[1:-1], right])
 
 
+def facetted_m(facet_m: float) -> Array:
+    """(n, 2) as :func:`outline_m`: a tip of three facets of the same length, turned by 45 degrees each."""
+    half, back = 0.5 * facet_m, np.sqrt(0.5) * facet_m
+    return np.array([[-half - back, -back], [-half, 0.0], [half, 0.0], [half + back, -back]])
+
+
 def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 2e-4) -> Gripper:
     """For the simulator: prisms with a facet each ``step_m``; their vertices lie on the rounded outline."""
-    tip = outline_m(width_m, radius_m, step_m)
+    return solids(outline_m(width_m, radius_m, step_m))
+
+
+def solids(tip: Array) -> Gripper:
+    """For the simulator: prisms whose near face ends in a ``tip`` (n, 2), see :func:`outline_m`."""
+    width_m = float(np.ptp(tip[:, 0]))
     near = np.vstack([[-0.5 * width_m, -LENGTH_M], tip, [0.5 * width_m, -LENGTH_M]])
     middle = np.array([0.0, -0.5 * LENGTH_M])
     inset_m = (1.0 - FAR_SHARE) * width_m
@@ -50,9 +63,10 @@ def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: floa
     points: dict[str, Any] = {}
     edges: dict[str, Any] = {}
     faces: list[tuple[str, list[str]]] = []
+    half_m = 0.5 * _thick_m(width_m)
     for finger, x_m in _middles_m(width_m).items():
         rims = {rim: [f"{finger}_{rim}{i}" for i in range(count)] for rim in ("near", "far")}
-        for names, loop, y_m in zip(rims.values(), (near, far), (-0.5 * THICK_M, 0.5 * THICK_M), strict=True):
+        for names, loop, y_m in zip(rims.values(), (near, far), (-half_m, half_m), strict=True):
             for i, (x, z) in enumerate(loop.tolist()):
                 at_tip = 0 < i < count - 1
                 points[names[i]] = {"finger": finger, "xyz_m": [x_m + x, y_m, z], "corner": at_tip}
@@ -73,13 +87,34 @@ def rounded_model(width_m: float = 0.012, radius_m: float = 0.004, step_m: float
         backs = (-0.5 * width_m, -LENGTH_M), (0.5 * width_m, -LENGTH_M)
         for name, (x, z) in {"a_back": backs[0], "a": tip[0], "b": tip[-1], "b_back": backs[1]}.items():
             corner = radius_m == 0.0 and "back" not in name
-            xyz_m = [float(x_m + x), -0.5 * THICK_M, float(z)]
+            xyz_m = [float(x_m + x), -0.5 * _thick_m(width_m), float(z)]
             points[f"{finger}_{name}"] = {"finger": finger, "xyz_m": xyz_m, "corner": corner}
-        via = [[x_m + x, -0.5 * THICK_M, z] for x, z in tip[1:-1].tolist()]
+        via = [[x_m + x, -0.5 * _thick_m(width_m), z] for x, z in tip[1:-1].tolist()]
         edges[f"{finger}_side_a"] = {"from": f"{finger}_a_back", "to": f"{finger}_a"}
         edges[f"{finger}_tip"] = {"from": f"{finger}_a", "to": f"{finger}_b", "via": via}
         edges[f"{finger}_side_b"] = {"from": f"{finger}_b", "to": f"{finger}_b_back"}
     return _gripper(points, edges, [])
+
+
+def facetted_model(tip: Array) -> Gripper:
+    """For the monitor: straight edges alone, with a corner between each two of them; ``tip`` (n, 2) as for
+    :func:`solids`.
+    """
+    width_m = float(np.ptp(tip[:, 0]))
+    points: dict[str, Any] = {}
+    edges: dict[str, Any] = {}
+    for finger, x_m in _middles_m(width_m).items():
+        outline = np.vstack([[tip[0, 0], -LENGTH_M], tip, [tip[-1, 0], -LENGTH_M]])
+        for i, (x, z) in enumerate(outline.tolist()):
+            xyz_m = [x_m + x, -0.5 * _thick_m(width_m), z]
+            points[f"{finger}{i}"] = {"finger": finger, "xyz_m": xyz_m, "corner": 0 < i < len(outline) - 1}
+        for i in range(len(outline) - 1):
+            edges[f"{finger}_edge{i}"] = {"from": f"{finger}{i}", "to": f"{finger}{i + 1}"}
+    return _gripper(points, edges, [])
+
+
+def _thick_m(width_m: float) -> float:
+    return THICK_M * min(width_m / THINNER_FROM_M, 1.0)
 
 
 def _middles_m(width_m: float) -> dict[str, float]:

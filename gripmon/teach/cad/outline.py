@@ -40,8 +40,7 @@ SHADED_PX = 0.1
 tips of 2 to 8 mm, rendered with a lamp from the side, outlines lay 0.05 to 0.17 px beside."""
 
 SHORTEST_PX = 8.0
-"""The shortest edge by itself: as long as what the monitor leaves out at the ends of one.  What is shorter only joins
-two others: a bridge."""
+"""The shortest edge by itself: what the monitor samples at least.  What is shorter only joins two others: a bridge."""
 
 SHORTEST_M = 1e-4  # of a gripper file's edges
 

@@ -52,9 +52,9 @@ FEWEST_FREE = 3
 
 @compiled
 def fit(
-    sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, ok: Any, edge_spread_px: Any, mean: Any,
-    prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float, support_sigmas: float,
-    support_share: float,
+    sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, ok: Any, independence: Any, edge_spread_px: Any,
+    mean: Any, prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float,
+    support_sigmas: float, support_share: float,
 ) -> Any:  # fmt: skip
     """``robust_fit.fit_irls``: whether it could be solved, then the fields of ``RobustFit`` in their order."""
     count = len(start)
@@ -73,7 +73,7 @@ def fit(
         for i in range(count):
             residual_px[k] -= unknowns[i] * jacobian[sample[k], i]
     supported, share, seen, believed = _judge(
-        sample, offset_px, weight, residual_px, edge, ok, len(edge_spread_px),
+        sample, offset_px, weight, residual_px, edge, ok, independence,
         start_width_px, gate_px, support_sigmas, support_share,
     )  # fmt: skip
     own, own_information = unknowns[:count].copy(), information[:count, :count].copy()
@@ -239,11 +239,11 @@ def _stiffness(weight: Any, residual: Any, reach: Any) -> float:
 
 @compiled
 def _judge(
-    sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, edges: int, start_width_px: float,
-    gate_px: float, support_sigmas: float, support_share: float,
+    sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, independence: Any,
+    start_width_px: float, gate_px: float, support_sigmas: float, support_share: float,
 ) -> tuple[Any, Any, Any, float]:  # fmt: skip
     """``robust_fit._judge``: the profiles that agree, each edge's share and whether it is seen, the share of pairs."""
-    supported = np.zeros(len(edge), np.bool_)
+    supported, edges = np.zeros(len(edge), np.bool_), len(independence)
     profiles, agreeing, others = np.zeros(edges), np.zeros(edges), np.zeros(edges)
     reach_px = start_width_px
     for k in range(len(sample)):
@@ -260,7 +260,8 @@ def _judge(
     for e in range(edges):
         some = max(profiles[e], 1.0)
         chance = 1.0 - math.exp(others[e] * (-gate_px / max(reach_px - gate_px, 0.5)) / some)
-        needed = profiles[e] * chance + support_sigmas * math.sqrt(profiles[e] * chance * (1.0 - chance))
+        variance = profiles[e] * chance * (1.0 - chance) / independence[e]
+        needed = profiles[e] * chance + support_sigmas * math.sqrt(variance)
         share[e] = agreeing[e] / some
         seen[e] = agreeing[e] >= FEWEST_AGREEING and agreeing[e] > needed and share[e] >= support_share
         seen_edges += seen[e]

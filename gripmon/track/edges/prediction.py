@@ -23,6 +23,7 @@ from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.track.edges import prediction_kernel, prediction_plain
+from gripmon.track.edges.kernel import FEWEST_AGREEING
 
 if TYPE_CHECKING:
     from gripmon.track.edges.taught import TaughtEdges
@@ -40,7 +41,8 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         Meta(
             ge=0.0,
             le=40.0,
-            description="part of an edge at each end that is left out: the neighbour edge shows there (px)",
+            description="part of an edge at each end that is left out: the neighbour edge shows there; down to half of "
+            "it where the edge is short (px)",
         ),
     ] = 4.0
     creases: Annotated[
@@ -64,8 +66,8 @@ FEWEST_SAMPLES = 4
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
-SHORTEST_PX = 8.0
-"""Less of an edge isn't sampled."""
+SHORTEST_PX = float(FEWEST_AGREEING - 1)
+"""Less of an edge isn't sampled: as many profiles as must agree would be closer than a pixel."""
 
 PLACES = 65
 """Places of an edge, evenly spaced, at which it is seen whether it lies in the image."""
@@ -140,7 +142,8 @@ class Prediction:
 
     With a taught model ``uv_px`` lies where the edge was taught to show, everything else is the sharp model's: what is
     measured from there is the model's own motion.  ``edge_spread_m`` (e,): standard deviation of what a
-    bevel moves an edge by, or of what teaching left of that.
+    bevel moves an edge by, or of what teaching left of that.  ``independence`` (e,): part of an edge's profiles that
+    see pixels of their own, see :func:`independent_part`.
     """
 
     cam_T_grip: Array
@@ -160,6 +163,7 @@ class Prediction:
     map_y: NDArray[np.float32]
     corners: PredictedCorners
     edge_spread_m: Array
+    independence: Array
 
     @cached_property
     def pixels_per_m(self) -> float:
@@ -233,15 +237,17 @@ def lay_out(
     wanted = view.visible & (settings.creases | ~view.crease | as_taught)
     along_m = gripper.outlines_m(points_cam_m, np.arange(len(gripper.edge_ids)), PLACES, cam_T_grip[:3, :3])
     uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
-    ranges = _by.sampled_ranges(uv, _inside(camera, uv, settings.reach_px), wanted, settings.end_margin_px, SHORTEST_PX)
+    margin_px = settings.end_margin_px
+    shortest_px = max(margin_px, SHORTEST_PX)  # the margin is zoomed, and so is what has to be left
+    ranges = _by.sampled_ranges(uv, _inside(camera, uv, settings.reach_px), wanted, margin_px, shortest_px)
     lengths = ranges[:, 2]
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
         # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most
         # one profile a pixel: closer ones see the same pixels again.
         share = np.sqrt(lengths)
-        counts = np.minimum(np.round(settings.samples * share / share.sum()), lengths).astype(int)
-    counts[counts < FEWEST_SAMPLES] = 0
+        wanted_counts = np.maximum(np.round(settings.samples * share / share.sum()), FEWEST_AGREEING)
+        counts = np.where(lengths > 0.0, np.minimum(wanted_counts, np.floor(lengths) + 1.0), 0.0).astype(int)
     edges = np.flatnonzero(counts)
     fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges.tolist(), counts.tolist(), strict=True) if n]
     first = np.concatenate([[0], np.cumsum(counts[edges])[:-1]]).astype(np.intp) if len(edges) else np.zeros(0, np.intp)
@@ -327,7 +333,26 @@ def predict(
         map_y=map_y,
         corners=corners,
         edge_spread_m=edge_spread_m,
+        independence=independent_part(uv, edge, len(gripper.edge_ids), ROWS * spacing_px),
     )
+
+
+def independent_part(uv_px: Array, edge: NDArray[np.intp], edges: int, width_px: float) -> Array:
+    """(e,) by how much the mean of each edge's profiles, at ``uv_px`` (n, 2) of ``edge`` (n,), is less exact than that
+    of as many independent ones, as a factor on their number; 1 for edges without any.
+
+    Two that are ``width_px`` wide and less apart share pixels, and are correlated by the shared part of their width.
+    """
+    apart_px, same = np.sqrt(np.square(np.diff(uv_px, axis=0)).sum(axis=1)), edge[1:] == edge[:-1]
+    count = np.bincount(edge, minlength=edges)
+    spacing_px = np.bincount(edge[1:][same], apart_px[same], edges) / np.maximum(count - 1, 1)
+    together = np.maximum(count, 1).astype(float)
+    for apart in range(1, int(count.max(initial=1))):
+        shared = np.maximum(1.0 - apart * spacing_px / width_px, 0.0) * np.maximum(count - apart, 0)
+        if not shared.any():
+            break
+        together += 2.0 * shared
+    return np.asarray(np.maximum(count, 1) / together)
 
 
 def _predict_corners(

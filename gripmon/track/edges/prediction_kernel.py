@@ -28,7 +28,7 @@ def largest_motion(jacobian: Any, xi: Any) -> float:
 
 @compiled
 def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
-    """``prediction._sampled_ranges`` of edges (e, c, 2) whose c places are ``inside`` (e, c): (e, 3)."""
+    """``prediction_plain.sampled_ranges``."""
     edges, places = inside.shape
     out, travelled = np.zeros((edges, 3)), np.empty(places)
     for e in range(edges):
@@ -47,7 +47,8 @@ def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, short
                 first, last, longest = begin, k, travelled[k] - travelled[begin]
         if last < first:
             continue
-        low, high = travelled[first] + margin_px, travelled[last] - margin_px
+        off_px = min(margin_px, max(0.5 * margin_px, 0.5 * longest - shortest_px))
+        low, high = travelled[first] + off_px, travelled[last] - off_px
         if high - low >= shortest_px:
             out[e, 0], out[e, 1], out[e, 2] = _fraction(travelled, low), _fraction(travelled, high), high - low
     return out

@@ -20,6 +20,9 @@ def sampled_ranges(
 ) -> Array:
     """First and last fraction and length in px (e, 3) of the longest run of each edge inside the image, less the
     margin; zeros if nothing is left, or the edge isn't ``wanted`` (e,).  Of edges (e, c, 2) c places, evenly spaced.
+
+    Of a short edge the margin leaves twice ``shortest_px``, if half of it suffices for that, or else what half of it
+    leaves.
     """
     out = np.zeros((len(uv_px), 3))
     step_px = np.linalg.norm(np.diff(uv_px, axis=1), axis=2)
@@ -28,7 +31,9 @@ def sampled_ranges(
         starts, stops = change[::2], change[1::2] - 1
         travelled = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step_px[e]))])
         run = int(np.argmax(travelled[stops] - travelled[starts]))
-        low, high = travelled[starts[run]] + margin_px, travelled[stops[run]] - margin_px
+        begin, end = travelled[starts[run]], travelled[stops[run]]
+        off_px = min(margin_px, max(0.5 * margin_px, 0.5 * (end - begin) - shortest_px))
+        low, high = begin + off_px, end - off_px
         if high - low >= shortest_px:
             fractions = np.interp([low, high], travelled, np.linspace(0.0, 1.0, inside.shape[1]))
             out[e] = fractions[0], fractions[1], high - low

@@ -314,7 +314,7 @@ def usual_width(width_px: Any, weight: Any) -> tuple[int, float]:
 @compiled
 def worth(
     sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
-    point_floor_px: float, edge_floor_px: float,
+    independence: Any, point_floor_px: float, edge_floor_px: float,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
     """What ``profiles.Edgels`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
     count, edges = len(sample), len(bevel_px)
@@ -323,7 +323,7 @@ def worth(
     for k in range(count):
         e = edge[sample[k]]
         wrong = polarity[e] != 0 and np.sign(step[k]) != polarity[e]
-        weight[k] = 0.0 if wrong else 1.0 / (sigma_px[k] ** 2 + point_floor_px**2)
+        weight[k] = 0.0 if wrong else independence[e] / (sigma_px[k] ** 2 + point_floor_px**2)
         energy[e] += step[k] ** 2
         cut_off_energy[e] += step[k] ** 2 * cut_off[k]
     usual_px = max(_nth(width_px.copy(), count, count // 2), 1.0) if count else 1.0

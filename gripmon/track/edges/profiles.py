@@ -330,6 +330,7 @@ def weigh(
         prediction.layout.edge,
         polarity,
         prediction.bevel_px,
+        prediction.independence,
         settings.point_floor_px,
         settings.edge_floor_px,
     )
@@ -354,9 +355,11 @@ def weigh_with_numpy(
 def base_weights(
     candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: RobustFitSettings
 ) -> Array:
-    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees."""
+    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.  Profiles
+    that see the same pixels share what these are worth.
+    """
     edge = prediction.layout.edge[candidates.sample]
-    weight = 1.0 / (candidates.sigma_px**2 + settings.point_floor_px**2)
+    weight = prediction.independence[edge] / (candidates.sigma_px**2 + settings.point_floor_px**2)
     wanted = polarity[edge]
     weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
     return weight

@@ -155,6 +155,7 @@ def fit_irls(
         prediction.jacobian,
         prediction.layout.edge,
         prediction.ok,
+        prediction.independence,
         edgels.edge_spread_px,
         prior.mean,
         prior.information,
@@ -360,7 +361,9 @@ def _judge(edgels: Edgels, fit: Fit, settings: RobustFitSettings) -> RobustFit:
     # Edge responses end before the profiles do: what was found tells how far candidates reach.
     reach_px = max(float(np.abs(candidates.offset_px).max(initial=0.0)), settings.start_width_px)
     chance = 1.0 - np.exp(others * (-gate_px / max(reach_px - gate_px, 0.5)) / some)
-    needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
+    # Profiles that see the same pixels agree by the same chance.
+    variance = profiles * chance * (1.0 - chance) / prediction.independence
+    needed = profiles * chance + settings.support_sigmas * np.sqrt(variance)
     share = agreeing / some
     seen = (agreeing >= FEWEST_AGREEING) & (agreeing > needed) & (share >= settings.support_share)
     # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.

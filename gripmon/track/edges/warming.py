@@ -93,4 +93,5 @@ def _of_one_edge() -> Prediction:
         map_y=place,
         corners=corners,
         edge_spread_m=np.zeros(1),
+        independence=np.ones(1),
     )

@@ -159,7 +159,7 @@ class FingerStrips:
         for edge in np.flatnonzero(~self._along & gripper.edge_view(points_m, eye_m).visible).tolist():
             ends = gripper.edge_points[edge].tolist()
             for face in self._faces(points_m, eye_m, ends):
-                ways = [points_m[far] - points_m[end] for end in ends for far in self._behind(end) if far in face]
+                ways = [points_m[far] - points_m[end] for end in ends for far in self._behind(end, face)]
                 # At the fingers' roots there are edges across them, too.
                 if ways and ways[0][2] < 0.0:
                     both = np.stack([ways[0], ways[-1]])
@@ -185,10 +185,20 @@ class FingerStrips:
                 out.append(set(face.points.tolist()))
         return out
 
-    def _behind(self, point: int) -> list[int]:
-        """The other ends of the edges along the finger that begin in a point."""
+    def _behind(self, point: int, face: set[int]) -> list[int]:
+        """Where the edges along the finger lead that begin in a point, from one to the next on a ``face``: a side may
+        be made of several.
+        """
         edges = self._gripper.edge_points[self._along]
-        return edges[:, ::-1][edges == point].tolist()
+        out, passed, begin = [], {point}, [point]
+        while begin:
+            at = begin.pop()
+            further = (set(edges[:, ::-1][edges == at].tolist()) & face) - passed
+            if not further and at != point:
+                out.append(at)
+            passed |= further
+            begin += sorted(further)
+        return out
 
 
 _ACROSS = ((np.arange(STRIP_LINES) + 0.5) / STRIP_LINES).tolist()
