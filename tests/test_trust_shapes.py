@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -21,7 +22,8 @@ from gripmon.monitor.refits import SIGMA_INFLATION
 from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump
-from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends
+from gripmon.track.edges.ends import along_fingers
 
 FPS, KNOCK = 20.0, 16
 """Frame with which the mount is knocked."""
@@ -104,6 +106,29 @@ def test_a_pose_that_needs_no_ends_is_remembered_without_them():
     claimed_m = np.sqrt(np.linalg.eigvalsh(weigher.anchor.covariance[:3, :3])[-1])
     sides = tracker.along[measurement.normal.edge]
     assert claimed_m > 0.99 * sigma_m_of(measurement, sides) > 1.2 * sigma_m_of(measurement, np.ones_like(sides))
+
+
+def test_the_edges_of_a_fingers_root_are_no_end_of_it():
+    """What is seen there leaves it open whether the tips are: a carrier hides it, and its rim is parallel to it."""
+    model = box_fingers(bevel_m=0.0)
+    roots = {
+        f"{side}_root_{y}": (f"{side}_in_{y}_back", f"{side}_out_{y}_back") for side in "LR" for y in ("near", "far")
+    }
+    roots |= {
+        f"{side}_root_{x}": (f"{side}_{x}_near_back", f"{side}_{x}_far_back") for side in "LR" for x in ("in", "out")
+    }
+    model["edges"] |= {name: {"from": one, "to": other} for name, (one, other) in roots.items()}
+    gripper = gripper_from_dict(model)
+    across = ~along_fingers(gripper)[1]
+    assert {gripper.edge_ids[k] for k in np.flatnonzero(across & ~edges_at_ends(gripper))} == set(roots)
+    monitor = Monitor(make_camera(PAPER_LENS), gripper, MonitorSettings(), reference_of(nominal_cam_T_grip()))
+    weigher = monitor._trust._weigher
+    for names, times in ((set(roots), 0), ({*roots, "L_tip_in"}, 1)):
+        edges = np.array([k for k, name in enumerate(gripper.edge_ids) if name in names])
+        seen = SimpleNamespace(
+            normal=SimpleNamespace(edge=edges), consensus=SimpleNamespace(edge_seen=np.ones(len(across), dtype=bool))
+        )
+        assert weigher._misread(seen, None, None) == pytest.approx(MISREAD_PROBABILITY**times)  # type: ignore[arg-type]
 
 
 # --- what the file doesn't say ---

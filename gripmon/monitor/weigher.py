@@ -33,7 +33,7 @@ from gripmon.monitor.refits import (
 )
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends
 from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
@@ -102,6 +102,7 @@ class Weigher:
     def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._along = tracker.along  # (e,) which edges run along the fingers
+        self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
         self._floor = _floor(settings)
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
@@ -234,26 +235,32 @@ class Weigher:
         """Probability that the mount was knocked since then; ``hidden``: something is at the gripper."""
         return max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
 
-    def confirmations(
-        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
-    ) -> int:
+    def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
-        further corner.  ``kept`` (v,): the measured edges that count.
+        further corner.
         """
-        by_edge = set(self._gripper.edge_finger[self._at_ends(measurement, kept)].tolist())
-        return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
+        return self._times(self._across(measurement), ends)
 
-    def _at_ends(self, measurement: Measurement, kept: NDArray[np.bool_] | None) -> NDArray[np.intp]:
-        """The edges at the fingers' ends that are seen."""
-        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+    def _across(self, measurement: Measurement) -> NDArray[np.intp]:
+        """The edges that are seen and don't run along the fingers."""
+        edge = measurement.normal.edge
         return edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
 
+    def _times(self, edges: NDArray[np.intp], ends: FingerEndsSeen | None) -> int:
+        by_edge = set(self._gripper.edge_finger[edges].tolist())
+        return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
+
     def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
-        """Probability that ends that are seen where they are expected are none.  A single straight border shows what
-        edges on one line do, of whatever fingers they are.
+        """Probability that ends that are seen where they are expected are none; ``kept`` (v,): the measured edges that
+        count.  A finger's root is no end, and a single straight border shows what edges on one line do, of whatever
+        fingers they are.
         """
-        times = self.confirmations(measurement, ends, kept)
-        if ends is not None and not ends.seen.any() and _on_one_line(measurement, self._at_ends(measurement, kept)):
+        edges = self._across(measurement)
+        edges = edges[self._at_ends[edges]]
+        if kept is not None:
+            edges = edges[np.isin(edges, measurement.normal.edge[kept])]
+        times = self._times(edges, ends)
+        if ends is not None and not ends.seen.any() and _on_one_line(measurement, edges):
             times = min(times, 1)
         return MISREAD_PROBABILITY**times
 

@@ -158,6 +158,12 @@ def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
     return FingerEnds(gripper, EdgeSettings()).finger
 
 
+def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:
+    """(e,) which edges meet a place at which a finger may end, and don't run along it: not those of its root."""
+    ends = FingerEnds(gripper, EdgeSettings())
+    return ~ends.along & np.isin(gripper.edge_points, ends.points).any(axis=1)
+
+
 class FingerEnds:
     """Looks beyond the ends of one gripper's fingers."""
 
@@ -168,6 +174,11 @@ class FingerEnds:
         self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
         self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
+
+    @property
+    def points(self) -> NDArray[np.intp]:
+        """The gripper's points at which fingers may end."""
+        return self._places.point[self._places.at_end]
 
     @property
     def finger(self) -> NDArray[np.intp]:
