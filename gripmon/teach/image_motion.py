@@ -15,7 +15,7 @@ from gripmon.model.records import Array
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
 from gripmon.teach.matte import sets_refused
 from gripmon.teach.silhouette import FOLDS, Stations, in_image, inner_side, measure_transitions
-from gripmon.teach.straight_pieces import jackknife_sigma
+from gripmon.teach.straight_pieces import WORST_RMS_PX, jackknife_sigma
 
 SAME_OPENING_M = 5e-5
 """Openings this close are one: some 0.2 px of each finger, 100 mm away."""
@@ -24,6 +24,8 @@ STATIONS = 40
 """On each edge."""
 TIP_SHARE = 0.35
 """Of a finger's length: its tip, which is at one depth."""
+MOST_TOGETHER = 0.55
+"""Mean motion of fingers over that between them: where one jaw is fixed it is a half, and known to a tenth."""
 ROUGH_STEP_PX = 2.0
 """Of a shift that is only roughly known: it is found in images of half the size."""
 _FAR_PX = 260
@@ -86,7 +88,9 @@ def check_opened(moved: Mapping[float, Sequence[FingerMoved]], counts: Sequence[
     for fingers in moved.values():
         shifts = np.array([finger.shift for finger in fingers])
         together = float(np.linalg.norm(0.5 * (shifts.min(axis=0) + shifts.max(axis=0))))
-        if together > float(np.linalg.norm(np.ptp(shifts, axis=0))):
+        if max(finger.rms_px for finger in fingers) > WORST_RMS_PX:
+            raise sets_refused(counts)
+        if together > MOST_TOGETHER * float(np.linalg.norm(np.ptp(shifts, axis=0))):
             raise NoResultError(
                 f"the images fall into sets of {' and '.join(map(str, counts))}, between which all that stays has "
                 "moved together: the camera moved; a camera fixed to the gripper, jaws alone that move"
