@@ -70,12 +70,12 @@ def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: p
     with caplog.at_level(logging.WARNING, "gripmon.record"):
         for i in range(30):
             writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
-        wait_until(lambda: "missing in the recording so far: 0 frames" in caplog.text)
+        wait_until(lambda: "missing in the recording so far: frames: 0" in caplog.text)
         os.kill(process, signal.SIGCONT)
         writer.close(60.0)
     assert (writer.dropped, writer.frames_written) == (0, 30)
     assert 0 < writer.images_dropped == 30 - len(pictures(tmp_path))
-    assert f"missing in the recording so far: 0 frames; {writer.images_dropped} images of others" in caplog.text
+    assert f"missing in the recording so far: frames: 0; images of other frames: {writer.images_dropped}" in caplog.text
 
 
 def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_path: Path) -> None:

@@ -193,6 +193,11 @@ def test_sources_by_name(tmp_path: Path):
         named_source("zenoh:640x480", (800, 600))
 
 
+def test_the_robot_is_named_as_the_folder_where_a_key_can(tmp_path: Path) -> None:
+    assert Project(tmp_path / "arm9").values["robot"] == "arm9"
+    assert Project(tmp_path / "cell $4").values["robot"] == defaults()["robot"]
+
+
 def test_a_camera_on_the_network_is_looked_through(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The driver's frames come on the monitor's own key, as when it runs."""
     from support.loopback import plain_session

@@ -105,9 +105,9 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
             f"           {_latency_line(summary.latency_while_tracking_ms)} while tracking (else it searches)",
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
-            *(f"look at it {_viewer()} {shlex.quote(recording)}" for recording in recordings),
+            *(f"look at it {_beside_us('rerun')} {shlex.quote(recording)}" for recording in recordings),
             _report_line(recordings, out),
-            "next       your own camera and gripper, on one page: gripmon setup arm1",
+            f"next       your own camera and gripper, on one page: {_beside_us('gripmon')} setup arm1",
         ]
     )
 
@@ -116,13 +116,13 @@ def _report_line(recordings: list[str], out: Path) -> str:
     """How to ask what happened."""
     if not recordings:
         return "recording  none was written; the alerts above say why"
-    return f"report     gripmon report {shlex.join(recordings)} --out {shlex.quote(str(out / 'report.html'))}"
+    return f"report     {_beside_us('gripmon')} report {shlex.join(recordings)} --out {shlex.quote(str(out / 'report.html'))}"
 
 
-def _viewer() -> str:
-    """How to start rerun's viewer, which is installed with us but perhaps not on the path."""
-    beside_us = Path(sys.executable).parent / "rerun"
-    return "rerun" if shutil.which("rerun") or not beside_us.exists() else shlex.quote(str(beside_us))
+def _beside_us(name: str) -> str:
+    """How to start a program of our environment, which is perhaps not on the path."""
+    beside_us = Path(sys.executable).parent / name
+    return name if shutil.which(name) or not beside_us.exists() else shlex.quote(str(beside_us))
 
 
 def _latency_line(latency_ms: Latency) -> str:

@@ -208,6 +208,8 @@ def view(arguments: Arguments) -> int:
 def _corrected(each: CorrectedRun) -> str:
     import numpy as np
 
+    from gripmon.analyse.content import clock_time
+
     correction = each.correction
     sigma_um = 1e6 * float(np.median(np.sqrt(np.einsum("nii->ni", correction.covariance)[:, :3].sum(axis=1))))
     count = len(correction.change_points)
@@ -218,5 +220,5 @@ def _corrected(each: CorrectedRun) -> str:
         turn_deg = np.degrees(float(np.linalg.norm(point.size[3:])))
         spread_ms = 1e-6 * (point.latest_ns - point.earliest_ns)
         seq = int(each.recording.frames.seq[point.index])
-        text += f"\n  frame {seq} ({point.stamp_ns} ns, within {spread_ms:.0f} ms): {size_mm:.3f} mm, {turn_deg:.3f}°"
+        text += f"\n  frame {seq} ({clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms): {size_mm:.3f} mm, {turn_deg:.3f}°"
     return text

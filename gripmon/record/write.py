@@ -289,7 +289,7 @@ class ProcessRecorder:
         losses = (self.dropped, self.images_dropped)
         if losses != self._losses_logged:
             self._losses_logged, self._losses_logged_s = losses, now_s
-            _log.warning("missing in the recording so far: %d frames; %d images of others", *losses)
+            _log.warning("missing in the recording so far: frames: %d; images of other frames: %d", *losses)
 
     def _running_worker(self) -> WorkerProcess | None:
         if self._worker is None and time.monotonic() >= self._restart_at:

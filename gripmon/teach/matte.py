@@ -246,7 +246,7 @@ def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
             offset = centre[1] - gain * centre[0]
         else:
             gain, offset = centre[1] / max(centre[0], 1.0), 0.0
-        off = np.abs(gain * seen + offset - wanted)
+        off: Array = np.abs(gain * seen + offset - wanted)
         weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
     return gain, offset
 

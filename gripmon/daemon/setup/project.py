@@ -64,6 +64,9 @@ class Project:
     def __init__(self, folder: Path) -> None:
         self.folder = writable_folder(folder).resolve()
         self.values, self._accepted = steps.defaults(), {}
+        with contextlib.suppress(ValueError):  # a folder may have a name that no key can
+            check_name("robot", self.folder.name)
+            self.values["robot"] = self.folder.name
         path = self.folder / SETUP
         if path.exists():
             kept = read_yaml(path)

@@ -94,6 +94,8 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
             add(folder, FolderSettings, inner)
     if not found:
         right = "LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos"
+        if any(path.endswith(".rrd") for path in files):
+            right += "; for gripmon's own recordings there are gripmon report, correct and export"
         raise SourceError(f"path: there is no episode in {root}; {right}")
     if cameras and not any(getattr(one.source, "camera", None) for one in found):
         raise SourceError(f"camera: {root} holds plain images or videos, of one camera each; leave it out")

@@ -147,7 +147,7 @@ class CauseJudge:
                 BLIND_CAUSES, "no finger is seen where it should be, nor near it; hidden, or far out of place"
             )
         if scatter_px > SCATTERED_PX:
-            text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: they don't tell what is wrong"
+            text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: which doesn't tell what is wrong"
             return self._told({Cause.UNKNOWN: 1.0}, text)
         comparison = self._compared(pooled, ref_cam_T_grip, baseline)
         top = max(comparison.log.values())

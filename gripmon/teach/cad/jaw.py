@@ -43,7 +43,9 @@ def jaw_of(
             raise InputError(f"{jaw_opening_m:g}: nothing says that the jaws move; with --jaw-range", "jaw_opening_m")
         return None
     if len(fingers) != 2:
-        raise InputError(f"is of two fingers, and there are {len(fingers)}; the meshes of both", "jaw_range_m")
+        raise InputError(
+            f"belongs to two fingers, and the files hold {len(fingers)}; give the meshes of both", "jaw_range_m"
+        )
     low, high = jaw_range_m
     nominal = round(_apart_m(*fingers.values()) if jaw_opening_m is None else jaw_opening_m, 7)
     if not low <= nominal <= high:

@@ -139,7 +139,7 @@ class LookAlignment:
             return None
         cam_T_grip, jaw_opening_m, places = self._laid_out
         parts = (places, self._mean, self._variance, self._at_first, self._count, self._unlike)
-        kept = (part.astype(kind).tobytes() for part, kind in zip(parts, _KINDS, strict=True))
+        kept = (np.asarray(part).astype(kind).tobytes() for part, kind in zip(parts, _KINDS, strict=True))
         return LookPixels(to_record(cam_T_grip), jaw_opening_m, self.views, *kept)
 
     def restore(self, record: LookPixels) -> None:
