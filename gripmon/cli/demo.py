@@ -116,7 +116,8 @@ def _report_line(recordings: list[str], out: Path) -> str:
     """How to ask what happened."""
     if not recordings:
         return "recording  none was written; the alerts above say why"
-    return f"report     {_beside_us('gripmon')} report {shlex.join(recordings)} --out {shlex.quote(str(out / 'report.html'))}"
+    page = shlex.quote(str(out / "report.html"))
+    return f"report     {_beside_us('gripmon')} report {shlex.join(recordings)} --out {page}"
 
 
 def _beside_us(name: str) -> str:

@@ -220,5 +220,6 @@ def _corrected(each: CorrectedRun) -> str:
         turn_deg = np.degrees(float(np.linalg.norm(point.size[3:])))
         spread_ms = 1e-6 * (point.latest_ns - point.earliest_ns)
         seq = int(each.recording.frames.seq[point.index])
-        text += f"\n  frame {seq} ({clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms): {size_mm:.3f} mm, {turn_deg:.3f}°"
+        when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
+        text += f"\n  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°"
     return text
