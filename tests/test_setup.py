@@ -26,11 +26,11 @@ from gripmon.calibrate.sighting import Sighting
 from gripmon.cli import main
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.project import Line
 from gripmon.daemon.setup.robot_file import reference_text
-from gripmon.daemon.setup.running import overlay
 from gripmon.daemon.setup.site import CaptureOrder, Do
 from gripmon.daemon.setup.steps import defaults, target_in
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
@@ -442,7 +442,9 @@ def _drawn_where_it_is(config: Config, truth: dict[str, Any], path: Path) -> Non
     for verdict, transform in ((Verdict.VALID, true), (Verdict.SUSPECT, true), (Verdict.UNKNOWN, None)):
         pose = None if transform is None else Transform(tuple(transform[:3, 3].tolist()), (x, y, z, w))
         changes = {"verdict": verdict, "cam_T_grip": pose, "corners": (), "jaw_opening_m": truth["jaw_opening_m"]}
-        jpeg = overlay(config, frame_record(**changes), np.asarray(image))
+        record = frame_record(**changes)
+        outlines = outlines_of(config.camera, config.gripper, record)
+        jpeg = overlay(np.asarray(image), record, outlines, image.shape[1])
         blue, green, red = np.moveaxis(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int), 2, 0)
         coloured = {"valid": green - red > 60, "suspect": red - blue > 60, "unknown": abs(red - blue) > 60}[
             verdict.value
