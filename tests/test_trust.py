@@ -237,7 +237,7 @@ def test_a_knock_across_lined_fingers_before_a_background_like_them_misleads_in_
 
 @pytest.mark.xfail(
     reason="where the border of a tone comes to lie where the tips were, nothing asks whether the fingers have slid: "
-    "asking in the frames whose ends are looked at mended a third of such frames, at a tenth of a frame's time",
+    "asking in the frames whose ends are looked at mended a quarter of such frames, at a tenth of a frame's time",
     strict=True,
 )
 def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_misleads_in_no_frame():
