@@ -60,8 +60,8 @@ def _summary(written: Written, episodes: dict[str, list[Line]]) -> str:
     pairs = {(line.camera, int(m)) for line, m in zip(written.lines, written.mountings, strict=True) if m >= 0}
     return (
         f"{count(len(episodes), 'episode')} of {count(len(cameras), 'camera')}: {sum(good)} with a transform that "
-        f"may be used, {len(good) - sum(good) or 'none'} without one; {count(len(pairs), 'mounting')}; camera moved "
-        f"in {went or 'none'} of them."
+        f"may be used, {len(good) - sum(good) or 'none'} without one; {count(len(pairs), 'mounting')}; "
+        f"the camera moved in {went or 'none'} of them."
     )
 
 
