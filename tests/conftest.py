@@ -56,12 +56,15 @@ def _state_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _log_as_found() -> Iterator[None]:
-    """A command that a test runs in this process sends the log to its own stderr; the next test finds it as before."""
+    """A command that a test, or what a file prepares, runs in this process sends the log to its own stderr; each test
+    finds it as it is at first.
+    """
     logger = logging.getLogger("gripmon")
-    handlers, level, propagates = logger.handlers, logger.level, logger.propagate
+    logger.handlers, logger.propagate = [], True
+    logger.setLevel(logging.NOTSET)
     yield
-    logger.handlers, logger.propagate = handlers, propagates
-    logger.setLevel(level)
+    logger.handlers, logger.propagate = [], True
+    logger.setLevel(logging.NOTSET)
 
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"

@@ -108,7 +108,7 @@ def test_a_taught_image_gives_the_reference_back():
     taught = taught_from(image)
     again, before = error(measured(image, arrays(taught), POSE), POSE), error(measured(image, None, POSE), POSE)
     assert np.linalg.norm(before[:3]) > 5e-4, "a bevel of 0.3 mm is half a millimetre in depth to the sharp model"
-    assert np.linalg.norm(again[:3]) < 4e-6
+    assert np.linalg.norm(again[:3]) < 5e-6
     assert taught.closure_px < 0.05
 
 
