@@ -55,16 +55,15 @@ def _state_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _log_as_found() -> Iterator[None]:
-    """A command that a test, or what a file prepares, runs in this process sends the log to its own stderr; each test
-    finds it as it is at first.
+def _log_as_at_first() -> None:
+    """Commands that other tests, or what a file prepares, ran in this process sent the log elsewhere, or silenced parts
+    of it.
     """
     logger = logging.getLogger("gripmon")
     logger.handlers, logger.propagate = [], True
-    logger.setLevel(logging.NOTSET)
-    yield
-    logger.handlers, logger.propagate = [], True
-    logger.setLevel(logging.NOTSET)
+    for each in (logger, *logging.root.manager.loggerDict.values()):
+        if isinstance(each, logging.Logger) and each.name.partition(".")[0] == "gripmon":
+            each.setLevel(logging.NOTSET)
 
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
