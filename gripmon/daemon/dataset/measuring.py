@@ -73,8 +73,9 @@ def _camera(config: Config, episode: Episode, source: Source | None = None) -> s
 
 def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
     source = open_source(episode.source)
-    camera, from_file = _camera(configs[0], episode, source), getattr(source, "camera", None)
-    if lens == "file" and from_file is not None:
+    camera = _camera(configs[0], episode, source)
+    from_file = getattr(source, "camera", None) if lens == "file" else None
+    if from_file is not None:
         configs = tuple(
             dataclasses.replace(
                 one, settings=msgspec.structs.replace(one.settings, camera=from_file), camera=make_camera(from_file)
@@ -88,11 +89,7 @@ def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
         if isinstance(found, str):
             return Measured(episode.name, camera, episode.key, episode.version, fault=found)
         config, source = configs[found], open_source(episode.source)
-    elif (
-        lens == "file"
-        and from_file is not None
-        and (fault := view_fault(config.view(), config.gripper, config.camera)) is not None
-    ):
+    elif from_file is not None and (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
         raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
     run = _Run(config)
     renewed = run.until_renewed(_frames(source))
@@ -104,7 +101,7 @@ def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
     table = run.table()
     plain = Measured(
         episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=renewed is not None,
-        gripper=config.gripper_path.stem, lens="file" if lens == "file" and from_file is not None else "configuration",
+        gripper=config.gripper_path.stem, lens="configuration" if from_file is None else "file",
     )  # fmt: skip
     try:
         stretches = tuple(stretches_of(table, run.alerts, run.reasons))

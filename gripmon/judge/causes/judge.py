@@ -38,10 +38,9 @@ SETTLED = 6
 CONTRADICTION_LOG_EVIDENCE = 8.0
 """Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
 
-_NEARLY_SURE, _LIKELY = (0.93, 0.05, 0.02), (0.7, 0.3)
-BLIND_CAUSES = dict(zip((Cause.VIEW_BLOCKED, Cause.UNKNOWN, Cause.CAMERA_MOUNT), _NEARLY_SURE, strict=True))
+BLIND_CAUSES = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
 """Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
-BAD_IMAGE_CAUSES = dict(zip((Cause.IMAGE_BAD, Cause.UNKNOWN, Cause.VIEW_BLOCKED), _NEARLY_SURE, strict=True))
+BAD_IMAGE_CAUSES = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
 MUCH_NOISE, LEAST_NOISE, DARK, BRIGHT = 4.0, 0.02, 0.08, 0.95
 
@@ -138,16 +137,16 @@ class CauseJudge:
                 return self._told(BAD_IMAGE_CAUSES, spoilt)
         if blind and baseline is not None and _unsharp(pooled, baseline):
             text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
-            return self._told(dict(zip((Cause.LENS, Cause.UNKNOWN), _LIKELY, strict=True)), text)
+            return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind and pooled.cells.min() > BRIGHT:
             text = f"no part of the image is below {100.0 * BRIGHT:.0f} % of the full scale: too much light, or hidden"
-            return self._told(dict(zip((Cause.IMAGE_BAD, Cause.UNKNOWN), _LIKELY, strict=True)), text)
+            return self._told({Cause.IMAGE_BAD: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind:
             return self._told(
                 BLIND_CAUSES, "no finger is seen where it should be, nor near it; hidden, or far out of place"
             )
         if scatter_px > SCATTERED_PX:
-            text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: which doesn't tell what is wrong"
+            text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px, which doesn't tell what is wrong"
             return self._told({Cause.UNKNOWN: 1.0}, text)
         comparison = self._compared(pooled, ref_cam_T_grip, baseline)
         top = max(comparison.log.values())
