@@ -64,8 +64,8 @@ def cargo_build(cargo: str, folder: Path) -> str:
     (folder / ".cargo" / "config.toml").write_text(crates)
     environment = os.environ | {"CARGO_HOME": str(folder / "home")}  # the user's own may not be writable
     # Debug: an overflow ends it.  No input: rustc would compile what it finds there.
-    command = [cargo, "build", "--quiet", "--offline"]
-    told = subprocess.run(command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
+    told = subprocess.run([cargo, "build", "--quiet", "--offline"], cwd=folder, env=environment, **options)
     return "" if told.returncode == 0 else told.stderr.strip() or f"exit status {told.returncode}"
 
 
