@@ -34,7 +34,13 @@ def write_atomically(path: Path, data: bytes) -> None:
 def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
     """Write under another name beside ``path``, then rename: a reader sees the old file or the new one, and a fault
     leaves the old one.  When the context ends, the new one survives a power cut.  OSError if it can't be written.
+
+    A device or a pipe is written to: a rename would put a file in its place, for every program of the machine.
     """
+    if path.exists() and not path.is_file():
+        with path.open("wb") as file:
+            yield file
+        return
     name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
     # With the mode that any new file gets: mkstemp's is narrower, and the umask can't be read without changing it.
     descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
