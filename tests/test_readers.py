@@ -63,7 +63,7 @@ def cargo_build(cargo: str, folder: Path) -> str:
     crates = f'[source.crates-io]\nreplace-with = "debian"\n[source.debian]\ndirectory = "{CRATES}"\n'
     (folder / ".cargo" / "config.toml").write_text(crates)
     environment = os.environ | {"CARGO_HOME": str(folder / "home")}  # the user's own may not be writable
-    # Debug: an overflow ends it.  An input that is empty even where /dev/null isn't: rustc compiles what it finds there.
+    # Debug: an overflow ends it.  No input: rustc would compile what it finds there.
     options: dict[str, Any] = {"input": "", "capture_output": True, "text": True}
     told = subprocess.run([cargo, "build", "--quiet", "--offline"], cwd=folder, env=environment, **options)
     return "" if told.returncode == 0 else told.stderr.strip() or f"exit status {told.returncode}"
