@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
+from gripmon.model.units import in_mm
 from gripmon.simulate import FrameTruth
 
 EVENT_NAMES = {
@@ -232,7 +233,7 @@ class Differences:
         if alerts:
             judged = [*(judged or ["verdicts and states as recorded"]), f"alerts differ: {alerts}"]
         same = f"verdicts, states and alerts of all {self.frames} frames as recorded"
-        numbers = f"numbers differ in {self.frames - self._same}, the TCP by up to {1e3 * self._largest_m:.2g} mm"
+        numbers = f"numbers differ in {self.frames - self._same}, the TCP by up to {in_mm(self._largest_m)} mm"
         why = " (the images were recorded as JPEG)" if from_jpeg else ""
         return f"{'; '.join(judged) or same}; {numbers}{why}"
 

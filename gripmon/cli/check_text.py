@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from gripmon.model.units import in_degrees, in_mm
+
 if TYPE_CHECKING:
     from gripmon.daemon import forecast_values as forecasts
     from gripmon.daemon.findings import Finding, Joined, Surroundings
@@ -236,7 +238,7 @@ def _certainty_lines(values: forecasts.OpeningCertainty) -> list[str]:
     if (past := past_limit(values)) is not None:
         bounds = values.protection_m, values.protection_rad
         worst_m, worst_rad = (max(v for v in each if v is not None) for each in bounds)
-        worst = f"{1e3 * worst_m:.2g} mm, {math.degrees(worst_rad):.2g} degrees"
+        worst = f"{in_mm(worst_m)} mm, {in_degrees(worst_rad)} degrees"
         lines.append(
             f"           no transform is valid {past}: bounds of up to {worst} (monitor.policy.alert_limit_m, _rad)"
         )

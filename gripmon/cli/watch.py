@@ -76,6 +76,7 @@ def watch(arguments: Arguments) -> None:
     where a router has rules they need an operator's certificate (--zenoh-config).
     """
     joined = arguments.network()
+    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # a missing connection stands in the table or the page
     if arguments.web:
         _serve(arguments, joined)
         return
@@ -84,7 +85,6 @@ def watch(arguments: Arguments) -> None:
         raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
     if arguments.alerts and (arguments.once or arguments.transforms):
         raise InputError("watch: --alerts prints alerts alone; leave out --once and --transforms")
-    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # a connection that is missing stands in the table
     from gripmon.client import Fleet
 
     log = _open_log(arguments) if arguments.alerts else None
@@ -118,7 +118,6 @@ def _serve(arguments: Arguments, joined: dict[str, Any]) -> None:
     address = arguments.address or ADDRESS
     if address in ("0.0.0.0", "::"):
         raise InputError(f"--address {address}: names no machine; the address by which others reach this one")
-    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # what is missing stands on the page
     with arguments.network_errors():
         opened = Fleet(**joined)
     with opened as fleet:

@@ -31,6 +31,7 @@ from gripmon.model.images import LARGEST_BYTES, image_paths
 from gripmon.model.provenance import Provenance, provenance_of
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, TargetError, checked, parse_target
+from gripmon.model.units import in_degrees, in_mm
 from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
@@ -172,8 +173,8 @@ def _uncertainty(covariance: tuple[float, ...]) -> list[str]:
     sigma = [math.sqrt(max(covariance[7 * i], 0.0)) for i in range(6)]
     if not any(sigma):
         return []
-    mm = ", ".join(f"{1e3 * s:.2g}" for s in sigma[:3])
-    degrees = ", ".join(f"{math.degrees(s):.2g}" for s in sigma[3:])
+    mm = ", ".join(in_mm(s) for s in sigma[:3])
+    degrees = ", ".join(in_degrees(s) for s in sigma[3:])
     return [f"one standard deviation along and about the camera's x, y, z: {mm} mm (TCP), {degrees} degrees"]
 
 

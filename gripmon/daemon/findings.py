@@ -31,6 +31,7 @@ from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Keys
 from gripmon.laser.report import expectation
+from gripmon.model.units import in_degrees, in_mm
 
 Level = Literal["OK", "WARN", "FAIL"]
 
@@ -305,11 +306,11 @@ def _network(keys: str | None) -> Finding:
 
 
 def _millimetres(value_m: float) -> str:
-    return f"{1e3 * value_m:.2g} mm"
+    return f"{in_mm(value_m)} mm"
 
 
 def _degrees(value_rad: float) -> str:
-    return f"{math.degrees(value_rad):.2g}°"
+    return f"{in_degrees(value_rad)}°"
 
 
 def _second_values(config: SecondConfig) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, Protection, ReferenceRecord
+from gripmon.model.units import in_degrees, in_mm
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
 from gripmon.teach.visibility import Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
@@ -218,14 +219,14 @@ class Promise:
             parts.append(f"alert_limit_m of at least {needed_m:g} ({1e3 * needed_m:g} mm)")
         if bound.rotation_rad > self.alert_limit_rad:
             needed_rad = _rounded_up(bound.rotation_rad)
-            parts.append(f"alert_limit_rad of at least {needed_rad:g} ({math.degrees(needed_rad):.2g} degrees)")
+            parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
         return " and ".join(parts)
 
     def text(self) -> str:
         """One line for a person."""
         bound = self.protection
-        good = f"good to {1e3 * bound.position_m:.2g} mm and {math.degrees(bound.rotation_rad):.2g} degrees"
-        limits = f"{1e3 * self.alert_limit_m:g} mm, {math.degrees(self.alert_limit_rad):.2g} degrees"
+        good = f"good to {in_mm(bound.position_m)} mm and {in_degrees(bound.rotation_rad)} degrees"
+        limits = f"{1e3 * self.alert_limit_m:g} mm, {in_degrees(self.alert_limit_rad)} degrees"
         reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
         return f"a transform of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
 

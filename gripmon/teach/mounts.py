@@ -20,6 +20,7 @@ from gripmon.judge.recalibrate import refusal
 from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
+from gripmon.model.units import in_mm
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import AccuracyForecast, Promise, forecast_frame
 from gripmon.teach.visibility import Rig, Sight, border, moved_camera, see, sideways_m
@@ -289,8 +290,8 @@ def _inexact(rig: Rig, found: Measurable, usual_m: float) -> tuple[Fault, ...]:
     faults, settings, gripper = [], rig.settings, rig.gripper
     if not found.promise.reachable:
         where = f" at {1e3 * usual_m:.1f} mm of opening" if gripper.has_jaw else ""
-        bound_mm = 1e3 * found.promise.protection.position_m
-        text = f"bound on the TCP's error {bound_mm:.2g} mm{where}: needs {found.promise.needed}"
+        bound = f"bound on the TCP's error {in_mm(found.promise.protection.position_m)} mm{where}"
+        text = f"{bound}: needs {found.promise.needed}"
         faults.append(Fault("no transform would be valid: the bound on its error is above the alert limit", text))
     if settings.recalibration.mode != "off":
         taken = gripper.innermost_corners(found.frame.corners, CORNER_COUNTS[settings.recalibrate_corners])

@@ -21,7 +21,7 @@ from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
 from gripmon.model.images import read_image
-from gripmon.model.records import FrameRecord, Image
+from gripmon.model.records import FrameRecord
 from gripmon.teach.messages import BadRequest
 
 _LINES = 200
@@ -139,10 +139,11 @@ class MonitorProcess:
                 except (NotCarriedOut, Ambiguous):
                     reply, data = None, None  # it starts, or ends
                 if reply is not None and reply.snapshot is not None:
-                    self._record = reply.snapshot.record
+                    seen = reply.snapshot
+                    self._record = seen.record
                     image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
                     if image is not None:
-                        self._picture = _picture(config, reply.snapshot.record, np.asarray(image))
+                        self._picture = overlay(np.asarray(image), seen.record, seen.outlines_px, _PICTURE_PX)
                         self._shown += 1
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_ASK_EVERY_S)
@@ -158,9 +159,6 @@ class MonitorProcess:
             if isinstance(source, FolderSettings) and record.name is not None:
                 image, _ = read_image(config.directory / source.path / record.name)
                 if image is not None:
-                    self._picture = _picture(config, record, image)
+                    outlines = outlines_of(config.camera, config.gripper, record)
+                    self._picture = overlay(image, record, outlines, _PICTURE_PX)
                     self._shown += 1
-
-
-def _picture(config: Config, record: FrameRecord, image: Image) -> bytes:
-    return overlay(image, record, outlines_of(config.camera, config.gripper, record), _PICTURE_PX)

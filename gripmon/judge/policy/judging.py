@@ -28,6 +28,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
+from gripmon.model.units import in_degrees, in_mm
 
 NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 """Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
@@ -344,11 +345,6 @@ class Policy:
         )
 
 
-def _two_digits(value: float) -> str:
-    """As a person writes it: 0.61, 1.2, 340."""
-    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
-
-
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
     """Which bound is not within its alert limit, in words; None where both are.  One that is NaN bounds nothing."""
     if protection is None:
@@ -356,13 +352,10 @@ def past_alert_limit(protection: Protection | None, settings: PolicySettings) ->
     hypothesis = f" ({protection.hypothesis})" if protection.hypothesis else ""
     if not protection.position_m <= settings.alert_limit_m:
         limit_mm = 1e3 * settings.alert_limit_m
-        return (
-            f"the TCP may be {_two_digits(1e3 * protection.position_m)} mm off, alert limit {limit_mm:g} mm{hypothesis}"
-        )
+        return f"the TCP may be {in_mm(protection.position_m)} mm off, alert limit {limit_mm:g} mm{hypothesis}"
     if not protection.rotation_rad <= settings.alert_limit_rad:
-        limit = math.degrees(settings.alert_limit_rad)
-        may = math.degrees(protection.rotation_rad)
-        return f"the rotation may be {_two_digits(may)} degrees off, alert limit {limit:.2g} degrees{hypothesis}"
+        may, limit = in_degrees(protection.rotation_rad), in_degrees(settings.alert_limit_rad)
+        return f"the rotation may be {may} degrees off, alert limit {limit} degrees{hypothesis}"
     return None
 
 
