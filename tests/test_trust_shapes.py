@@ -168,3 +168,12 @@ def test_bevels_that_no_one_taught_are_within_the_bound(bevel_m: float):
     assert len(valid) >= 8, "or nothing is promised at all"
     bound_m = np.array([0.0 if r.protection is None else r.protection.position_m for r in seen.records])
     assert (error_m[valid] <= bound_m[valid]).all()
+
+
+def test_bevels_that_the_file_states_are_within_the_bound():
+    """Which is wider than the task bears, until they are taught."""
+    seen = bevelled_stills(2e-4, known_m=2e-4)
+    error_m = np.linalg.norm(seen.errors()[:, :3], axis=1)
+    bounds = [record.protection for record in seen.records]
+    assert all(each is not None and error <= each.position_m for error, each in zip(error_m, bounds, strict=True))
+    assert error_m.max() > 1e-3 and Verdict.VALID not in seen.verdicts()

@@ -32,6 +32,7 @@ from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Keys
 from gripmon.laser.report import expectation
 from gripmon.model.units import in_degrees, in_mm
+from gripmon.teach.accuracy import UNTOLD_BEVEL_M
 
 Level = Literal["OK", "WARN", "FAIL"]
 
@@ -253,7 +254,13 @@ def _promise(report: Forecast) -> Finding | None:
     if _USUAL_SPREAD * share > 1.0:
         often = "one frame in twenty is twice as uncertain: some will be suspect"
         return Finding("WARN", "promise", f"good to {good}, close to {limit}; {often}")
-    return Finding("OK", "promise", f"a transform is good to {good}, within {limit}")
+    text, untold = f"a transform is good to {good}, within {limit}", report.protection_if_bevelled
+    if untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad):
+        may = f"{_millimetres(untold.position_m)} and {_degrees(untold.rotation_rad)}"
+        text += f", if all edges are as sharp as the gripper file says; to {may} with bevels of "
+        text += f"{_millimetres(UNTOLD_BEVEL_M)}: teach them (gripmon teach), or state them (bevel_m)"
+        return Finding("WARN", "promise", text)
+    return Finding("OK", "promise", text)
 
 
 def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:

@@ -38,12 +38,14 @@ from gripmon.model.geometry import invert, make_transform, rotation_angle, rotat
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import (
     EDGE_POINT_SIGMA_PX,
+    UNTOLD_BEVEL_M,
     AccuracyForecast,
     Promise,
     UnknownOpening,
     accuracy_over_jaw,
     forecast_accuracy,
     forecast_frame,
+    with_bevels,
 )
 from gripmon.teach.mounts import Mount
 from gripmon.teach.visibility import (
@@ -95,6 +97,7 @@ def forecast(config: Config) -> Forecast:
         edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
         accuracy=_accuracy(config),
         protection=None if found is None else _bounds(found),
+        protection_if_bevelled=None if found is None else _if_bevelled(config),
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
         reachable=found is not None and found.reachable,
@@ -123,6 +126,15 @@ def limits_warning(config: Config) -> str | None:
     if found is None or found.reachable:
         return None
     return f"{config.path}: no transform of this view can be valid: valid needs {found.needed} (monitor.policy)"
+
+
+def _if_bevelled(config: Config) -> Bounds | None:
+    """What a frame may promise if no edge is sharp; None where edges were taught, or the gripper file is exact."""
+    rig, policy = rig_of(config), config.settings.monitor.policy
+    if rig.taught is not None or rig.settings.model_sigma_m == 0.0:
+        return None
+    worn = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
+    return _bounds(Promise.of(forecast_frame(worn, config.cam_T_grip, config.jaw_opening_m).protection, policy))
 
 
 def _bounds(found: Promise) -> Bounds:

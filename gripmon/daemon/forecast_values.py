@@ -245,7 +245,8 @@ class InView(msgspec.Struct, frozen=True):
 class Forecast(msgspec.Struct, frozen=True):
     """What the calibration expects to see: metres, radians, px; positions in the camera frame.
 
-    ``protection``: what one frame may promise; ``needed``: the alert limits that this view could keep, where no
+    ``protection``: what one frame may promise; ``protection_if_bevelled``: the same if the gripper has bevels that no
+    one has said or taught, null where it can't; ``needed``: the alert limits that this view could keep, where no
     transform of it can be valid.
     """
 
@@ -261,6 +262,7 @@ class Forecast(msgspec.Struct, frozen=True):
     edges: tuple[EdgeView, ...]
     accuracy: Accuracy
     protection: Bounds | None
+    protection_if_bevelled: Bounds | None
     alert_limit_m: float
     alert_limit_rad: float
     reachable: bool

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from gripmon.judge.policy import PolicySettings
@@ -34,6 +35,10 @@ CLUTTER_PX = 0.1
 """What the background is assumed to shift a stretch of an edge by, beside that, for the protection level: with it the
 bound is that of the usual frame before clutter; one in twenty has up to four times as much (tools/bench integrity).
 """
+
+
+UNTOLD_BEVEL_M = 2e-4
+"""Width of the bevels that machined edges have where a drawing asks for broken edges and says no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +137,12 @@ def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tupl
     """At ``count`` openings (m) over the jaw's travel: what a frame gives, None where too little is visible."""
     openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count).tolist()
     return [(m, forecast_frame(rig, cam_T_grip, m) if see(rig, cam_T_grip, m).enough else None) for m in openings_m]
+
+
+def with_bevels(gripper: Gripper, least_m: float) -> Gripper:
+    """The same gripper with all its edges bevelled or rounded by at least so much."""
+    edges = {n: structs.replace(edge, bevel_m=max(edge.bevel_m, least_m)) for n, edge in gripper.model.edges.items()}
+    return Gripper(structs.replace(gripper.model, edges=edges))
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
