@@ -20,18 +20,21 @@ FAR_SHARE, THINNER_FROM_M = 0.6, 0.008
 thinner.
 """
 
+LEAST_FLAT_M = 1e-3
+"""Half of the flat part of a tip, below which it has none."""
+
 MOTION = {"left": {"motion": {"axis": [-0.5, 0.0, 0.0]}}, "right": {"motion": {"axis": [0.5, 0.0, 0.0]}}}
 JAW = {"nominal_m": GAP_M, "min_m": 0.01, "max_m": 0.06}
 
 
 def outline_m(width_m: float, radius_m: float, step_m: float) -> Array:
     """(n, 2) x, z of a finger's tip from its left side to its right one, corners rounded by a radius (0: sharp); tip at
-    z = 0.
+    z = 0.  With too little flat between them it is wholly round, whatever the step: a file of wider steps is the same.
     """
     half = 0.5 * width_m
     if radius_m == 0.0:
         return np.array([[-half, 0.0], [half, 0.0]])
-    radius_m = half if half - radius_m < step_m else radius_m  # a flat part shorter than a facet is none
+    radius_m = half if half - radius_m < LEAST_FLAT_M else radius_m
     angle = np.linspace(0.0, 0.5 * np.pi, max(round(0.5 * np.pi * radius_m / step_m), 2) + 1)
     left = np.column_stack([radius_m - half - radius_m * np.cos(angle), radius_m * np.sin(angle) - radius_m])
     right = left[::-1] * (-1.0, 1.0)
