@@ -74,10 +74,9 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def taught(rig: Path) -> Path:
     """The file that a process of its own has written."""
-    images = sorted((rig / "first").glob("*.png"))
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "gripmon", "teach", *map(str, images)),
+            *(sys.executable, "-m", "gripmon", "teach", str(rig / "first")),
             *("--config", str(rig / "config.yaml"), "--picture", str(rig / "pictures" / "taught.png")),
         ],
         capture_output=True,
@@ -211,7 +210,7 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
         ("nowhere.png", 2, "nowhere.png: the file is missing; an image file"),
         ("empty.png", 2, "empty.png: the file is empty"),
         ("text.png", 2, "text.png: truncated, damaged or not an image"),
-        ("first", 2, "is a folder; image files"),
+        ("nothing", 2, "nothing: no image in this folder; e.g. *.png, *.jpg"),
         ("small.png", 2, "wrong_size: 384x288 pixels; 768x576"),
         ("black.png", 2, "black: no pixel brighter"),
         ("first/0.png first/../first/0.png", 2, "is the same image as"),
@@ -230,6 +229,7 @@ def test_what_can_not_be_taught_from_is_one_line(
     """Unreadable or foreign files end with 2, images without the gripper at the reference with 3; nothing written."""
     image = image_of(BEVEL_M, scene(120.0))
     (tmp_path / "first").mkdir()
+    (tmp_path / "nothing").mkdir()
     for name in ("alone.png", "first/0.png"):
         cv2.imwrite(str(tmp_path / name), image)
     (tmp_path / "first" / "timestamps.csv").write_text(f"file,stamp_ns,jaw_opening_m\n0.png,1,{OPENING_M}\n")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory, positive_number
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.images import image_paths
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from gripmon.track.edges.taught import TaughtEdge
 
 _OPTIONS = """
-[IMAGE...]          image file at the reference calibration
+[IMAGE...]          image file at the reference calibration, or a folder of them
 --config CONFIG     configuration (YAML); its source section is not used
 --out FILE          file to write (default: what the configuration names under taught, else taught.yaml beside it);
                     with --page or --corners the folder to write to (default: the configuration's, else this one)
@@ -97,6 +98,7 @@ def teach(arguments: Arguments) -> None:
     Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
     in use, each before another background, some with the jaws opened otherwise.
     """
+    arguments.image = image_paths(arguments.image)
     if arguments.page or arguments.corners is not None or arguments.live is not None:
         _teach_by_hand(arguments)
         return

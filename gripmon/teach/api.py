@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +22,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.images import image_paths
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import MonitorSettings
@@ -89,12 +89,13 @@ class Teaching:
 
 def teach(
     config: Configured,
-    images: Sequence[str | PathLike[str]],
+    images: Sequence[str | Path],
     *,
     jaw_opening_m: float | None = None,
     command: str = "gripmon.teach.api.teach",
 ) -> Teaching:
-    """Measure what the gripper's edges look like in image files that were taken at the reference calibration.
+    """Measure what the gripper's edges look like in image files that were taken at the reference calibration; for a
+    folder in all images in it.
 
     ``config``: load it without a taught model (``with_taught=False``).  ``jaw_opening_m``: in all images (m); None: the
     configuration's where it is fixed, else that of a ``timestamps.csv`` beside each image.  ``command`` is written into
@@ -110,7 +111,7 @@ def teach(
     if jaw_opening_m is None and config.settings.jaw.source == "fixed":
         jaw_opening_m = config.jaw_opening_m
     pictures = [
-        read_picture(Path(image), config.camera, gripper, settings.bit_depth, jaw_opening_m) for image in images
+        read_picture(path, config.camera, gripper, settings.bit_depth, jaw_opening_m) for path in image_paths(images)
     ]
     for each in pictures:
         if each.jaw_opening_m is None and gripper.has_jaw:
@@ -158,8 +159,6 @@ def read_picture(
     """An image that fits the camera, in full scale, with its jaw opening: the one given, else that of its folder's
     ``timestamps.csv``.  Raises :class:`~gripmon.model.errors.InputError`.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; image files, e.g. {path}/*.png")
     image = read_any(path)
     frame = in_full_scale(Frame(0, 0, image, None, str(path)), bit_depth)
     refused = inspect(frame, camera, gripper)

@@ -20,8 +20,8 @@ again, at 60 frames/s. "daemon" is a live camera in a process of its own, with r
 is its own processor time. "start" is `gripmon run` with a camera on the network, from the start of the process until a
 subscriber has the first measured transform; "replay" is `gripmon replay`, less the time for reading and decoding files.
 
-The 99 % of "frame" are frames that share their core with the analysis of causes: a drift that goes on asks for it in one
-frame of 60, and it takes some 25 ms. Traced in 6,000 frames, all above 3 ms came in such bursts of about six, while
+The 99 % of "frame" are frames that share their core with the analysis of causes: a drift that goes on asks for it in
+one frame of 60, and it takes some 25 ms. Traced in 6,000 frames, all above 3 ms came in such bursts of about six, while
 `Monitor.process` alone stays below 2.7 ms. Neither handing over between threads sooner (0.05 ms) nor letting the result
 count a second later changes it, a lower priority of that thread makes it worse: on one core the operating system's time
 slices decide. Where there is a second core, as for "daemon", 99 % are below twice the median.
