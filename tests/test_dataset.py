@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,8 +25,8 @@ from support.episode_files import WRIST, Shots, write_lerobot, write_mcap
 from gripmon.analyse.dataset import Journal, Measured
 from gripmon.analyse.stretches import mountings_of
 from gripmon.cli import main
-from gripmon.daemon.config import load_config
-from gripmon.daemon.dataset import measure_dataset
+from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.dataset import engines, measure_dataset
 from gripmon.daemon.dataset.engines import DIED, local
 from gripmon.daemon.dataset.measuring import measure
 from gripmon.io.sources import BagSettings, SourceError
@@ -177,6 +178,19 @@ def test_episode_that_kills_its_worker_is_a_row_and_the_others_are_measured(lero
     episodes = [Episode(str(i), BagSettings(path="x"), "") for i in range(5)]
     found = {each.episode: each.fault for each in local((config,), episodes, "file", 2, die_of_the_second)}
     assert found == {"0": None, "1": DIED, "2": None, "3": None, "4": None}
+
+
+def tell_the_process(episode: Episode) -> Measured:
+    return Measured(episode.name, str(os.getpid()), episode.key, "")
+
+
+def test_workers_are_replaced_before_what_stays_with_them_adds_up(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(engines, "WORKER_EPISODES", 2)
+    config = load_config(builtin_config("demo.yaml"), check_source=False)
+    episodes = [Episode(str(i), BagSettings(path="x"), "") for i in range(5)]
+    found = [(each.episode, each.camera) for each in local((config,), episodes, "file", 1, tell_the_process)]
+    assert sorted(name for name, _ in found) == ["0", "1", "2", "3", "4"]
+    assert sorted(Counter(process for _, process in found).values()) == [1, 2, 2]
 
 
 BLANK = Shots([np.full((288, 384), 90, np.uint8)] * 6, [i * NS for i in range(1, 7)], [0.03] * 6)

@@ -19,6 +19,10 @@ from gripmon.model.errors import InputError, one_line
 
 AHEAD = 2
 """Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
+WORKER_EPISODES = 50
+"""After so many a worker is replaced: some 3 MB of each stay with it, 0.15 GB until then, for which no cause is known;
+and the 2 s of its start are a hundredth or two of its time.
+"""
 DIED = "the process that measured it died, also when it was alone (out of memory, or a decoder that crashed)"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _RAY_TRIES = 3
@@ -48,8 +52,8 @@ def local(
     workers: int,
     work: Callable[[Episode], Measured] = _work,
 ) -> Iterator[Measured]:
-    """In ``workers`` processes.  Where one dies, what was in flight is measured again, one by one: the one that kills
-    its worker alone, too, is given up.
+    """In ``workers`` processes, and new ones after :data:`WORKER_EPISODES` for each.  Where one dies, what was in
+    flight is measured again, one by one: the one that kills its worker alone, too, is given up.
     """
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
@@ -59,9 +63,11 @@ def local(
         queue, count = (suspects, 1) if alone else (waiting, workers)
         with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (configs, lens)) as pool:
             flying: dict[Future[Measured], Episode] = {}
+            left = count * WORKER_EPISODES
             try:
-                while queue or flying:
-                    while queue and len(flying) < (1 if alone else AHEAD * count):
+                while (queue and left) or flying:
+                    while queue and left and len(flying) < (1 if alone else AHEAD * count):
+                        left -= 1
                         episode = queue.popleft()
                         try:
                             flying[pool.submit(work, episode)] = episode
@@ -75,11 +81,11 @@ def local(
             except BrokenProcessPool:
                 finished = [future for future in flying if future.done() and future.exception() is None]
                 yield from (future.result() for future in finished)
-                left = [episode for future, episode in flying.items() if future not in finished]
+                lost = [episode for future, episode in flying.items() if future not in finished]
                 if alone:
-                    yield from (failed(configs, episode, DIED) for episode in left)
+                    yield from (failed(configs, episode, DIED) for episode in lost)
                 else:
-                    suspects.extend(left)
+                    suspects.extend(lost)
             except GeneratorExit:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
@@ -103,7 +109,8 @@ def ray_cluster(configs: Configs, episodes: Sequence[Episode], lens: str, addres
                 f"no Ray cluster at {address or 'this machine'} ({one_line(error):.200})", "address"
             ) from None
     environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
-    task: Any = ray.remote(num_cpus=1, max_retries=_RAY_TRIES - 1, runtime_env=environment)(_on_ray)
+    options = {"num_cpus": 1, "max_calls": WORKER_EPISODES, "max_retries": _RAY_TRIES - 1, "runtime_env": environment}
+    task: Any = ray.remote(**options)(_on_ray)
     shared = ray.put((configs, lens))
     waiting, flying = deque(episodes), dict[Any, Episode]()
     resources: Any = ray.cluster_resources
