@@ -108,6 +108,21 @@ def test_check_says_what_bevels_would_do_that_no_one_has_stated(
         assert worn["position_m"] > 1e-3 and f"to {1e3 * worn['position_m']:.2g} mm and" in line
 
 
+@pytest.mark.parametrize(("made_of", "doubts"), [("finger.stl", True), ("work/0.PNG", False)])
+def test_edges_that_images_have_shown_are_as_they_show(
+    made_of: str, doubts: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """CAD doesn't know of bevels that no one has drawn."""
+    inputs = f"[{{file: {made_of}, sha256: '{64 * '0'}'}}]"
+    provenance = f"provenance: {{gripmon: '1', time: '2026-11-23', command: gripmon gripper, inputs: {inputs}}}"
+    file = DEMO.parent / "grippers" / "two_box_fingers.yaml"
+    (tmp_path / "gripper.yaml").write_text(f"{file.read_text()}\n{provenance}\n")
+    path = tmp_path / "config.yaml"
+    path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
+    assert main(["check", str(path)]) == 0
+    assert ("bevels of 0.2 mm" in capsys.readouterr().out) == doubts
+
+
 def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():
     usual, cam_T_grip = rig()
     model = msgspec.to_builtins(usual.gripper.model)

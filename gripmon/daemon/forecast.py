@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from gripmon.daemon.forecast_values import (
 from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
+from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import (
     EDGE_POINT_SIGMA_PX,
@@ -129,9 +131,13 @@ def limits_warning(config: Config) -> str | None:
 
 
 def _if_bevelled(config: Config) -> Bounds | None:
-    """What a frame may promise if no edge is sharp; None where edges were taught, or the gripper file is exact."""
+    """What a frame may promise if no edge is sharp; None where edges are known as they show, because they were taught
+    or the gripper file was made from images, or where it is said to be exact.
+    """
     rig, policy = rig_of(config), config.settings.monitor.policy
-    if rig.taught is not None or rig.settings.model_sigma_m == 0.0:
+    made_of = () if rig.gripper.model.provenance is None else rig.gripper.model.provenance.inputs
+    from_images = any(Path(each.file).suffix.lower() in IMAGE_SUFFIXES for each in made_of)
+    if rig.taught is not None or from_images or rig.settings.model_sigma_m == 0.0:
         return None
     worn = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
     return _bounds(Promise.of(forecast_frame(worn, config.cam_T_grip, config.jaw_opening_m).protection, policy))
