@@ -189,6 +189,6 @@ def test_bevels_that_the_file_states_are_within_the_bound():
 def test_what_is_grasped_does_not_teach_the_error_of_a_reported_opening():
     from benchmarks.integrity_runs import run_scene
 
-    seen = run_scene("round tips: grasp", 2026, 26, 40)
+    seen = run_scene("round tips: grasp", 2026, 26, 96)
     frames = [k for k, valid in enumerate(seen["valid"]) if valid]
     assert all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)
