@@ -311,6 +311,7 @@ def test_a_calibrated_camera_is_named_and_its_doubt_counts(rig: Rig, tmp_path: P
 
 def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
     image, camera, gripper = rig.image_path, rig.folder / "camera.yaml", rig.folder / "gripper.yaml"
+    (tmp_path / "nothing").mkdir()
     (tmp_path / "broken.png").write_bytes(image.read_bytes()[:2000])
     cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(rig.image, (320, 240)))
     (tmp_path / "no.yaml").write_text("camera: [")
@@ -324,7 +325,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
     for arguments, said in (
         ([tmp_path / "broken.png", *page], "truncated, damaged or not an image"),
         ([tmp_path / "none.png", *page], "the file is missing"),
-        ([tmp_path, *page], "is a folder"),
+        ([tmp_path / "nothing", *page], "no image in this folder"),
         ([tmp_path / "small.png", *page], "320x240 pixels; 768x576"),
         ([image, "--page", "--camera", camera, "--robot", "arm"], "--gripper: is missing; a gripper file"),
         ([image, image, "--page", "--camera", camera], "2 images, and no gripper; one image"),
