@@ -109,9 +109,9 @@ def ray_cluster(configs: Configs, episodes: Sequence[Episode], lens: str, addres
                 f"no Ray cluster at {address or 'this machine'} ({one_line(error):.200})", "address"
             ) from None
     environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
-    task: Any = ray.remote(
-        num_cpus=1, max_calls=WORKER_EPISODES, max_retries=_RAY_TRIES - 1, runtime_env=environment
-    )(_on_ray)
+    task: Any = ray.remote(num_cpus=1, max_calls=WORKER_EPISODES, max_retries=_RAY_TRIES - 1, runtime_env=environment)(
+        _on_ray
+    )
     shared = ray.put((configs, lens))
     waiting, flying = deque(episodes), dict[Any, Episode]()
     resources: Any = ray.cluster_resources
