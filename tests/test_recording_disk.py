@@ -132,14 +132,14 @@ def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
     command("fsfreeze", "--freeze", str(freezable_disk))
     count = 20
     slowest_s = 0.0
-    while writer.failure is None or writer.dropped == 0:
+    while "doesn't answer" not in str(writer.failure) or writer.dropped == 0:  # until then it only can't keep up
         assert count < 20_000, "nobody notices"
         before_s = time.monotonic()
         offer(writer, count, 1)
         slowest_s = max(slowest_s, time.monotonic() - before_s)
         count += 1
         time.sleep(0.01)
-    assert "the disk" in str(writer.failure) and "doesn't answer" in str(writer.failure)
+    assert "the disk" in str(writer.failure)
     assert writer.frames_written == 20
     command("fsfreeze", "--unfreeze", str(freezable_disk))
     wait_until(lambda: writer.failure is None, LONG_S)
