@@ -139,7 +139,7 @@ def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
         slowest_s = max(slowest_s, time.monotonic() - before_s)
         count += 1
         time.sleep(0.01)
-    assert "the disk" in str(writer.failure)
+    assert "the disk" in str(writer.failure) and "doesn't answer" in str(writer.failure)
     assert writer.frames_written == 20
     command("fsfreeze", "--unfreeze", str(freezable_disk))
     wait_until(lambda: writer.failure is None, LONG_S)

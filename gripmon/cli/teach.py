@@ -98,7 +98,6 @@ def teach(arguments: Arguments) -> None:
     Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
     in use, each before another background, some with the jaws opened otherwise.
     """
-    arguments.image = image_paths(arguments.image)
     if arguments.page or arguments.corners is not None or arguments.live is not None:
         _teach_by_hand(arguments)
         return
@@ -151,6 +150,7 @@ def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
 
 def _teach_by_hand(arguments: Arguments) -> None:
     """Handle ``gripmon teach --page`` and ``--corners``."""
+    arguments.image = image_paths(arguments.image)
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
     from gripmon.daemon.teaching import in_words, outline_session, page_session, read_inputs, teach_from_file

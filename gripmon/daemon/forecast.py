@@ -37,6 +37,7 @@ from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
 from gripmon.model.images import IMAGE_SUFFIXES
+from gripmon.model.records import Protection
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import (
     EDGE_POINT_SIGMA_PX,
@@ -98,7 +99,7 @@ def forecast(config: Config) -> Forecast:
         corners=_corners(config),
         edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
         accuracy=_accuracy(config),
-        protection=None if found is None else _bounds(found),
+        protection=None if found is None else _bounds(found.protection),
         protection_if_bevelled=None if found is None else _if_bevelled(config),
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
@@ -134,17 +135,17 @@ def _if_bevelled(config: Config) -> Bounds | None:
     """What a frame may promise if no edge is sharp; None where edges are known as they show, because they were taught
     or the gripper file was made from images, or where it is said to be exact.
     """
-    rig, policy = rig_of(config), config.settings.monitor.policy
+    rig = rig_of(config)
     made_of = () if rig.gripper.model.provenance is None else rig.gripper.model.provenance.inputs
     from_images = any(Path(each.file).suffix.lower() in IMAGE_SUFFIXES for each in made_of)
     if rig.taught is not None or from_images or rig.settings.model_sigma_m == 0.0:
         return None
     worn = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
-    return _bounds(Promise.of(forecast_frame(worn, config.cam_T_grip, config.jaw_opening_m).protection, policy))
+    return _bounds(forecast_frame(worn, config.cam_T_grip, config.jaw_opening_m).protection)
 
 
-def _bounds(found: Promise) -> Bounds:
-    return Bounds(found.protection.position_m, found.protection.rotation_rad, found.protection.risk)
+def _bounds(protection: Protection) -> Bounds:
+    return Bounds(protection.position_m, protection.rotation_rad, protection.risk)
 
 
 def _camera(config: Config) -> CameraValues:
