@@ -14,7 +14,8 @@ from gripmon.track.integrity import hypotheses_of
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 FINGER = np.array([0, 0, 0, 0, 1, 1, 1, 1])
 ALONG = np.array([True, True, False, False, True, True, False, False])
-EVERY = hypotheses_of(NAMES, FINGER, ("a", "b"), ALONG, True)
+INNER = np.array(["_in" in name for name in NAMES])
+EVERY = hypotheses_of(NAMES, FINGER, ("a", "b"), ALONG, INNER, True)
 LASTING = Lasting.of(EVERY)
 ROWS = np.arange(len(LASTING.name))
 BASE_T = perturb(np.eye(4), np.array([0.01, -0.02, 0.2, 0.1, 0.2, -0.1]))
@@ -96,7 +97,7 @@ def test_what_lasts_is_all_that_may_have_been_wrong_from_the_first_frame_on():
 
 def test_with_hidden_edges_hypotheses_doubt_the_same_of_what_is_left():
     edges = np.array([0, 1, 3, 4, 5])  # a_tip, b_tip and b_side are hidden
-    seen = hypotheses_of(tuple(NAMES[e] for e in edges), FINGER[edges], ("a", "b"), ALONG[edges], True)
+    seen = hypotheses_of(tuple(NAMES[e] for e in edges), FINGER[edges], ("a", "b"), ALONG[edges], INNER[edges], True)
     rows = LASTING.rows(seen, edges)
     told = {name: seen.name[row] for name, row in zip(LASTING.name, rows, strict=True)}
     assert told["edge a_out belongs to something else"] == "edge a_out belongs to something else"

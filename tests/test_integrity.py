@@ -260,10 +260,12 @@ def test_doubts_add_up_and_are_chosen_from():
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side", "b_back")
 FINGER_OF = np.array([0, 0, 0, 0, 1, 1, 1, 1, 1])
 ALONG = np.array([True, True, False, False, True, True, False, False, False])
+INNER = np.array(["_in" in name for name in NAMES])
+NO_EDGE = np.zeros(9, dtype=bool)
 
 
 def of_two_fingers(has_opening: bool = False) -> Hypotheses:
-    return hypotheses_of(NAMES, FINGER_OF, ("a", "b"), ALONG, has_opening)
+    return hypotheses_of(NAMES, FINGER_OF, ("a", "b"), ALONG, INNER, has_opening)
 
 
 def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
@@ -331,7 +333,8 @@ def test_where_edges_err_as_often_as_their_prior_says_the_bound_holds_as_stated(
 
 def test_an_edge_that_errs_is_beyond_a_bound_that_reckons_with_nothing():
     """What the one before must be able to see."""
-    hypotheses, blind = of_two_fingers(), hypotheses_of(NAMES, np.zeros(9, dtype=int), ("a",), np.ones(9, bool), False)
+    blind = hypotheses_of(NAMES, np.zeros(9, dtype=int), ("a",), np.ones(9, bool), NO_EDGE, False)
+    hypotheses = of_two_fingers()
     blind = Hypotheses(blind.name[:1], blind.prior[:1], blind.keep[:1], blind.opening[:1], blind.sudden[:1], 0)
     bias = np.zeros((9, 12))
     bias[2] = 4.0
@@ -355,6 +358,7 @@ def test_hypotheses_doubt_what_their_names_say():
         "the ends of finger b belong to something else": {"b_tip", "b_side", "b_back"},
         "finger a is not where its model says": a,
         "finger b is not where its model says": b,
+        "the fingers' inner edges belong to what is grasped": {"a_in", "b_in"},
         "the jaw opening is wrong": set(),
         "what looks like the fingers' ends is something else": {
             n for n, along in zip(NAMES, ALONG, strict=True) if not along
@@ -366,6 +370,7 @@ def test_hypotheses_doubt_what_their_names_say():
     assert {p for n, p in prior.items() if n.startswith("edge ")} == {WRONG_EDGE}
     assert {p for n, p in prior.items() if n.startswith("the ends of")} == {WRONG_EDGE}
     assert {p for n, p in prior.items() if n.startswith("finger ")} == {WRONG_GRIPPER}
+    assert prior["the fingers' inner edges belong to what is grasped"] == WRONG_EDGE
     assert prior["the jaw opening is wrong"] == WRONG_GRIPPER
 
 
@@ -375,6 +380,7 @@ def test_hypotheses_know_what_kind_they_are():
     assert {found.name[k] for k in np.flatnonzero(found.sudden)} == {
         "finger a is not where its model says",
         "finger b is not where its model says",
+        "the fingers' inner edges belong to what is grasped",
         "what looks like the fingers' ends is something else",
     }
     assert found.name[0] == "nothing is wrong"
@@ -390,7 +396,9 @@ def test_without_ends_each_hypothesis_doubts_them_besides():
     np.testing.assert_array_equal(without.prior, every.prior)
     on_the_sides = [f"edge {name} belongs to something else" for name in ("a_out", "a_in", "b_out", "b_in")]
     fingers = [f"finger {name} is not where its model says" for name in "ab"]
-    assert {every.name[k] for k in np.flatnonzero(more)} == {*on_the_sides, *fingers, "the jaw opening is wrong"}
+    grasped = "the fingers' inner edges belong to what is grasped"
+    wrong = {*on_the_sides, *fingers, grasped, "the jaw opening is wrong"}
+    assert {every.name[k] for k in np.flatnonzero(more)} == wrong
 
 
 def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
@@ -415,8 +423,8 @@ def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
 
 
 def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():
-    one = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a", "b"), ALONG[:3], False)
+    one = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a", "b"), ALONG[:3], INNER[:3], False)
     assert not any(name.startswith(("finger", "the ends of")) for name in one.name), "one finger, one edge at its end"
     assert len(one.name) == 1 + 3 + 1 and one.keep.shape == (5, 3)
-    every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), False)
+    every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), NO_EDGE, False)
     np.testing.assert_array_equal(every.keep[every.ends], 1.0)

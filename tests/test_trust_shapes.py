@@ -22,7 +22,7 @@ from gripmon.monitor.refits import SIGMA_INFLATION
 from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump
-from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges
 from gripmon.track.edges.ends import along_fingers
 
 FPS, KNOCK = 20.0, 16
@@ -108,6 +108,24 @@ def test_a_pose_that_needs_no_ends_is_remembered_without_them():
     assert claimed_m > 0.99 * sigma_m_of(measurement, sides) > 1.2 * sigma_m_of(measurement, np.ones_like(sides))
 
 
+def test_what_is_grasped_touches_the_inner_edges_of_both_fingers():
+    gripper = gripper_from_dict(box_fingers(bevel_m=0.0))
+    along = along_fingers(gripper)[1]
+    inner = {gripper.edge_ids[k] for k in np.flatnonzero(inner_edges(gripper))}
+    assert inner == {name for name, runs in zip(gripper.edge_ids, along, strict=True) if runs and "_in_" in name}
+    assert len(inner) == 4
+
+
+def test_what_a_lone_finger_holds_touches_it_towards_the_tcp():
+    model = box_fingers(bevel_m=0.0)
+    for part in ("points", "edges", "fingers"):
+        model[part] = {name: value for name, value in model[part].items() if name.lower().startswith("l")}
+    model["faces"] = [face for face in model["faces"] if face["finger"] == "left"]
+    gripper = gripper_from_dict(model)
+    inner = {gripper.edge_ids[k] for k in np.flatnonzero(inner_edges(gripper))}
+    assert inner == {"L_in_near_along", "L_in_far_along"}
+
+
 def test_the_edges_of_a_fingers_root_are_no_end_of_it():
     """What is seen there leaves it open whether the tips are: a carrier hides it, and its rim is parallel to it."""
     model = box_fingers(bevel_m=0.0)
@@ -179,16 +197,12 @@ def test_bevels_that_the_file_states_are_within_the_bound():
     assert error_m.max() > 1e-3 and Verdict.VALID not in seen.verdicts()
 
 
-@pytest.mark.xfail(
-    reason="an object that is closed upon moves both inner edges; that contradicts what was learnt of the opening's "
-    "report, which is forgotten and within a frame learnt anew from the same edges",
-    raises=AssertionError,
-    strict=True,
-)
 @pytest.mark.usefixtures("tools_importable")
 def test_what_is_grasped_does_not_teach_the_error_of_a_reported_opening():
+    """An object that is closed upon moves both inner edges, as another opening and distance would."""
     from benchmarks.integrity_runs import run_scene
 
     seen = run_scene("round tips: grasp", 2026, 26, 96)
     frames = [k for k, valid in enumerate(seen["valid"]) if valid]
     assert all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)
+    assert len([k for k in frames if k >= 84]) >= 10 and max(seen["level_m"][84:]) < 6e-4, "it is over"

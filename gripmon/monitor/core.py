@@ -208,7 +208,7 @@ class Monitor:
         evidence = self._evidence(frame, measurement, before_T, drift, doubtful=bool(faults))
         self._jumped = self._jumped or evidence.jumped
         if standing.believed:
-            self._follow(measurement, evidence.motion)
+            self._follow(standing, evidence.motion)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
@@ -229,10 +229,10 @@ class Monitor:
             frame, self.reference, judgement, standing, self._gripper, taken, origin, smoothed, drift, alerts
         )
 
-    def _follow(self, measurement: Measurement, motion: Motion) -> None:
+    def _follow(self, standing: Standing, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
         assert self._covariance is not None
-        self._tracker.learn(measurement)
+        self._tracker.learn(standing.measurement, opening=not standing.ambiguous)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()

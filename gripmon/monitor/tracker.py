@@ -84,11 +84,13 @@ class Tracker:
         )
         return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
-    def learn(self, measurement: Measurement) -> None:
-        """The gripper was where it was measured: that is what it usually shows, and the report's error."""
+    def learn(self, measurement: Measurement, opening: bool) -> None:
+        """The gripper was where it was measured: that is what it usually shows, and, if the ``opening`` that was seen
+        is to be believed, too, the report's error.
+        """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
-        if not self._jaw.exact:
+        if opening and not self._jaw.exact:
             self._jaw.learn()
 
     def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:

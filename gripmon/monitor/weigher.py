@@ -33,7 +33,7 @@ from gripmon.monitor.refits import (
 )
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges
 from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
@@ -350,7 +350,8 @@ def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
 
 def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
     names = tuple(gripper.edge_ids[edge] for edge in edges)
-    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
+    of_each = gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], inner_edges(gripper)[edges]
+    return hypotheses_of(names, *of_each, may_open)
 
 
 def _floor(settings: MonitorSettings) -> Array:

@@ -28,6 +28,9 @@ PARALLEL_COSINE = 0.87
 MAJORITY = 0.5
 """Part of the edges' length that has to run one way for the fingers to have a direction at all."""
 
+DISTINCT_M = 1e-4
+"""A finger's edges that are nearer to each other than a gripper file's points may be have no inner and outer one, m."""
+
 BEYOND_PX = (3.0, 16.5)
 """Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and as long as the stretch of an edge
 that makes a corner seen (``corners.neighbourhood_px``).
@@ -162,6 +165,26 @@ def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:
     """(e,) which edges meet a place at which a finger may end, and don't run along it: not those of its root."""
     ends = FingerEnds(gripper, EdgeSettings())
     return ~ends.along & np.isin(gripper.edge_points, ends.points).any(axis=1)
+
+
+@lru_cache(maxsize=8)
+def inner_edges(gripper: Gripper) -> NDArray[np.bool_]:
+    """(e,) which edges along the fingers face the other fingers, a lone one's the TCP, so that what is grasped touches
+    them: those that are nearer to the inmost one of their finger than to its middle.
+    """
+    axis, along = along_fingers(gripper)
+    middle_m = gripper.points_grip_m()[gripper.edge_points].mean(axis=1)
+    own = [along & (gripper.edge_finger == finger) for finger in np.unique(gripper.edge_finger[along])]
+    centre_m = np.array([middle_m[edges].mean(axis=0) for edges in own])
+    between_m = centre_m.mean(axis=0) if len(own) > 1 else np.zeros(3)
+    inner = np.zeros(len(along), dtype=bool)
+    for edges, centre in zip(own, centre_m, strict=True):
+        inwards = between_m - centre
+        inwards -= (inwards @ axis) * axis
+        way_m = (middle_m - centre) @ inwards / max(float(np.linalg.norm(inwards)), DISTINCT_M)
+        inmost_m = way_m[edges].max()
+        inner |= edges & (way_m > 0.5 * inmost_m) & (inmost_m > DISTINCT_M)
+    return inner
 
 
 class FingerEnds:

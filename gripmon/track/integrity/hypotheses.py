@@ -12,7 +12,7 @@ from gripmon.model.records import Array
 
 WRONG_EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else, a border parallel to it, a pad, a shadow; or
-that the ends of one finger do, together.
+that the ends of one finger do, together, or the inner edges of all fingers, which close upon one object.
 """
 
 WRONG_GRIPPER = 1e-3
@@ -49,9 +49,12 @@ def hypotheses_of(
     finger: NDArray[np.intp],
     finger_names: tuple[str, ...],
     along: NDArray[np.bool_],
+    inner: NDArray[np.bool_],
     has_opening: bool,
 ) -> Hypotheses:
-    """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end."""
+    """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end,
+    ``inner`` (v,) for those that what is grasped touches.
+    """
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
     whole = np.ones(count)
@@ -65,6 +68,9 @@ def hypotheses_of(
             rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
             rows.append((f"finger {name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
+    if inner.sum() > 1 and not inner.all():
+        # In one image another distance and opening make up for it; where the gripper was before doesn't fit then.
+        rows.append(("the fingers' inner edges belong to what is grasped", WRONG_EDGE, ~inner, False, True))
     if has_opening:
         rows.append(("the jaw opening is wrong", WRONG_GRIPPER, whole, True, False))
     ends = len(rows)
