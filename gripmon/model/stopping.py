@@ -1,8 +1,10 @@
-"""Requests to end: SIGINT and SIGTERM, from the first import to the last file that is closed."""
+"""Ends: requests by SIGINT and SIGTERM, from the first import to the last file that is closed, and a parent's end."""
 
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -50,6 +52,20 @@ def signals_request(stop: StopRequest) -> Iterator[None]:
     """Around a loop that looks at ``stop``: nothing is raised."""
     with _handling(lambda number, _frame: _take(stop, number)):
         yield
+
+
+def end_with_parent() -> None:
+    """In a worker that :mod:`multiprocessing` spawned: ends it when its parent ends, also by SIGKILL or for want of
+    memory.  By itself it would wait for work for ever, with all of its memory.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "only a spawned process has a parent to follow"
+
+    def follow() -> None:
+        parent.join()
+        os._exit(EXIT_FAILED)
+
+    threading.Thread(target=follow, name="parent", daemon=True).start()
 
 
 def _take(stop: StopRequest, number: int) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import options
+from gripmon.model.stopping import end_with_parent
 
 _DESCRIPTION = """\
 Runs the monitor, by edges and by corners, over simulated scenes of every condition (clutter, occlusion, blur, noise,
@@ -141,6 +142,7 @@ def _prepare() -> None:
     from benchmarks import pairs, series  # noqa: F401 - so that a checkout that changes meanwhile does no harm
     from benchmarks.rows import warm_up
 
+    end_with_parent()
     cv2.setNumThreads(1)
     warm_up()
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import options
+from gripmon.model.stopping import end_with_parent
 
 _DESCRIPTION = """\
 Runs the monitor over random scenes of every condition (free view, clutter, light, grasps, covers, things whose borders
@@ -202,6 +203,7 @@ def _prepare() -> None:
 
     from benchmarks import integrity_runs  # noqa: F401
 
+    end_with_parent()
     cv2.setNumThreads(1)
 
 

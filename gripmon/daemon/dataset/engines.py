@@ -16,6 +16,7 @@ from gripmon.analyse.dataset import Measured
 from gripmon.daemon.dataset.measuring import Configs, failed, measure
 from gripmon.io.sources.episodes import Episode
 from gripmon.model.errors import InputError, one_line
+from gripmon.model.stopping import end_with_parent
 
 AHEAD = 2
 """Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
@@ -37,6 +38,11 @@ def _begin(configs: Configs, lens: str) -> None:
 
     cv2.setNumThreads(1)
     _given = configs, lens
+
+
+def _begin_here(configs: Configs, lens: str) -> None:
+    end_with_parent()
+    _begin(configs, lens)
 
 
 def _work(episode: Episode) -> Measured:
@@ -61,7 +67,7 @@ def local(
     while waiting or suspects:
         alone = bool(suspects)
         queue, count = (suspects, 1) if alone else (waiting, workers)
-        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (configs, lens)) as pool:
+        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin_here, (configs, lens)) as pool:
             flying: dict[Future[Measured], Episode] = {}
             left = count * WORKER_EPISODES
             try:
