@@ -112,6 +112,20 @@ def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_a
     assert errors_m(seen)[BEGINS + 1 + within :].max() < 2e-4
 
 
+@pytest.mark.parametrize("size_m", [-2e-3, -7e-4, 7e-4, 2e-3])
+@pytest.mark.parametrize("reported", [True, False])
+def test_a_knock_along_the_axis_just_after_the_jaw_has_moved_is_no_grasp(size_m: float, reported: bool):
+    """What is known of the opening is least then, and a grasped object that shifts the inner edges looks alike."""
+    jaw = JawScript(knots=((0.0, 0.034), ((BEGINS - 1) / FPS, 0.030)), reported=reported, reported_offset_m=1e-4)
+    knock = Bump(at_s=BEGINS_S, ring_fraction=0.0, translation_m=(0.0, 0.0, size_m))
+    seen = watched(scene(28, jaw=jaw, mount=(knock,)), MonitorSettings(jaw_sigma_m=2e-4, jaw_offset_sigma_m=5e-4))
+    assert_nothing_misleads(seen)
+    after = slice(BEGINS + 1 + 6, None)
+    shift_m = np.array([np.nan if r.drift is None else r.drift.tcp_shift_m[2] for r in seen.records])
+    assert (np.abs(shift_m[after] - size_m) < 3e-4).all()
+    assert not reported or valid(seen)[after].all()
+
+
 NEVER_FOUND = pytest.mark.xfail(
     reason="after some doubtful frames nothing is searched for, and a proof needs four corners in one frame: a gripper "
     "that was knocked by some millimetres behind a bar stays suspect for long after the bar has gone",

@@ -232,7 +232,7 @@ class Monitor:
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
         assert self._covariance is not None
-        self._tracker.learn(standing.measurement, opening=not standing.ambiguous)
+        self._tracker.learn(standing.measurement, opening=not standing.grasped)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()

@@ -14,8 +14,8 @@ class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
 
     ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
-    it; ``where_it_was``: the anchor has it there; ``ambiguous``: something else than a knock of the mount explains
-    that it hasn't; ``finer``: what the gripper's look makes of it, which then is the pose.
+    it; ``where_it_was``: the anchor has it there; ``grasped``: something between the fingers may have shifted their
+    inner edges, and with them the opening; ``finer``: what the gripper's look makes of it, which then is the pose.
     """
 
     measurement: Measurement
@@ -24,5 +24,5 @@ class Standing:
     protection: Protection
     believed: bool
     where_it_was: bool
-    ambiguous: bool = False
+    grasped: bool = False
     finer: Fused | None = None

@@ -243,8 +243,8 @@ class Integrity:
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        unclear = trust.ambiguous and not moved
-        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was, unclear)
+        at = measurement, cam_T_grip, covariance, trust.protection
+        return Standing(*at, believed, where_it_was, trust.grasped)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
         """Whether the mount was knocked, the edges showing ``beside_px`` from the old place: so rare that one lucky

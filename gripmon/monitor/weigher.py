@@ -72,15 +72,16 @@ class Trust:
 
     ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
     ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
-    explains that, too.  ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis;
-    None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of, without the ends where it
-    needs none; None where no edge is seen.
+    explains that, too; ``grasped``: that may be something between the fingers.  ``most_probable``: the fits with the
+    anchor, and the number of the most probable hypothesis; None where there is none.  ``ends``: as they were seen.
+    ``fits``: what it was made of, without the ends where it needs none; None where no edge is seen.
     """
 
     protection: Protection
     proven: bool
     displaced: bool = False
     ambiguous: bool = False
+    grasped: bool = False
     most_probable: tuple[Anchored, int] | None = None
     ends: FingerEndsSeen | None = None
     fits: Refits | None = None
@@ -200,7 +201,8 @@ class Weigher:
         if self._unexplained is not None:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        return Trust(protection, proven, displaced, ambiguous, most_probable, ends, made_of)
+        grasped = ambiguous and hypotheses.grasp >= 0 and bool(possible[hypotheses.grasp] > 0.0)
+        return Trust(protection, proven, displaced, ambiguous, grasped, most_probable, ends, made_of)
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""

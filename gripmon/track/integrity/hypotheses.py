@@ -26,7 +26,7 @@ class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
     the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
-    end of a finger is what it seems.
+    end of a finger is what it seems, ``grasp`` of the one that something grasped shifts the inner edges; -1: none is.
     """
 
     name: tuple[str, ...]
@@ -35,6 +35,7 @@ class Hypotheses:
     opening: NDArray[np.bool_]
     sudden: NDArray[np.bool_]
     ends: int
+    grasp: int = -1
 
     def without_ends(self) -> tuple[Hypotheses, NDArray[np.bool_]]:
         """The same where no end of a finger is what it seems besides; (h,) which doubt more than that then."""
@@ -68,7 +69,9 @@ def hypotheses_of(
             rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
             rows.append((f"finger {name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
+    grasp = -1
     if inner.sum() > 1 and not inner.all():
+        grasp = len(rows)
         # In one image another distance and opening make up for it; where the gripper was before doesn't fit then.
         rows.append(("the fingers' inner edges belong to what is grasped", WRONG_EDGE, ~inner, False, True))
     if has_opening:
@@ -77,5 +80,5 @@ def hypotheses_of(
     rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
     names, prior, keep, opening, sudden = zip(*rows, strict=True)
     return Hypotheses(
-        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends
+        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends, grasp
     )
