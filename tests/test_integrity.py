@@ -428,3 +428,14 @@ def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():
     assert len(one.name) == 1 + 3 + 1 and one.keep.shape == (5, 3)
     every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), NO_EDGE, False)
     np.testing.assert_array_equal(every.keep[every.ends], 1.0)
+
+
+def test_that_a_lone_fingers_ends_are_something_else_is_one_hypothesis():
+    """That of all ends, which isn't where their corners are seen and something is known of where it was."""
+    hypotheses = hypotheses_of(NAMES[:4], np.zeros(4, dtype=int), ("a",), ALONG[:4], INNER[:4], False)
+    doubting_all = [k for k, keep in enumerate(hypotheses.keep) if not keep[~ALONG[:4]].any()]
+    assert doubting_all == [hypotheses.ends] and hypotheses.sudden[hypotheses.ends]
+    assert {f"edge {name} belongs to something else" for name in NAMES[:4]} <= set(hypotheses.name)
+    tip = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a",), ALONG[:3], INNER[:3], False)
+    doubting_all = [k for k, keep in enumerate(tip.keep) if not keep[~ALONG[:3]].any()]
+    assert doubting_all == [tip.ends], "of one edge at its end, too"

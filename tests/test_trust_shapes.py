@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -206,3 +207,26 @@ def test_what_is_grasped_does_not_teach_the_error_of_a_reported_opening():
     frames = [k for k, valid in enumerate(seen["valid"]) if valid]
     assert all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)
     assert len([k for k in frames if k >= 84]) >= 10 and max(seen["level_m"][84:]) < 6e-4, "it is over"
+
+
+@pytest.mark.usefixtures("tools_importable")
+@pytest.mark.parametrize("motion", ["0.2 mm, 0.2°", "2 mm, 1°"])
+def test_a_lone_finger_is_valid_where_it_shows_more_than_it_needs(motion: str, tmp_path: Path):
+    """Without any one of its edges the others still tell where it is; that its end is one its two corners prove."""
+    from benchmarks.shapes import MOTIONS, shapes, track
+
+    [shape] = (shape for shape in shapes() if shape.name == "sharp box, one finger")
+    seen = track(shape, *MOTIONS[motion], 60, 1, tmp_path)
+    assert seen.valid >= 0.9 * seen.frames and seen.beyond == 0
+    assert seen.error_m < 2e-5
+
+
+@pytest.mark.usefixtures("tools_importable")
+def test_a_lone_finger_whose_end_is_hidden_is_not_valid_after_a_knock():
+    """What hides it has an end, too: a bar parallel to it, while the mount jumps."""
+    from benchmarks.integrity_runs import run_scene
+
+    seen = run_scene("one finger: bump, tips hidden", 2026, 2, 96)
+    frames = [k for k, valid in enumerate(seen["valid"]) if valid]
+    assert len(frames) >= 10
+    assert all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import msgspec
@@ -76,14 +77,21 @@ class Draft:
         return self.gripper.points_grip_m(self.opening_m)[self.gripper.corner_points]
 
 
+class Fingers(Enum):
+    """Which grippers: the usual ones, two fingers with rounded tips, or one finger of the usual that stands still."""
+
+    USUAL = ""
+    ROUND_TIPS = "round tips"
+    ONE = "one finger"
+
+
 @dataclass(frozen=True)
 class Condition:
     """A kind of scene.
 
     ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``moves``:
     the mount moves, so that an alert which says so is true; ``inside``: a scene may begin in the midst of it;
-    ``truth``: what the true gripper is instead of the one that the monitor knows; ``round_tips``: fingers with rounded
-    tips instead of the usual grippers.
+    ``truth``: what the true gripper is instead of the one that the monitor knows; ``fingers``: of which grippers.
     """
 
     name: str
@@ -93,7 +101,7 @@ class Condition:
     moves: bool = False
     inside: bool = True
     truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
-    round_tips: bool = False
+    fingers: Fingers = Fingers.USUAL
 
 
 def with_(settings: Any, **changes: Any) -> Any:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.integrity_conditions import ORDINARY, bump
-from benchmarks.integrity_draft import Changes, Condition, Draft, both, with_
+from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, both, with_
 from gripmon.simulate.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
 
 _COMES, _GOES = 0.12, 0.88  # shares of the time at which what comes is there, and leaves again
@@ -240,15 +240,23 @@ MISLEADING: tuple[Condition, ...] = (
     ),
     Condition("bump at rim", "the mount jumps beside a bar", both(rim_beside, bump), moves=True, inside=False),
 )
-_WITH_ROUND_TIPS = (
-    "ordinary", "clutter", "light", "blur", "jaw cycle", "cover one", "bump", "vibration", "creep", "opening wrong",
-    "grasp", "grasp lines", "long bar", "rim over tips", "rim beside", "shadow lines", "bump in grasp",
-    "bump, tips hidden",
-)  # fmt: skip
+_WITH = {
+    Fingers.ROUND_TIPS: (
+        "ordinary", "clutter", "light", "blur", "jaw cycle", "cover one", "bump", "vibration", "creep", "opening wrong",
+        "grasp", "grasp lines", "long bar", "rim over tips", "rim beside", "shadow lines", "bump in grasp",
+        "bump, tips hidden",
+    ),
+    Fingers.ONE: (
+        "ordinary", "clutter", "light", "cover one", "hand", "bump", "vibration", "creep", "tips worn", "long bar",
+        "thin plate", "rim over tips", "rim beside", "plate behind", "copies", "shadow lines", "bump, tips hidden",
+        "bump at rim",
+    ),
+}  # fmt: skip
 
-ROUND_TIPS = tuple(
-    replace(condition, name=f"round tips: {condition.name}", round_tips=True)
+OTHER_FINGERS = tuple(
+    replace(condition, name=f"{fingers.value}: {condition.name}", fingers=fingers)
+    for fingers, names in _WITH.items()
     for condition in (*ORDINARY, *MISLEADING)
-    if condition.name in _WITH_ROUND_TIPS
+    if condition.name in names
 )
-CONDITIONS = (*ORDINARY, *MISLEADING, *ROUND_TIPS)
+CONDITIONS = (*ORDINARY, *MISLEADING, *OTHER_FINGERS)

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks.integrity_draft import Condition, Draft
+from benchmarks.integrity_draft import Condition, Draft, Fingers
 from benchmarks.rounded import rounded_model, rounded_solids
 from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
 from gripmon.model.camera import Camera, PaperLens, make_camera
@@ -61,12 +61,14 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
     """Scene ``number`` of a condition."""
     rng = np.random.default_rng([seed, zlib.crc32(b"integrity " + condition.name.encode()), number])
     camera = _camera(rng)
-    gripper, shown = _round_tipped(rng) if condition.round_tips else 2 * (_usual(number),)
+    gripper, shown = _grippers(condition.fingers, number, rng)
     cam_T_grip, opening_m = _placed(rng, camera, shown)
     draft = _draft(rng, frames, shown, cam_T_grip, opening_m)
     if condition.truth is not None:
         shown = Gripper(msgspec.convert(condition.truth(rng, msgspec.to_builtins(gripper.model)), GripperModel))
     scenario = _scenario(condition, draft)
+    if not shown.has_jaw:
+        scenario = msgspec.structs.replace(scenario, jaw=JawScript())
     simulator = Simulator(camera, shown, cam_T_grip, scenario, seed=int(rng.integers(2**31)))
     sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
     inside = condition.inside and rng.random() < INSIDE_SHARE
@@ -83,9 +85,27 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
     )
 
 
-def _usual(number: int) -> Gripper:
+def _grippers(fingers: Fingers, number: int, rng: np.random.Generator) -> tuple[Gripper, Gripper]:
+    """What the monitor knows, and what is shown."""
+    if fingers is Fingers.ROUND_TIPS:
+        return _round_tipped(rng)
     models = gripper_models()
-    return Gripper(msgspec.convert(models[number % len(models)], GripperModel))
+    model = models[number % len(models)]
+    gripper = Gripper(msgspec.convert(_first_finger(model) if fingers is Fingers.ONE else model, GripperModel))
+    return gripper, gripper
+
+
+def _first_finger(model: dict[str, Any]) -> dict[str, Any]:
+    """A model's first finger alone, which stands still; the TCP stays where it is."""
+    own = next(iter(model["fingers"]))
+    points = {name: point for name, point in model["points"].items() if point["finger"] == own}
+    return {
+        "name": f"{model['name']}, one",
+        "fingers": {own: {}},
+        "points": points,
+        "edges": {name: edge for name, edge in model["edges"].items() if edge["from"] in points},
+        "faces": [face for face in model["faces"] if face["finger"] == own],
+    }
 
 
 def _round_tipped(rng: np.random.Generator) -> tuple[Gripper, Gripper]:

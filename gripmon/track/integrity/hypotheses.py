@@ -55,16 +55,21 @@ def hypotheses_of(
 ) -> Hypotheses:
     """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end,
     ``inner`` (v,) for those that what is grasped touches.
+
+    A lone finger's ends are all that there are: that something else was taken for them is said once, as for all fingers.
     """
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
     whole = np.ones(count)
     rows.append(("nothing is wrong", 1.0, whole, False, False))
+    lone = len(finger_names) == 1
     for number, name in enumerate(edge_names):
-        rows.append((f"edge {name} belongs to something else", WRONG_EDGE, np.arange(count) != number, False, False))
+        others = np.arange(count) != number
+        if not (lone and (others == along).all()):
+            rows.append((f"edge {name} belongs to something else", WRONG_EDGE, others, False, False))
     for number, name in enumerate(finger_names):
         own = finger == number
-        if (own & ~along).sum() > 1:
+        if (own & ~along).sum() > 1 and not lone:
             what = f"the ends of finger {name} belong to something else"
             rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
