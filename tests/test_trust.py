@@ -23,8 +23,9 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import make_transform, perturb
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import MISREAD_PROBABILITY, Trust
+from gripmon.monitor.weigher import MISREAD_PROBABILITY
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,

@@ -1,12 +1,46 @@
-"""What is published of a frame in which the gripper was measured."""
+"""What a measurement is worth, and what is published of a frame in which the gripper was measured."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from gripmon.model.records import Array, Protection
-from gripmon.track.edges import Measurement
+from gripmon.monitor.refits import Anchored, Refits
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.look import Fused
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What one measurement is worth.
+
+    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
+    ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
+    explains that, too; ``grasped``: that may be something between the fingers; ``may_have_slid``: a
+    lone finger along itself, its end being seen elsewhere than it was.  ``most_probable``: the fits with the
+    anchor, and the number of the most probable hypothesis; None where there is none.  ``ends``: as they were seen.
+    ``fits``: what it was made of, without the ends where it needs none; None where no edge is seen.
+    """
+
+    protection: Protection
+    proven: bool
+    displaced: bool = False
+    ambiguous: bool = False
+    grasped: bool = False
+    may_have_slid: bool = False
+    most_probable: tuple[Anchored, int] | None = None
+    ends: FingerEndsSeen | None = None
+    fits: Refits | None = None
+
+    @property
+    def instead(self) -> tuple[int, Array, Array] | None:
+        """Number of the most probable hypothesis, with the pose (4, 4) and covariance (6, 6) that the anchor and the
+        rest of the edges give under it; None where there is none.
+        """
+        if self.most_probable is None or self.fits is None:
+            return None
+        anchored, number = self.most_probable
+        return (number, *self.fits.solution(anchored, number))
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,9 @@ from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, Monito
 from gripmon.monitor.finer import FinerLook
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.standing import Standing
+from gripmon.monitor.standing import Standing, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Trust, Weigher
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Weigher
 from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 

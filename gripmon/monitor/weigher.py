@@ -7,8 +7,6 @@ creep, unless it was knocked, which is rare: the last pose that proved itself is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,8 +30,9 @@ from gripmon.monitor.refits import (
     reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.standing import Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges
 from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
@@ -66,37 +65,6 @@ CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
 
 
-@dataclass(frozen=True, slots=True)
-class Trust:
-    """What one measurement is worth.
-
-    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
-    ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
-    explains that, too; ``grasped``: that may be something between the fingers.  ``most_probable``: the fits with the
-    anchor, and the number of the most probable hypothesis; None where there is none.  ``ends``: as they were seen.
-    ``fits``: what it was made of, without the ends where it needs none; None where no edge is seen.
-    """
-
-    protection: Protection
-    proven: bool
-    displaced: bool = False
-    ambiguous: bool = False
-    grasped: bool = False
-    most_probable: tuple[Anchored, int] | None = None
-    ends: FingerEndsSeen | None = None
-    fits: Refits | None = None
-
-    @property
-    def instead(self) -> tuple[int, Array, Array] | None:
-        """Number of the most probable hypothesis, with the pose (4, 4) and covariance (6, 6) that the anchor and the
-        rest of the edges give under it; None where there is none.
-        """
-        if self.most_probable is None or self.fits is None:
-            return None
-        anchored, number = self.most_probable
-        return (number, *self.fits.solution(anchored, number))
-
-
 class Weigher:
     """Bounds for one monitor's measurements, and the anchor that they rest on."""
 
@@ -104,6 +72,7 @@ class Weigher:
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._along = tracker.along  # (e,) which edges run along the fingers
         self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
+        self._lone = has_lone_end(gripper)
         self._floor = _floor(settings)
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
@@ -126,6 +95,8 @@ class Weigher:
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
         self._unexplained: Array | None = None
+        self._reference_T = from_record(reference.cam_T_grip)
+        self._slid: bool | None = None  # not known before something is proven
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -165,11 +136,14 @@ class Weigher:
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else 1.0 if slid else self._misread(measurement, ends, kept)
+        may_have_slid = self._may_have_slid(measurement, cam_T_grip, displaced)
+        misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         # How probable it is that only the frame tells where the fingers are along themselves.
-        alone = 1.0 if displaced or self.anchor is None else self._knocked(now_s - self.anchor.now_s, hidden=True)
+        alone = 1.0
+        if self.anchor is not None and not (displaced or may_have_slid):
+            alone = self._knocked(now_s - self.anchor.now_s, hidden=True)
         jumped = alone * prior[hypotheses.ends] > risk
         made_of = fits
         if displaced or jumped or self.anchor is None:
@@ -192,7 +166,7 @@ class Weigher:
             now = protection_of(all_along, risk)
             if displaced:
                 now = larger(now, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
-            return Trust(now, proven, displaced, ends=ends, fits=made_of)
+            return Trust(now, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
@@ -202,12 +176,13 @@ class Weigher:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and hypotheses.grasp >= 0 and bool(possible[hypotheses.grasp] > 0.0)
-        return Trust(protection, proven, displaced, ambiguous, grasped, most_probable, ends, made_of)
+        return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
         assert trust.fits is not None
         rows = self._about(trust.fits.edges)[1]
+        self._slid = trust.may_have_slid
         if self.anchor is not None:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is not a vibration, but what rings after it is.
@@ -220,6 +195,22 @@ class Weigher:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
         else:
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
+
+    def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
+        """Whether the end of a lone finger may be something else though its corners are seen: there are other corners
+        than its own, of marks on it and of what is beside it.  It proves a place from which the edges don't show apart,
+        at first that of the reference, and each after it; the rest a person has to say, by a new reference.
+        """
+        if not self._lone:
+            return False
+        if self._slid is None:
+            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._floor
+            way = perturbation_between(self._reference_T, cam_T_grip)
+            displaced = bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
+        else:
+            assert self.anchor is not None
+            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
+        return bool(self._slid) or (displaced and measurement.prediction.moved_px(way) >= ONE_EDGE_PX)
 
     def held(self, protection: Protection, growth: Array, unseen_s: float, hidden: bool) -> Protection:
         """The bounds of a transform that was measured ``unseen_s`` ago, with the covariance (6, 6) of what may have

@@ -38,6 +38,7 @@ from gripmon.model.geometry import from_record, perturbation_between, rotation_a
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
+from gripmon.track.edges import has_lone_end
 
 OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
 """Squared normalised error that normal errors exceed once in a thousand times."""
@@ -210,6 +211,8 @@ class Recalibrator:
         if len(seen) == 1 and len(self._gripper.finger_ids) > 1:
             name = self._gripper.finger_ids[int(seen[0])]
             asks.append(f"only finger '{name}' is seen: if it is bent, that looks like a camera that moved")
+        if has_lone_end(self._gripper):
+            asks.append("the gripper has one finger: something else may look like its end, elsewhere along it")
         return asks
 
     def _check_still(self, tracked: Average) -> None:

@@ -1,6 +1,13 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
-from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends, finger_of_ends, inner_edges
+from gripmon.track.edges.ends import (
+    FingerEnds,
+    FingerEndsSeen,
+    edges_at_ends,
+    finger_of_ends,
+    has_lone_end,
+    inner_edges,
+)
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
 from gripmon.track.edges.robust_fit import prior_information
@@ -32,6 +39,7 @@ __all__ = [
     "edge_sums",
     "edges_at_ends",
     "finger_of_ends",
+    "has_lone_end",
     "inner_edges",
     "prior_information",
     "trace_of",

@@ -167,6 +167,11 @@ def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:
     return ~ends.along & np.isin(gripper.edge_points, ends.points).any(axis=1)
 
 
+def has_lone_end(gripper: Gripper) -> bool:
+    """Whether the end of a single finger alone tells where it is along itself."""
+    return len(gripper.finger_ids) == 1 and not along_fingers(gripper)[1].all()
+
+
 @lru_cache(maxsize=8)
 def inner_edges(gripper: Gripper) -> NDArray[np.bool_]:
     """(e,) which edges along the fingers face the other fingers, a lone one's the TCP, so that what is grasped touches

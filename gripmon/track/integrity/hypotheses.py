@@ -56,7 +56,7 @@ def hypotheses_of(
     """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end,
     ``inner`` (v,) for those that what is grasped touches.
 
-    A lone finger's ends are all that there are: that something else was taken for them is said once, as for all fingers.
+    A lone finger's ends are all that there are: something else taken for them is one hypothesis, as of all fingers.
     """
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
