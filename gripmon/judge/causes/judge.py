@@ -290,7 +290,11 @@ def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) 
         case Cause.CAMERA_MOUNT:
             shift_mm = 1e3 * float(np.linalg.norm(motion[POSE][:3]))
             turn_deg = math.degrees(float(np.linalg.norm(motion[POSE][3:])))
-            also = "all fingers bent alike" if len(gripper.finger_ids) > 1 else "a finger bent so"
+            also = (
+                "all fingers bent alike"
+                if len(gripper.finger_ids) > 1
+                else "a finger bent so, or something else in place of its end,"
+            )
             return (
                 f"the camera moved against the gripper: TCP by {shift_mm:.3f} mm, turned by {turn_deg:.3f} degrees; "
                 f"{also} would look the same"
