@@ -27,7 +27,7 @@ from support.policy_runs import (
 )
 
 from gripmon.judge.policy import Policy, PolicySettings
-from gripmon.model.records import AlertKind, Cause, Protection, Verdict
+from gripmon.model.records import NOTHING_WRONG, AlertKind, Cause, Protection, Verdict
 
 K = AlertKind
 
@@ -48,6 +48,8 @@ def test_a_transform_is_suspect_while_its_error_may_exceed_an_alert_limit():
     assert reason.startswith("the TCP may be") and "alert limit 1 mm (edge a belongs" in reason
     verdict, reason = judged(1e-4, 1.05 * limit_rad)
     assert verdict is SUSPECT and reason is not None and reason.startswith("the rotation may be")
+    itself = run.feed(seen(protection=Protection(0.5, 1e-3, 1e-5, NOTHING_WRONG))).reason
+    assert itself is not None and "nothing is wrong" not in itself and "too little of the gripper is seen" in itself
     assert judged(math.nan, 1e-3)[0] is SUSPECT and judged(1e-4, math.nan)[0] is SUSPECT, "NaN bounds nothing"
     assert run.feed(seen(protection=None)).verdict is SUSPECT
     assert run.feed(seen(sigma=np.full(6, 0.1))).verdict is VALID, "bounds count, which are made of covariances"

@@ -15,7 +15,8 @@ class GripperSearch:
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly.  A lost gripper is searched
     for all the time as long as the last transform is held: it may come back at any moment, and goes on moving; then in
-    one of several frames.
+    one of several frames.  What was found beside a doubtful fit is followed as long again: a place has to show the
+    fingers' ends, and clutter hides them in some frames.
     """
 
     def __init__(self, meter: FingertipMeter, settings: SearchSettings, hold_s: float):
@@ -23,6 +24,7 @@ class GripperSearch:
         self._meter, self._settings, self._hold_s = meter, settings, hold_s
         self._backlog: Backlog[Sequence[Expected]] = Backlog()
         self._found: Sequence[Expected] | None = None  # for the newest frame
+        self._kept: tuple[Sequence[Expected], float] = (), 0.0  # found before a doubtful fit, and when
         self._now_s = self._seen_s = 0.0
         self._credit = float(settings.eager_frames)
         self._untrusted = 0  # frames since the gripper was seen
@@ -44,6 +46,10 @@ class GripperSearch:
             if isinstance(found, Exception):
                 raise found
             self._found = found
+            self._kept = found, now_s
+        kept, since_s = self._kept
+        if kept and self._found is None and not self._untrusted and now_s - since_s <= self._hold_s:
+            self._found = kept
         at_once = not self._searched
         if self._found is not None or len(self._backlog):
             return Patience(self._found is not None, self._found is not None, at_once)
@@ -70,5 +76,7 @@ class GripperSearch:
         earned = -1.0 if pays else 1.0 / self._settings.refill_frames
         self._credit = min(max(self._credit + earned, 0.0), float(self._settings.eager_frames))
         self._untrusted += 1
+        if not measurement.looked_far:
+            self._kept = (), 0.0
         if measurement.trusted:
             self._untrusted, self._searched, self._seen_s = 0, False, self._now_s

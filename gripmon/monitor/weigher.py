@@ -136,7 +136,7 @@ class Weigher:
         again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        may_have_slid = self._may_have_slid(measurement, cam_T_grip, displaced)
+        may_have_slid = self._lone and self._may_have_slid(measurement, cam_T_grip, displaced)
         misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
@@ -201,8 +201,6 @@ class Weigher:
         than its own, of marks on it and of what is beside it.  It proves a place from which the edges don't show apart,
         at first that of the reference, and each after it; the rest a person has to say, by a new reference.
         """
-        if not self._lone:
-            return False
         if self._slid is None:
             covariance = self._expected[1] + measurement.covariance[:6, :6] + self._floor
             way = perturbation_between(self._reference_T, cam_T_grip)

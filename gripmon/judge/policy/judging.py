@@ -17,6 +17,7 @@ import numpy as np
 from gripmon.judge.policy.alerts import AlertBook
 from gripmon.judge.policy.settings import PolicySettings, time_left_s
 from gripmon.model.records import (
+    NOTHING_WRONG,
     Alert,
     AlertKind,
     Array,
@@ -349,7 +350,8 @@ def past_alert_limit(protection: Protection | None, settings: PolicySettings) ->
     """Which bound is not within its alert limit, in words; None where both are.  One that is NaN bounds nothing."""
     if protection is None:
         return "no bound on the error is known"
-    hypothesis = f" ({protection.hypothesis})" if protection.hypothesis else ""
+    why = "too little of the gripper is seen" if protection.hypothesis == NOTHING_WRONG else protection.hypothesis
+    hypothesis = f" ({why})" if why else ""
     if not protection.position_m <= settings.alert_limit_m:
         limit_mm = 1e3 * settings.alert_limit_m
         return f"the TCP may be {in_mm(protection.position_m)} mm off, alert limit {limit_mm:g} mm{hypothesis}"

@@ -48,11 +48,21 @@ from gripmon.model.records.notes import Limits, MonitorNotes
 from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
 from gripmon.model.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.model.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
-from gripmon.model.records.values import Array, Drift, Image, Protection, Smoothed, Transform, to_json
+from gripmon.model.records.values import (
+    NOTHING_WRONG,
+    Array,
+    Drift,
+    Image,
+    Protection,
+    Smoothed,
+    Transform,
+    to_json,
+)
 
 __all__ = [
     "END_CORNERS",
     "MESSAGES",
+    "NOTHING_WRONG",
     "Alert",
     "AlertEvent",
     "AlertKind",

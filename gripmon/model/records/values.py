@@ -73,6 +73,10 @@ class Smoothed(msgspec.Struct, frozen=True, gc=False):
     covariance: Covariance
 
 
+NOTHING_WRONG = "nothing is wrong"
+"""``hypothesis`` of a bound that owes most to what is seen itself."""
+
+
 class Protection(msgspec.Struct, frozen=True, gc=False):
     """Bounds on the error of a transform: it lies beyond either with at most the stated probability."""
 

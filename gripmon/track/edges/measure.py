@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.ends import FingerEndsSeen
+from gripmon.track.edges.ends import FingerEndsSeen, edges_at_ends
 from gripmon.track.edges.evidence import FingerMeter
 from gripmon.track.edges.look import unevenness
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
@@ -106,6 +107,10 @@ class FingertipMeter(FingerMeter):
         """(e,) which edges run along the fingers."""
         return self._ends.along
 
+    @cached_property
+    def _at_ends(self) -> NDArray[np.intp]:
+        return np.flatnonzero(edges_at_ends(self._gripper))
+
     def measure(
         self,
         image: Image,
@@ -121,9 +126,9 @@ class FingertipMeter(FingerMeter):
         start from).
 
         ``usual_share`` of the profiles agree when all is well.  With clearly less the ``rivals`` (4, 4) are looked at:
-        poses at which the gripper was.  If it is not there either, and where ``patience`` allows, it is looked for
-        elsewhere, last of all where ``search`` proposes (if None, a search in this image): another place than one that
-        may be true must show the fingers' ends.
+        poses at which the gripper was.  If it is not there either, or no end of its fingers is seen there, and where
+        ``patience`` allows, it is looked for elsewhere, last of all where ``search`` proposes (if None, a search in
+        this image): another place than one that may be true must show the fingers' ends.
         """
         self._take(jaw_reported)
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
@@ -138,17 +143,26 @@ class FingertipMeter(FingerMeter):
             best = self._at_rivals(image, expected, rivals, best)
         if best.consensus.share >= self._settings.consensus.trusted_share:
             self._zoom_to(self._fitting_zoom(best))
+        at_once = patience.at_once and best.consensus.share < satisfied
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
-            self._lost = 0
-            return best
-        best.trusted = self._trusted(image, best, usual_share)
+            at_an_end = best.consensus.edge_seen[self._at_ends].any()
+            # Gone along themselves, the fingers show most of their outline still.
+            if not best.trusted or at_an_end or not self._looks_at_ends(best.prediction):
+                self._lost = 0
+                return best
+        else:
+            best.trusted = self._trusted(image, best, usual_share)
         self._lost = 0 if best.trusted else self._lost + 1
         if not (patience.when_doubtful if best.trusted else patience.when_lost):
             return best
-        best = self._from_elsewhere(image, expected, best, usual_share, search or self.searched, patience.at_once)
+        best = self._from_elsewhere(image, expected, best, usual_share, search or self.searched, at_once)
         best.looked_far = True
         return best
+
+    def _looks_at_ends(self, prediction: Prediction) -> bool:
+        """Whether an end of a finger might be seen in this view."""
+        return bool(np.isin(prediction.layout.edges, self._at_ends).any())
 
     def _take(self, jaw_reported: bool) -> None:
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported

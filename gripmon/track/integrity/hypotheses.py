@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array
+from gripmon.model.records import NOTHING_WRONG, Array
 
 WRONG_EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else, a border parallel to it, a pad, a shadow; or
@@ -61,7 +61,7 @@ def hypotheses_of(
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
     whole = np.ones(count)
-    rows.append(("nothing is wrong", 1.0, whole, False, False))
+    rows.append((NOTHING_WRONG, 1.0, whole, False, False))
     lone = len(finger_names) == 1
     for number, name in enumerate(edge_names):
         others = np.arange(count) != number
