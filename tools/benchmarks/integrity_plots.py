@@ -52,7 +52,7 @@ def _page(parts: dict[str, Frames], limit_mm: float, file: Path) -> None:
     for axes, (name, frames) in zip(grid.flat, parts.items(), strict=False):
         _diagram(axes, frames, limit_mm, labelled=False)
         misleading = int((frames.lies | frames.unbounded).sum())
-        axes.set_title(f"{name}: {misleading} of {len(frames.view)} misleading", fontsize=9)
+        axes.set_title(f"{name}\n{misleading} of {len(frames.view)} misleading", fontsize=9)
     for axes in grid.flat[len(parts) :]:
         axes.set_visible(False)
     figure.supxlabel("error of the TCP's position (mm)")
