@@ -67,6 +67,7 @@ def test_both_fingers_in_one_file_are_told_apart(tmp_path: Path):
     np.testing.assert_allclose(ends_of(made.gripper), ends_of(known), atol=2 * MICROMETRE)
 
 
+@pytest.mark.skipif(not CUBE.is_file(), reason="../shared/data/visp_cube is not there")
 def test_visps_cube_is_the_one_that_was_written_by_hand():
     by_hand = load_gripper(ARC_FINGERS.with_name("visp_cube.yaml"))
     made = gripper_from_cad([CUBE], frame="cad").gripper

@@ -57,7 +57,7 @@ def _page(parts: dict[str, Frames], limit_mm: float, file: Path) -> None:
         axes.set_visible(False)
     figure.supxlabel("error of the TCP's position (mm)")
     figure.supylabel("protection level (mm)")
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=100)
 
 
 def _diagram(axes: Axes, frames: Frames, limit_mm: float, *, labelled: bool) -> None:
