@@ -30,7 +30,8 @@ class Robot:
 
     def __init__(self, session: zenoh.Session, jaw: ZenohJaw, key: str) -> None:
         self.jaw = jaw
-        self._publisher = session.declare_publisher(key)
+        # The default drops what is too large for a queue on a busy machine.
+        self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: self._publisher.matching_status.matching, "the jaw to listen")
 
     def says(self, payload: str | bytes, expected_m: float | None) -> None:
