@@ -104,7 +104,7 @@ def test_a_further_conclusion_is_urgent_only_while_no_cause_is_known():
         now_s = number / 60.0
         analysis.catch_up(now_s)
         frame = Frame(number, number, np.zeros((2, 2), np.uint8), None)
-        texts.append(analysis.ask(True, frame, lambda kept: None, np.eye(4), now_s).text)
+        texts.append(analysis.ask(True, False, frame, lambda kept: None, np.eye(4), now_s).text)
     known = [next(n for n, text in enumerate(texts) if text == each) for each in ("4", "5")]
     asked = np.array([1, 2]) * EVERY - 1  # of these frames the first conclusion that names a cause, and one more
     assert (known - asked).tolist() == [round(60.0 * RESULT_AFTER_S), round(60.0 * CONFIRMED_AFTER_S)]

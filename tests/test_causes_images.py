@@ -206,3 +206,14 @@ def test_a_report_that_is_only_roughly_known_is_named_when_it_is_wrong():
     named = {alert.cause for record in told for alert in record.alerts} - {Cause.UNKNOWN}
     assert named == {Cause.JAW_OPENING}
     assert not any(record.alerts for record in told[:24])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_knock_while_the_monitor_learns_what_is_normal_is_still_the_cameras(seed: int):
+    """Frames from before and after it, taken together, look like a bent finger, and like nothing else."""
+    knock = Tilt(start_s=9.5 / FPS, time_s=0.0, tcp_shift_m=(1e-3, 2e-4), translation_m=(-1e-3, 0.0, 2e-4))
+    scenario = Scenario(name="early", fps=FPS, duration_s=1.5, mount=(knock,))
+    scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, seed)
+    monitor = new_monitor()
+    told = [monitor.process(scene.frame(index)) for index in range(44)]
+    assert {alert.cause for record in told for alert in record.alerts} - {Cause.UNKNOWN} == {Cause.CAMERA_MOUNT}

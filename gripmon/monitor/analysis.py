@@ -69,6 +69,11 @@ class CauseAnalysis:
         self._forget()
         self._calm = calm
 
+    def knocked(self) -> None:
+        """The camera is elsewhere from the next frame on: what is normal isn't learnt of two places."""
+        if self._wants_baseline:
+            self._do(CauseJudge.knocked)
+
     def interrupted(self) -> None:
         """No frames came for long: someone may have exchanged the camera meanwhile, until all has been calm again."""
         self._do(lambda judge: judge.interrupted())
@@ -77,13 +82,14 @@ class CauseAnalysis:
     def ask(
         self,
         wrong: bool,
+        usual: bool,
         frame: Frame,
         gather: Callable[[Frame], EdgeEvidence],
         ref_cam_T_grip: Array,
         now_s: float,
     ) -> Explanation:
-        """What the frames before have shown; and one more in which something looks ``wrong`` or not, that of ``now_s``,
-        up to which :meth:`catch_up` has taken over what was due.
+        """What the frames before have shown; and one more in which something looks ``wrong``, or which may show what is
+        ``usual``, or neither, that of ``now_s``, up to which :meth:`catch_up` has taken over what was due.
 
         ``gather`` its evidence only if it is needed, from an image of its own: the caller may read the next one into
         the same memory.
@@ -100,7 +106,7 @@ class CauseAnalysis:
         else:
             if self._calm == CALM_FRAMES:
                 self._forget()
-            gathers, concludes = self._calm >= CALM_FRAMES and self._wants_baseline, False
+            gathers, concludes = usual and self._calm >= CALM_FRAMES and self._wants_baseline, False
         if not gathers:
             return known
         assert frame.image is not None

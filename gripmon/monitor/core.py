@@ -196,7 +196,7 @@ class Monitor:
         measurement = self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
         standing = self._trust.judge(frame, measurement, self._now_s)
         if standing is None:
-            explanation = self._explain(frame, measurement, wrong=True)
+            explanation = self._explain(frame, measurement, wrong=True, usual=False)
             return self._unmeasured(
                 frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation=explanation
             )
@@ -325,7 +325,10 @@ class Monitor:
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
         residual_px = self._tracker.edge_residuals_px(measurement)
         odd = self._watches.add(measurement.blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
-        explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
+        if self._standing.knocked:
+            self._analysis.knocked()
+        wrong = astray or motion.present or motion.suspicious or odd
+        explanation = self._explain(frame, measurement, wrong, usual=self._standing.believed)
         return Evidence(
             shift,
             sigma,
@@ -353,7 +356,7 @@ class Monitor:
                 self._watch.set_reference_covariance(self._covariance)
         return since_start
 
-    def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
+    def _explain(self, frame: Frame, measurement: Measurement, wrong: bool, usual: bool) -> Explanation:
         if self._stream.repeats:
             return self._analysis.known  # the image is an old one, what the robot reports is not
         here = self._ref_cam_T_grip
@@ -361,7 +364,7 @@ class Monitor:
         def gather(kept: Frame) -> EdgeEvidence:
             return self._tracker.evidence(kept, measurement, here)
 
-        return self._analysis.ask(wrong, frame, gather, here, self._now_s)
+        return self._analysis.ask(wrong, usual, frame, gather, here, self._now_s)
 
     def _drift(self) -> Drift:
         return drift_between(self._ref_cam_T_grip, self._cam_T_grip)

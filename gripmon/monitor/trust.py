@@ -236,7 +236,8 @@ class Integrity:
         if trust.most_probable is not None and not trust.proven and (trust.displaced or self._short(trust)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
-        moved = self._knocked(trust, self._beside_px(measurement, cam_T_grip))
+        beside_px = self._beside_px(measurement, cam_T_grip)
+        moved = self._knocked(trust, beside_px)
         if trust.proven and (moved or not trust.displaced):
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if frame.image is not None and not moved:
@@ -244,7 +245,7 @@ class Integrity:
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         at = measurement, cam_T_grip, covariance, trust.protection
-        return Standing(*at, believed, where_it_was, trust.grasped)
+        return Standing(*at, believed, where_it_was, trust.grasped, knocked=moved and beside_px >= ONE_EDGE_PX)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
         """Whether the mount was knocked, the edges showing ``beside_px`` from the old place: so rare that one lucky

@@ -117,6 +117,11 @@ class CauseJudge:
             self._well.append(evidence)
             self._baseline = None
 
+    def knocked(self) -> None:
+        """The camera is elsewhere from now on: frames from before and after a knock are no baseline together."""
+        if self.wants_baseline:
+            self._well, self._baseline = [], None
+
     def add(self, evidence: EdgeEvidence) -> None:
         """A frame in which something may be wrong, measured or not."""
         self._frames.append(evidence)
