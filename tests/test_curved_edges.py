@@ -27,7 +27,7 @@ from gripmon.model.records import Cause, Frame, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Bump, ObjectLook, Prop
-from gripmon.track.edges import FingerEnds, finger_of_ends
+from gripmon.track.edges import FingerEnds
 from gripmon.track.edges.prediction import SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import EdgeSettings, profile_offsets_px
 
@@ -202,8 +202,8 @@ def test_a_corner_is_where_straight_edges_meet():
 
 def test_fingers_end_where_their_sides_turn_into_curves():
     model, _ = rounded(0.004)
-    assert finger_of_ends(model)[:4].tolist() == [0, 0, 1, 1]
     ends = FingerEnds(model, EdgeSettings())
+    assert ends.finger[:4].tolist() == [0, 0, 1, 1]
     assert [model.edge_ids[e] for e in np.flatnonzero(~ends.along)] == ["left_tip", "right_tip"]
 
 

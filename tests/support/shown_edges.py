@@ -52,14 +52,13 @@ class Shown:
         outliers: int = 0,
         blur_px: float = 0.7,
         hidden: tuple[str, ...] = (),
-        endless: tuple[str, ...] = (),
         noise: float = 0.004,
         brightest: float = 0.7,
         steepest: float = 0.3,
         grey: float = 0.4,
     ) -> EdgeEvidence:
         """``bent``: 4x4 motion of a finger's points in the gripper frame; ``camera``: the one that really looks;
-        ``outliers``: so many pieces are off by up to 5 px; ``endless``: fingers whose ends something hides.
+        ``outliers``: so many pieces are off by up to 5 px.
         """
         gripper, reference = self.gripper, self.reference
         pose = reference if cam_T_grip is None else cam_T_grip
@@ -81,8 +80,6 @@ class Shown:
                 fraction.append(f)
                 uv.append(0.5 * (ends[0] + ends[1]))
                 across.append([-along[1], along[0]])
-        corner_finger = gripper.point_finger[gripper.corner_points]
-        ending = ~np.isin(corner_finger, [gripper.finger_ids.index(name) for name in (*hidden, *endless)])
         off_px = self.rng.normal(0.0, sigma_px, len(edge))
         wrong = self.rng.permutation(len(edge))[:outliers]
         off_px[wrong] += self.rng.uniform(-5.0, 5.0, len(wrong))
@@ -102,8 +99,6 @@ class Shown:
             blur_px2=np.full(len(edge), blur_px**2),
             across=across_px,
             finger_share=np.array([0.05 if name in hidden else 0.8 for name in gripper.finger_ids]),
-            ends=ending,
-            ends_in_view=np.ones(len(ending), dtype=bool),
             noise=noise,
             brightest=brightest,
             steepest=steepest,

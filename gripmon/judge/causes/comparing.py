@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gripmon.judge.causes.models import Errors, Knowledge, Suspect, Weighed, suspects, weigh
+from gripmon.judge.causes.models import Errors, Knowledge, Suspect, Weighed, something_else, suspects, weigh
 from gripmon.judge.causes.pooling import Baseline, Pooled
 from gripmon.judge.causes.state import EdgeView, State
-from gripmon.judge.drift.kinds import SIGNIFICANT_SIGMAS
 from gripmon.judge.recalibrate.edges import STRETCH_PX
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
@@ -64,15 +62,13 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """``log`` evidence of each model with its prior, how each fits, by how much the blur has changed (None: it can't be
-    told), and ``elsewhere`` (f,): share of each finger's pieces that stand where the finger is if it is bent, and not
-    where it was.
+    """``log`` evidence of each model with its prior, how each fits, and by how much the blur has changed; None where it
+    can't be told.
     """
 
     log: Mapping[Key, float]
     fits: Mapping[Key, Weighed]
     blur_change_px: float | None
-    elsewhere: Array
 
 
 def compare(
@@ -106,9 +102,8 @@ def compare(
     models = suspects(gripper, float(ref_cam_T_grip[2, 3]), known, interrupted)
     view = EdgeView(camera, gripper, evidence)
 
-    def fitted(suspect: Suspect) -> Weighed:
+    def fitted(suspect: Suspect, errors: Errors) -> Weighed:
         pose = evidence.cam_T_grip if suspect.cause in FOLLOWED else start.cam_T_grip
-        errors = Errors(bias_px, sigma_px, spread_px, edge)
         firsts = [replace(start, cam_T_grip=pose, jaw_opening_m=opening) for opening in openings_m]
         fits = [weigh(view, gripper, suspect.model, start, first, errors) for first in firsts]
         return max(fits, key=lambda fit: fit.log_evidence)
@@ -117,11 +112,13 @@ def compare(
     if baseline is not None and not reported and gripper.has_jaw:
         # What was seen of an opening that no one reports may be as wrong as the fingers are.
         openings_m.append(baseline.jaw_opening_m)
+    errors = Errors(bias_px, sigma_px, spread_px, np.unique(evidence.edge, return_inverse=True)[1])
     # What even the freest model doesn't explain all pieces share as an error.
-    edge = np.unique(evidence.edge, return_inverse=True)[1]
-    alone_px = np.hypot(sigma_px, spread_px)
-    sigma_px = np.hypot(sigma_px, _shared_px(fitted(models[-1]).residual_px, sigma_px))
-    fits = {(suspect.cause, suspect.part): fitted(suspect) for suspect in models}
+    shared_px = _shared_px(fitted(models[-1], errors).residual_px, sigma_px)
+    errors = replace(errors, sigma_px=np.hypot(sigma_px, shared_px))
+    borders = something_else(view.residual(start)[0] - bias_px, evidence.fraction, errors, evidence.reach_px)
+    errors = replace(errors, something_else=borders)
+    fits = {(suspect.cause, suspect.part): fitted(suspect, errors) for suspect in models}
     log = {(s.cause, s.part): fits[s.cause, s.part].log_evidence + math.log(s.prior) for s in models}
     change_px = _blur_change_px(pooled, baseline)
     if change_px is not None:
@@ -135,8 +132,7 @@ def compare(
             log[cause, part] += math.log(
                 STRAY_PROBABILITY if part is not None and part not in pooled.absent else chance
             )
-    finger = gripper.edge_finger[evidence.edge]
-    return Comparison(log, fits, change_px, _elsewhere(fits, alone_px, finger, len(gripper.finger_ids)))
+    return Comparison(log, fits, change_px)
 
 
 def _knowledge(
@@ -164,17 +160,6 @@ def _shared_px(residual_px: Array, sigma_px: Array) -> float:
     """
     excess = float(np.median(residual_px**2 / sigma_px**2)) / (0.6745**2 * 0.5) - 1.0
     return math.sqrt(max(excess, 0.0) * float(np.median(sigma_px**2)))
-
-
-def _elsewhere(fits: Mapping[Key, Weighed], sigma_px: Array, finger: NDArray[np.intp], fingers: int) -> Array:
-    """See :class:`Comparison`; ``sigma_px`` (s,) of the pieces by themselves, ``finger`` (s,) of each."""
-    shares = np.zeros(fingers)
-    stands = {key: np.abs(fit.residual_px) <= SIGNIFICANT_SIGMAS * sigma_px for key, fit in fits.items()}
-    for part in range(fingers):
-        own = finger == part
-        if (Cause.FINGER_BENT, part) in stands and own.any():
-            shares[part] = (stands[Cause.FINGER_BENT, part] & ~stands[None, None])[own].mean()
-    return shares
 
 
 def _blur_change_px(pooled: Pooled, baseline: Baseline | None) -> float | None:

@@ -13,7 +13,6 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.models import Weighed
@@ -22,8 +21,7 @@ from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.judge.causes.watches import LEARNT
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
-from gripmon.track.edges import finger_of_ends
+from gripmon.model.records import Array, Cause, CauseWeight, EdgeEvidence, Explanation
 from gripmon.track.edges.evidence import FINGER_SEEN_SHARE
 
 FEWEST_PIECES = 4
@@ -51,10 +49,8 @@ by how much its cells may have wandered before, and may differ now, parts of the
 that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
 """
 
-FINGER_GONE_SHARE = 2.0 / 3.0
-"""Share of the pieces of a finger's edges beyond which it has gone elsewhere, though its ends aren't seen: its outline
-has two sides and a tip, and a thing before one corner of it shows borders of its own for two of these.
-"""
+MOST_EDGES = 0.5
+"""Part of the seen edges beyond which a cause has to explain them to be named: the others belong to something else."""
 
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -158,8 +154,8 @@ class CauseJudge:
         total = sum(math.exp(value - top) for value in comparison.log.values())
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
-        unseen = _not_seen_elsewhere(pooled, baseline, comparison, self._gripper)
-        for key in [key for key in shares if _ill_founded(key, pooled, unseen)]:
+        of_few = _of_few_edges(max(shares, key=lambda key: shares[key]), comparison)
+        for key in [key for key in shares if key == of_few or _ill_founded(key, pooled)]:
             if shares[key] >= self._settings.probable:
                 text = f"too little of the fingers is seen to tell what moved; what is seen would fit if {text}"
             shares[Cause.UNKNOWN, None] += shares.pop(key)
@@ -218,35 +214,23 @@ def _unsharp(pooled: Pooled, baseline: Baseline) -> bool:
     return bool((np.abs(pooled.cells - baseline.cells)[steady] < ALIKE).mean() >= MOSTLY)
 
 
-def _not_seen_elsewhere(
-    pooled: Pooled, baseline: Baseline | None, comparison: Comparison, gripper: Gripper
-) -> NDArray[np.bool_]:
-    """(f,) fingers of which something else may hide a part, as far as one can see.
-
-    A finger that is bent is seen elsewhere: it shows its ends there, or most of its edges have left their place for
-    one that the finger as a whole can have.  One that a bar, a box or a hand hides shows a border or two of that beside
-    its own edges, which stay where they were, and the border goes on beyond its end.  What was never seen as an end,
-    before clutter or because the fingertips are round, can't be missed.
-    """
-    expected = pooled.ends_in_view if baseline is None else pooled.ends_in_view & baseline.ends
-    finger, fingers = finger_of_ends(gripper), len(gripper.finger_ids)
-    wanted = np.bincount(finger[expected], minlength=fingers)
-    endless = np.bincount(finger[pooled.ends], minlength=fingers) < np.minimum(wanted, END_CORNERS)
-    return np.asarray(endless & (comparison.elsewhere <= FINGER_GONE_SHARE))
-
-
-def _ill_founded(key: Key, pooled: Pooled, unseen: NDArray[np.bool_]) -> bool:
-    """Whether a cause is told from fingers that most of their own profiles contradict, or is about one that is
-    ``unseen`` (f,) where it would be then.
+def _ill_founded(key: Key, pooled: Pooled) -> bool:
+    """Whether a cause is told from fingers that most of their own profiles contradict.
 
     A finger that isn't seen at all is weighed as such.  Of an opening and of the lens two fingers have to tell: what
     one does may as well be its own.
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
-        return part not in pooled.absent and (not pooled.share[part] >= FINGER_SEEN_SHARE or bool(unseen[part]))
+        return part not in pooled.absent and not pooled.share[part] >= FINGER_SEEN_SHARE
     several = min(len(pooled.share), 2)
     return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_SEEN_SHARE).sum()) < several
+
+
+def _of_few_edges(key: Key, comparison: Comparison) -> Key | None:
+    """The best cause if it says where the edges stand, but most of them don't."""
+    says_where = key[0] not in (Cause.UNKNOWN, Cause.VIEW_BLOCKED)
+    return key if says_where and (comparison.fits[key].own > 0.5).mean() <= MOST_EDGES else None
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

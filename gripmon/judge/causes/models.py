@@ -5,8 +5,9 @@ the reported opening), and what it frees has a normal prior of a size that is it
 from the smallest worth telling to the largest believed.  A model with more freedom spreads its prior over more that
 could have been seen, and so pays for what it doesn't need (MacKay 1992, "Bayesian interpolation").
 
-Pieces of edges, and whole edges, err with Student's distribution: one that was mistaken costs every model the same few
-nats, and must not be worth a motion that bends itself around it (Lange, Little and Taylor 1989).
+Pieces of edges, and whole edges, err with Student's distribution (Lange, Little and Taylor 1989), and an edge may as
+well belong to something else, a border anywhere within the profiles' reach: one that was mistaken costs every model the
+same, and must not be worth a motion that bends itself around it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ _MOUNT, _FINGER, _JAW, _RARE = 0.3, 0.25, 0.15, 0.1
 """Probabilities beforehand, given that something looks wrong: of a mount that moved, or another camera after a pause;
 of a bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
 """
+
+
+WRONG_EDGE = 0.1
+"""Probability that an edge belongs to something else, given that something looks wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +110,12 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
 STUDENT_FREEDOM = 3.0
 """Degrees of freedom of Student's distribution of the errors."""
 
+_STUDENT_HEIGHT = math.gamma(2.0) / (math.gamma(1.5) * math.sqrt(math.pi * STUDENT_FREEDOM))
+"""Density of an error of zero, for a scale of one."""
+
+LEAST_SHARE = 1e-9
+"""Of an edge's weight, so that an edge that belongs to something else still has an offset."""
+
 _COARSE_PX = 1.0
 _COARSE_ROUNDS, _FINE_ROUNDS = 3, 8
 _CONVERGED_PX = 2e-3
@@ -130,12 +141,15 @@ class Model:
 class Errors:
     """Of the pieces (s,) of edges: what they showed beyond the model when all was well, their scale ``sigma_px``, and
     the scale ``spread_px`` of what a whole edge is off by; ``edge`` (s,) numbers the edges from 0 to k - 1.
+    ``something_else`` (k,): log probability of what each edge shows if it belongs to something else, up to the constant
+    that all models share (see :func:`something_else`); None where none may.
     """
 
     bias_px: Array
     sigma_px: Array
     spread_px: Array
     edge: NDArray[np.intp]
+    something_else: Array | None = None
 
     @property
     def edges(self) -> int:
@@ -152,13 +166,15 @@ class Errors:
 @dataclass(frozen=True, slots=True)
 class Weighed:
     """``log_evidence`` up to a constant that all models of a frame share; the state that fits best, how far it is
-    from the model's start (m,), and the residual (s,) in px that it leaves.
+    from the model's start (m,), and the residual (s,) in px that it leaves; ``own`` (k,): probability of each edge that
+    it is that edge, not something else.
     """
 
     log_evidence: float
     state: State
     motion: Array
     residual_px: Array
+    own: Array
 
 
 def weigh(view: EdgeView, gripper: Gripper, model: Model, start: State, first: State, errors: Errors) -> Weighed:
@@ -173,6 +189,9 @@ def weigh(view: EdgeView, gripper: Gripper, model: Model, start: State, first: S
         residual, motion = residual - errors.bias_px, state.since(start)
         coarse_px = _COARSE_PX if round_ < _COARSE_ROUNDS else 0.0
         weight, spread_weight = _weights(residual, off_px, errors, spread_px, coarse_px)
+        if coarse_px == 0.0:
+            own = _of_edges(residual, off_px, errors)[1]
+            weight, spread_weight = weight * own[errors.edge], spread_weight * own
         design = np.hstack([jacobian[:, free], belongs])
         at = np.concatenate([motion[free], off_px])
         precision = np.concatenate([largest[free], spread_weight])
@@ -188,11 +207,12 @@ def weigh(view: EdgeView, gripper: Gripper, model: Model, start: State, first: S
     residual, jacobian = view.residual(state)
     residual, motion = residual - errors.bias_px, state.since(start)
     weight, spread_weight = _weights(residual, off_px, errors, spread_px, 0.0)
+    logs, own = _of_edges(residual, off_px, errors)
+    weight, spread_weight = weight * own[errors.edge], spread_weight * own
     priors = np.array([model.precision(size)[free] for size in (model.sizes.tolist() or [0.0])])
     design = np.hstack([jacobian[:, free], belongs])
-    fit = _student(residual - off_px[errors.edge], errors.sigma_px) + _student(off_px, spread_px)
-    log = fit + _volume(design, weight, spread_weight, motion[free], priors)
-    return Weighed(float(np.logaddexp.reduce(log)) - math.log(len(log)), state, motion, residual)
+    log = logs.sum() + _volume(design, weight, spread_weight, motion[free], priors)
+    return Weighed(float(np.logaddexp.reduce(log)) - math.log(len(log)), state, motion, residual, own)
 
 
 def _weights(residual: Array, off_px: Array, errors: Errors, spread_px: Array, coarse_px: float) -> tuple[Array, Array]:
@@ -204,9 +224,46 @@ def _weights(residual: Array, off_px: Array, errors: Errors, spread_px: Array, c
     return weight, (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * spread_px**2 + off_px**2)
 
 
-def _student(error: Array, scale: Array) -> float:
+def _student(error: Array, scale: Array) -> Array:
     """Log of the density over that of an error of zero."""
-    return -0.5 * (STUDENT_FREEDOM + 1.0) * float(np.log1p((error / scale) ** 2 / STUDENT_FREEDOM).sum())
+    return np.asarray(-0.5 * (STUDENT_FREEDOM + 1.0) * np.log1p((error / scale) ** 2 / STUDENT_FREEDOM))
+
+
+def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[Array, Array]:
+    """(k,) log probability of what each edge shows, and (k,) that it is the edge, not something else."""
+    pieces = _student(residual - off_px[errors.edge], errors.sigma_px)
+    own = np.bincount(errors.edge, pieces, errors.edges) + _student(off_px, errors.of_edge_px)
+    if errors.something_else is None:
+        return own, np.ones(len(own))
+    own += math.log1p(-WRONG_EDGE)
+    both = np.logaddexp(own, errors.something_else)
+    return both, np.maximum(np.exp(own - both), LEAST_SHARE)
+
+
+def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: float) -> Array:
+    """(k,) see :class:`Errors`: a straight border whose distance from each end of the edge is anything up to
+    ``reach_px``; ``residual`` (s,) of any model, which differs from others by a line, ``fraction`` (s,) along the edge.
+    """
+    out = np.zeros(errors.edges)
+    weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.sigma_px**2)
+    spread_weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.of_edge_px**2)
+    for k in range(errors.edges):
+        at = np.flatnonzero(errors.edge == k)
+        first, last = fraction[at].min(), fraction[at].max()
+        ends = np.ones((len(at), 1))
+        if last > first:
+            along = (fraction[at] - first) / (last - first)
+            ends = np.column_stack([1.0 - along, along])
+        information = (ends.T * weight[at]) @ ends
+        border = ends @ np.linalg.solve(information, ends.T @ (weight[at] * residual[at]))
+        # Volumes of what agrees: of the border's ends within the reach, of the edge's own offset within its spread.
+        may_be = 0.5 * np.log(2.0 * math.pi) * len(information) - 0.5 * np.linalg.slogdet(information)[1]
+        may_be -= len(information) * math.log(2.0 * reach_px)
+        is_own = math.log(_STUDENT_HEIGHT / errors.of_edge_px[k]) + 0.5 * math.log(2.0 * math.pi)
+        is_own -= 0.5 * math.log(weight[at].sum() + spread_weight[k])
+        fit = float(_student(residual[at] - border, errors.sigma_px[at]).sum())
+        out[k] = math.log(WRONG_EDGE) + fit + may_be - is_own
+    return out
 
 
 def _volume(design: Array, weight: Array, spread_weight: Array, motion: Array, priors: Array) -> Array:

@@ -23,7 +23,7 @@ EDGE_PIECES = 5
 """Pieces that an edge is divided into."""
 
 SEEN_FRAME_SHARE = 1.0 / 3.0
-"""Part of the frames in which a piece has to be seen, or an end, and which have to show so much of a finger."""
+"""Part of the frames in which a piece has to be seen, and which have to show so much of a finger."""
 
 TEXTURE_SIGMA_SHARE = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
@@ -36,18 +36,15 @@ FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
 class Pooled:
     """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
     edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
-    finger's own place in enough of the frames, NaN where it isn't in view; ``ends`` (p,) places seen there as ends of
-    their finger in enough of the frames, and ``ends_in_view`` (p,) those that might be; ``blur_px2``: of the lens, None
-    where it can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander``
-    (12, 16) of the cells from frame to frame; ``frames`` that it was made of.
+    finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where it
+    can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
+    of the cells from frame to frame; ``frames`` that it was made of.
     """
 
     evidence: EdgeEvidence
     piece: NDArray[np.intp]
     absent: tuple[int, ...]
     share: Array
-    ends: NDArray[np.bool_]
-    ends_in_view: NDArray[np.bool_]
     blur_px2: float | None
     noise: float
     brightest: float
@@ -84,7 +81,6 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     absences = [absent_fingers(frame, gripper) for frame in frames]
     often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
     share = _share(frames)
-    ends, ends_in_view = _often([f.ends for f in frames]), _often([f.ends_in_view for f in frames])
     noise = float(np.median([frame.noise for frame in frames]))
     brightest = float(np.median([frame.brightest for frame in frames]))
     steepest = float(np.median([frame.steepest for frame in frames]))
@@ -92,7 +88,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     image = noise, brightest, steepest, np.median(cells, axis=0), np.ptp(cells, axis=0)
     if not places:
         nothing = _only(midst, np.zeros(len(midst.edge), dtype=bool))
-        return Pooled(nothing, np.zeros(0, np.intp), often, share, ends, ends_in_view, None, *image, len(frames))
+        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, *image, len(frames))
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -125,7 +121,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         across=other[:, 3:],
     )
     blur_px2 = isotropic_blur_px2(evidence)
-    return Pooled(evidence, numbers, often, share, ends, ends_in_view, blur_px2, *image, len(frames))
+    return Pooled(evidence, numbers, often, share, blur_px2, *image, len(frames))
 
 
 def _share(frames: Sequence[EdgeEvidence]) -> Array:
@@ -133,11 +129,6 @@ def _share(frames: Sequence[EdgeEvidence]) -> Array:
     shares = np.sort(np.nan_to_num([frame.finger_share for frame in frames], nan=-1.0), axis=0)
     reached = shares[-math.ceil(SEEN_FRAME_SHARE * len(frames))]
     return np.where(reached >= 0.0, reached, np.nan)
-
-
-def _often(flags: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """(p,) what holds in as many of the frames as a piece has to be seen in."""
-    return np.asarray(np.mean(flags, axis=0) >= SEEN_FRAME_SHARE)
 
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
@@ -201,7 +192,7 @@ def _only(evidence: EdgeEvidence, kept: NDArray[np.bool_]) -> EdgeEvidence:
 class Baseline:
     """``motion`` (m,) of the unknowns from the reference; ``bias_px`` of each piece of an edge beyond that, and
     ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then;
-    ``ends``, blur, noise, ``steepest``, ``cells`` and ``wander`` as in :class:`Pooled`.
+    blur, noise, ``steepest``, ``cells`` and ``wander`` as in :class:`Pooled`.
     """
 
     motion: Array
@@ -209,7 +200,6 @@ class Baseline:
     sigma_px: Array
     jaw_reported_m: float | None
     jaw_opening_m: float
-    ends: NDArray[np.bool_]
     blur_px2: float | None
     noise: float
     steepest: float
@@ -221,7 +211,7 @@ class Baseline:
         bias_px, sigma_px = np.full(edges * EDGE_PIECES, np.nan), np.full(edges * EDGE_PIECES, np.nan)
         bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
         then = pooled.evidence
-        image = pooled.ends, pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
+        image = pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
         return cls(motion, bias_px, sigma_px, then.jaw_reported_m, then.jaw_opening_m, *image)
 
     def start(self, state: State, reported: bool, gripper: Gripper) -> State:

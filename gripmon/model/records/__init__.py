@@ -25,7 +25,7 @@ from gripmon.model.records.commands import (
     SnapshotImage,
     accepting,
 )
-from gripmon.model.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
+from gripmon.model.records.evidence import EdgeEvidence, EdgeSums
 from gripmon.model.records.frames import (
     CornerFault,
     CornerRecord,
@@ -60,7 +60,6 @@ from gripmon.model.records.values import (
 )
 
 __all__ = [
-    "END_CORNERS",
     "MESSAGES",
     "NOTHING_WRONG",
     "Alert",

@@ -12,10 +12,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-END_CORNERS = 2
-"""Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
-
-
 @dataclass(frozen=True, slots=True)
 class EdgeEvidence:
     """Stretches of the fingers' edges (s of them) as each finger's own best rigid motion finds them; f fingers.
@@ -29,11 +25,10 @@ class EdgeEvidence:
     and ``across`` (s, 2) that direction in the image.
 
     ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where
-    none was sampled; of the places at which fingers may end, the gripper's corners first, ``ends`` (p,) those that
-    are seen there as such, with nothing that goes on beyond them, and ``ends_in_view`` (p,) those that might be.
-    ``reach_px``: how far from the measured pose edges were looked for at first. Of the image, as parts of the full
-    scale: ``noise`` of a pixel; ``brightest``: what only one pixel in a hundred exceeds; ``steepest``: what only
-    one difference of neighbours in a thousand exceeds; ``cells`` (12, 16): the grey levels of its parts.
+    none was sampled.  ``reach_px``: how far from the measured pose edges were looked for at first.  Of the image, as
+    parts of the full scale: ``noise`` of a pixel; ``brightest``: what only one pixel in a hundred exceeds;
+    ``steepest``: what only one difference of neighbours in a thousand exceeds; ``cells`` (12, 16): the grey levels of
+    its parts.
     """
 
     cam_T_grip: Array
@@ -48,8 +43,6 @@ class EdgeEvidence:
     blur_px2: Array
     across: Array
     finger_share: Array
-    ends: NDArray[np.bool_]
-    ends_in_view: NDArray[np.bool_]
     noise: float
     brightest: float
     steepest: float

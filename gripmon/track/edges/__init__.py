@@ -4,7 +4,6 @@ from gripmon.track.edges.ends import (
     FingerEnds,
     FingerEndsSeen,
     edges_at_ends,
-    finger_of_ends,
     has_lone_end,
     inner_edges,
 )
@@ -38,7 +37,6 @@ __all__ = [
     "agreeing_fingers",
     "edge_sums",
     "edges_at_ends",
-    "finger_of_ends",
     "has_lone_end",
     "inner_edges",
     "prior_information",

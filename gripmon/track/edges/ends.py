@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import END_CORNERS, Array, Image
+from gripmon.model.records import Array, Image
 from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settling import Measurement
+
+END_CORNERS = 2
+"""Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
 
 PARALLEL_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""
@@ -153,12 +156,6 @@ class _Places:
         rows += [(point, True, -1, -1, -1, number) for number, point in enumerate(roundings.tolist())]
         columns = np.array(rows, dtype=np.intp).reshape(-1, 6).T
         return cls(columns[0], gripper.point_finger[columns[0]], columns[1] > 0, *columns[2:])
-
-
-@lru_cache(maxsize=8)
-def finger_of_ends(gripper: Gripper) -> NDArray[np.intp]:
-    """(s,) the finger of each place at which one may end: corners, where sides turn into curves, roundings."""
-    return FingerEnds(gripper, EdgeSettings()).finger
 
 
 def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import cv2
@@ -21,8 +20,6 @@ from gripmon.model.compiled import compiled
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
-from gripmon.track.edges.ends import FingerEnds
-from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.prediction import FEWEST_SAMPLES
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
@@ -61,10 +58,6 @@ class _Place(NamedTuple):
 class FingerMeter(Settler):
     """Looks at the fingers one by one, in a frame that was measured."""
 
-    @cached_property
-    def _ends(self) -> FingerEnds:
-        return FingerEnds(self._gripper, self._settings.edges)
-
     def evidence(
         self, image: Image, measurement: Measurement, *elsewhere: Array, jaw_reported: bool = True
     ) -> EdgeEvidence:
@@ -82,7 +75,6 @@ class FingerMeter(Settler):
             for finger in range(len(self._gripper.finger_ids))
         ]
         found = [place for place in places if place is not None]
-        ends, ends_in_view = self._ends_at(image, measurement, places)
         kernel_px = self._settings.edges.blur_px
         stretches = [_Stretches.of(place, kernel_px) for place in found]
         zoom = measurement.candidates.zoom
@@ -95,8 +87,6 @@ class FingerMeter(Settler):
                 for name, empty in _EMPTY._asdict().items()
             },
             finger_share=np.array([np.nan if place is None else place.share for place in places]),
-            ends=ends,
-            ends_in_view=ends_in_view,
             noise=measurement.candidates.noise / measurement.candidates.full_scale,
             brightest=_brightest(image) / measurement.candidates.full_scale,
             steepest=_steepest(image) / measurement.candidates.full_scale,
@@ -150,41 +140,6 @@ class FingerMeter(Settler):
         with self._zoomed(present):
             edgels = self._look(image, self._predict(self._lay_out(there), there))
             return self._best(edgels, finger, [start])
-
-    def _ends_at(
-        self, image: Image, measurement: Measurement, places: list[_Place | None]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(s,) places at the fingers' ends that are seen as such where its own one of ``places`` has the finger, and
-        (s,) those that might be.
-        """
-        seen, in_view = np.zeros((2, len(self._ends.finger)), dtype=bool)
-        for finger, place in enumerate(places):
-            if place is None:
-                continue
-            own = self._ends.finger == finger
-            there = self._measured_at(image, measurement, place, finger)
-            in_view |= own & self._ends.in_view(there.prediction)
-            seen |= own & self._ends.at_places(image, there)
-        return seen, in_view
-
-    def _measured_at(self, image: Image, measurement: Measurement, place: _Place, finger: int) -> Measurement:
-        """The measurement as if the gripper were where a finger shows, with the corners of that finger alone.
-
-        A corner is looked for beside where it is predicted: farther off it is predicted, and its edges are seen, again.
-        """
-        prediction, xi = place.edgels.prediction, place.fit.xi
-        if prediction.moved_px(xi) > self._settings.relinearise_px:
-            opening_m = measurement.jaw_opening_m
-            there = self._moved(prediction, xi, Expected(prediction.cam_T_grip, opening_m, opening_m))
-            prediction = self._predict(self._lay_out(there), there)
-            again = self._best(self._look(image, prediction), finger, [np.zeros(len(self._prior))])
-            place = place if again is None else again
-        edgels, fit = place.edgels, place.fit
-        geometry = CornerGeometry.of(self._gripper, edgels.prediction, self._settings.corners)
-        corners = intersect_edges(edgels, fit, fit.weight, geometry, self._settings.corners)
-        return replace(
-            measurement, prediction=edgels.prediction, candidates=edgels.candidates, consensus=fit, corners=corners
-        )
 
     @contextmanager
     def _zoomed(self, zoom: int) -> Iterator[None]:

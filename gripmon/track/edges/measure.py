@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.ends import FingerEndsSeen, edges_at_ends
+from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
 from gripmon.track.edges.evidence import FingerMeter
 from gripmon.track.edges.look import unevenness
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
@@ -96,6 +96,10 @@ class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
 
     _lost = 0  # frames in a row in which it wasn't seen there
+
+    @cached_property
+    def _ends(self) -> FingerEnds:
+        return FingerEnds(self._gripper, self._settings.edges)
 
     @property
     def finger_axis(self) -> Array:
