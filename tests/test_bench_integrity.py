@@ -22,7 +22,7 @@ def line(**columns: Any) -> dict[str, Any]:
         "asked": n,
         "limit_m": 5e-4,
         "limit_rad": 0.02,
-        "camera_alerts": [],
+        "false_alerts": [],
         "seconds": 1.0,
         "view": [0] * n,
         "enough": [True] * n,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.integrity_draft import Changes, Condition, Draft, with_
+from gripmon.model.records import Cause
 from gripmon.simulate.scenario import (
     BentFinger,
     Bump,
@@ -222,12 +223,16 @@ def worn(draft: Draft) -> Changes:
     return {"fingers": with_(draft.fingers, shape=FingerShape(wear_m=draft.uniform(1e-4, 3e-4), worn_finger=finger))}
 
 
+MOVED, BENT = (Cause.CAMERA_MOUNT,), (Cause.FINGER_BENT,)
+OTHER = (*BENT, Cause.JAW_OPENING)
+"""Of fingers that aren't as the model has them."""
+
 ORDINARY: tuple[Condition, ...] = (
     Condition("ordinary", "some clutter moves, usual noise", ordinary),
     Condition("clutter", "boxes, cables, print, chequers move", clutter),
     Condition("clutter still", "the same, standing still", clutter_still),
     Condition("light", "steps of the light, a soft shadow", light),
-    Condition("blur", "Gaussian blur of 0.7 to 2.5 px added", blur),
+    Condition("blur", "Gaussian blur of 0.7 to 2.5 px added", blur, wrong=(Cause.LENS,)),
     Condition("noise", "read noise 3 to 6 DN, strong shot noise", noise),
     Condition("flicker", "light flickers by 20 to 40 %", flicker),
     Condition("jpeg", "quality 55 to 85", jpeg),
@@ -236,15 +241,17 @@ ORDINARY: tuple[Condition, ...] = (
     Condition("hand", "a hand passes, up to all of the view", hand),
     Condition("sheet", "a printed sheet passes, up to all of the view", sheet),
     Condition("covered run", "some frames show nothing of the gripper", covered_run),
-    Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, moves=True, inside=False),
+    Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, wrong=MOVED, inside=False),
     Condition("flash", "far too bright, or dark, for some frames", flash),
     Condition("low contrast", "fingers and table of nearly the same grey", low_contrast, enough=False),
-    Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, moves=True),
-    Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, moves=True, inside=False),
-    Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False),
-    Condition("crash", "the mount jumps and bends a finger", crash, enough=False, moves=True, inside=False),
-    Condition("opening wrong", "report off by 0.3 to 2 mm", opening_wrong, enough=False),
-    Condition("model off", "tips 0.1 to 0.3 mm other than the model", ordinary, enough=False, truth=mismeasured),
-    Condition("tips worn", "tips 0.1 to 0.3 mm shorter than the model", worn, enough=False),
-    Condition("tips rounded", "facets of 0.2 to 0.6 mm on the tips' edges", rounded, enough=False),
+    Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, wrong=MOVED),
+    Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, wrong=MOVED, inside=False),
+    Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False, wrong=BENT),
+    Condition("crash", "the mount jumps and bends a finger", crash, enough=False, wrong=(*MOVED, *BENT), inside=False),
+    Condition("opening wrong", "report off by 0.3 to 2 mm", opening_wrong, enough=False, wrong=(Cause.JAW_OPENING,)),
+    Condition(
+        "model off", "tips 0.1 to 0.3 mm other than the model", ordinary, enough=False, wrong=OTHER, truth=mismeasured
+    ),
+    Condition("tips worn", "tips 0.1 to 0.3 mm shorter than the model", worn, enough=False, wrong=OTHER),
+    Condition("tips rounded", "facets of 0.2 to 0.6 mm on the tips' edges", rounded, enough=False, wrong=OTHER),
 )

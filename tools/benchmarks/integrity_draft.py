@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array
+from gripmon.model.records import Array, Cause
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 
 Changes = dict[str, Any]
@@ -89,8 +89,8 @@ class Fingers(Enum):
 class Condition:
     """A kind of scene.
 
-    ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``moves``:
-    the mount moves, so that an alert which says so is true; ``inside``: a scene may begin in the midst of it;
+    ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``wrong``:
+    what is wrong, so that an alert which names it is true; ``inside``: a scene may begin in the midst of it;
     ``truth``: what the true gripper is instead of the one that the monitor knows; ``fingers``: of which grippers.
     """
 
@@ -98,7 +98,7 @@ class Condition:
     what: str
     changes: Callable[[Draft], Changes]
     enough: bool = True
-    moves: bool = False
+    wrong: tuple[Cause, ...] = ()
     inside: bool = True
     truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
     fingers: Fingers = Fingers.USUAL

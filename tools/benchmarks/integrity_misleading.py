@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.integrity_conditions import ORDINARY, bump
+from benchmarks.integrity_conditions import MOVED, ORDINARY, bump
 from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, both, with_
 from gripmon.simulate.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
 
@@ -230,15 +230,15 @@ MISLEADING: tuple[Condition, ...] = (
     Condition("cables", "cables before the fingers", cables),
     Condition("misleading run", "some frames show other lines, then the view is free", misleading_run),
     Condition("shadow lines", "sharp shadows parallel to the tips", shadow_lines),
-    Condition("bump in grasp", "the mount jumps while an object is held", both(grasp, bump), moves=True, inside=False),
+    Condition("bump in grasp", "the mount jumps while an object is held", both(grasp, bump), wrong=MOVED, inside=False),
     Condition(
         "bump, tips hidden",
         "the mount jumps while the tips are hidden",
         both(_together(rim_over_tips, big_grasp, box_over_one), bump),
-        moves=True,
+        wrong=MOVED,
         inside=False,
     ),
-    Condition("bump at rim", "the mount jumps beside a bar", both(rim_beside, bump), moves=True, inside=False),
+    Condition("bump at rim", "the mount jumps beside a bar", both(rim_beside, bump), wrong=MOVED, inside=False),
 )
 _WITH = {
     Fingers.ROUND_TIPS: (
