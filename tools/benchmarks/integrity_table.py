@@ -40,7 +40,7 @@ one tip is hidden, and where both are; without conditions in which the gripper i
 after a jump or after the view became free
 PL µm, error µm: medians of valid frames; NEES: mean of valid frames
 back: valid within 3 frames after the view is free again; latest: the most frames that it took
-alerts: new ones that name what isn't wrong: the camera's mount, another camera, a finger, the opening or the lens""".splitlines()
+alerts: new ones that name what isn't wrong: the mount, another camera, a finger, the opening, the lens""".splitlines()
 )
 
 _POSSIBLE = (
