@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, Severity
+
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
@@ -60,6 +62,26 @@ def test_misleading_frames_are_counted_by_kind():
     assert (out["lies"], out["unbounded"], out["suspect_unbounded"], out["misleading_scenes"]) == (1, 3, 1, 1)
     found = worst(lines)
     assert (found[0]["scene"], found[0]["frame"], found[0]["misleading"]) == (0, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cause", "event", "wrong", "false"),
+    [
+        (AlertKind.STEP, Cause.CAMERA_MOUNT, AlertEvent.RAISED, (), True),
+        (AlertKind.STEP, Cause.CAMERA_MOUNT, AlertEvent.RAISED, (Cause.CAMERA_MOUNT,), False),
+        (AlertKind.VIBRATION, Cause.CAMERA_MOUNT, AlertEvent.RAISED, (), False),
+        (AlertKind.GRIPPER, Cause.FINGER_BENT, AlertEvent.UPDATED, (Cause.CAMERA_MOUNT,), True),
+        (AlertKind.GRIPPER, Cause.FINGER_BENT, AlertEvent.CLEARED, (), False),
+        (AlertKind.LENS, Cause.LENS, AlertEvent.RAISED, (Cause.LENS,), False),
+        (AlertKind.OCCLUDED, Cause.VIEW_BLOCKED, AlertEvent.RAISED, (), False),
+    ],
+)
+def test_an_alert_is_false_that_newly_names_what_is_not_wrong(
+    kind: AlertKind, cause: Cause, event: AlertEvent, wrong: tuple[Cause, ...], false: bool
+):
+    from benchmarks.integrity_runs import is_false
+
+    assert is_false(Alert(kind, cause, Severity.ERROR, "", event=event), wrong) == false
 
 
 def test_a_valid_frame_without_a_level_misleads():

@@ -119,7 +119,7 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
     for index, look in enumerate(watched.looks):
         record = monitor.process(look.frame)
         rows.append(_judged(record, look, settings.policy.integrity_risk))
-        alerts += [[index, alert.text] for alert in record.alerts if _is_false(alert, watched.wrong)]
+        alerts += [[index, alert.text] for alert in record.alerts if is_false(alert, watched.wrong)]
     policy = settings.policy
     return {
         "condition": name,
@@ -141,7 +141,7 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
     }
 
 
-def _is_false(alert: Alert, wrong: tuple[Cause, ...]) -> bool:
+def is_false(alert: Alert, wrong: tuple[Cause, ...]) -> bool:
     """Whether an alert newly names what isn't ``wrong``: that the camera's mount moved, or what gripper or lens did."""
     named = alert.cause in (*NO_REFERENCE, Cause.CAMERA_MOUNT) and alert.kind is not AlertKind.VIBRATION
     new = alert.event in (AlertEvent.RAISED, AlertEvent.UPDATED)

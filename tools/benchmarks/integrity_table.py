@@ -192,9 +192,7 @@ def as_markdown(results: dict[str, Any], pictures: list[str]) -> str:
         "## Targets",
         "\n".join(f"- {line}" for line in target_lines(results["total"])),
         "## Worst frames",
-        "\n".join(
-            f"- `{line.partition(': ')[0]}`: {line.partition(': ')[2]}" for line in worst_lines(results["worst"])
-        ),
+        "\n".join(f"- `{line.replace(': frame', '`: frame', 1)}" for line in worst_lines(results["worst"])),
         *(f"![Stanford diagram](integrity/{name})" for name in pictures),
         "## Conditions",
         "\n".join(f"- {name}: {row['what']}" for name, row in results["rows"].items()),
