@@ -14,7 +14,7 @@ from scipy.stats import t as student
 from support.shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, two_fingers
 from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
-from gripmon.judge.causes.models import STUDENT_FREEDOM, WRONG_EDGE, Errors, Model, something_else, weigh
+from gripmon.judge.causes.models import STUDENT_FREEDOM, WRONG_EDGE_PROBABILITY, Errors, Model, something_else, weigh
 from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.model.camera import LensSettings
@@ -217,7 +217,7 @@ def test_what_an_edge_shows_that_belongs_to_something_else_is_the_integral_over_
         lambda off_px: student.pdf(off_px / spread_px, STUDENT_FREEDOM) / spread_px
         * height(np.full(count, off_px), sigma_px), -1.0, 1.0, limit=200,
     )[0]  # fmt: skip
-    assert found[0] == pytest.approx(math.log(WRONG_EDGE * any_border / own), abs=0.5)
+    assert found[0] == pytest.approx(math.log(WRONG_EDGE_PROBABILITY * any_border / own), abs=0.5)
 
 
 def test_a_cause_that_most_edges_contradict_is_not_named():

@@ -99,6 +99,13 @@ def test_a_finger_behind_a_bar_is_hidden_not_bent(level_dn: float):
     assert explanation.probable.cause is Cause.UNKNOWN
 
 
+def test_a_bent_finger_is_named_before_a_plain_background():
+    """Ten pixels farther than the gripper is measured."""
+    bent = BentFinger(finger="left", tip_shift_m=(-1.4e-3, 0.0, 0.0), start_s=AT_S)
+    explanation, _ = explained(simulated(background=PLAIN), simulated(background=PLAIN, bent_fingers=(bent,)))
+    assert explanation.probable.cause is Cause.FINGER_BENT
+
+
 @pytest.mark.parametrize(
     "motion",
     [

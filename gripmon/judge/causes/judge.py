@@ -154,8 +154,9 @@ class CauseJudge:
         total = sum(math.exp(value - top) for value in comparison.log.values())
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
-        of_few = _of_few_edges(max(shares, key=lambda key: shares[key]), comparison)
-        for key in [key for key in shares if key == of_few or _ill_founded(key, pooled)]:
+        best = max(shares, key=lambda key: shares[key])
+        of_few_edges = _of_few_edges(best, comparison)
+        for key in [key for key in shares if _ill_founded(key, pooled) or (of_few_edges and key == best)]:
             if shares[key] >= self._settings.probable:
                 text = f"too little of the fingers is seen to tell what moved; what is seen would fit if {text}"
             shares[Cause.UNKNOWN, None] += shares.pop(key)
@@ -227,10 +228,10 @@ def _ill_founded(key: Key, pooled: Pooled) -> bool:
     return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_SEEN_SHARE).sum()) < several
 
 
-def _of_few_edges(key: Key, comparison: Comparison) -> Key | None:
-    """The best cause if it says where the edges stand, but most of them don't."""
+def _of_few_edges(key: Key, comparison: Comparison) -> bool:
+    """Whether a cause says where the edges stand, but most of them don't."""
     says_where = key[0] not in (Cause.UNKNOWN, Cause.VIEW_BLOCKED)
-    return key if says_where and (comparison.fits[key].own > 0.5).mean() <= MOST_EDGES else None
+    return says_where and bool((comparison.fits[key].own > 0.5).mean() <= MOST_EDGES)
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

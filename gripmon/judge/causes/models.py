@@ -37,7 +37,7 @@ of a bent finger; of a wrong opening; and of a lens, of several things and of no
 """
 
 
-WRONG_EDGE = 0.1
+WRONG_EDGE_PROBABILITY = 0.1
 """Probability that an edge belongs to something else, given that something looks wrong."""
 
 
@@ -235,7 +235,7 @@ def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[Array, Ar
     own = np.bincount(errors.edge, pieces, errors.edges) + _student(off_px, errors.of_edge_px)
     if errors.something_else is None:
         return own, np.ones(len(own))
-    own += math.log1p(-WRONG_EDGE)
+    own += math.log1p(-WRONG_EDGE_PROBABILITY)
     both = np.logaddexp(own, errors.something_else)
     return both, np.maximum(np.exp(own - both), LEAST_SHARE)
 
@@ -262,7 +262,7 @@ def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: f
         is_own = math.log(_STUDENT_HEIGHT / errors.of_edge_px[k]) + 0.5 * math.log(2.0 * math.pi)
         is_own -= 0.5 * math.log(weight[at].sum() + spread_weight[k])
         fit = float(_student(residual[at] - border, errors.sigma_px[at]).sum())
-        out[k] = math.log(WRONG_EDGE) + fit + may_be - is_own
+        out[k] = math.log(WRONG_EDGE_PROBABILITY) + fit + may_be - is_own
     return out
 
 
