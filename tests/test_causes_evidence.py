@@ -193,6 +193,36 @@ def test_borders_of_other_things_are_no_bent_finger(seed: int):
     assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
 
 
+@pytest.mark.parametrize("seed", [*range(5), 25])
+def test_borders_of_other_things_hide_no_knock(seed: int):
+    """Of half a millimetre and a third of a degree; borders beside two of a finger's edges, on the same side of them,
+    far enough to drag a fit along that doubts no edge.
+    """
+    shown, rng = Shown(sharp_gripper(), seed=seed), np.random.default_rng(seed)
+    edges = tuple(rng.choice(ALL_OF_LEFT, 2, replace=False).tolist())
+    border_px = float(rng.choice([-1, 1]) * rng.uniform(3.0, 6.0))
+    shift, turn = rng.normal(size=(2, 3))
+    shift_m, turn_deg = 5e-4 * shift / np.linalg.norm(shift), 0.3 * turn / np.linalg.norm(turn)
+    judge = shown.judge(sigma_px=0.05)
+    for _ in range(FRAMES):
+        evidence = shown.evidence(knocked(shown.reference, tuple(shift_m), tuple(turn_deg)), sigma_px=0.05)
+        judge.add(beside(shown, evidence, edges, border_px))
+    assert judge.explanation(shown.reference).probable.cause is Cause.CAMERA_MOUNT
+
+
+@pytest.mark.parametrize(("learnt", "named"), [(5, False), (6, True)])
+def test_what_was_learnt_before_a_knock_stays_if_it_suffices(learnt: int, named: bool):
+    """A reference that is off as far as it may be hides a knock of a tenth of a millimetre from who has learnt less."""
+    shown = Shown(sharp_gripper())
+    off = knocked(shown.reference, (1e-4, -1e-4, 1e-4), (0.05, 0.05, -0.05))
+    judge = shown.judge(well=learnt, cam_T_grip=off)
+    judge.knocked()
+    assert judge.wants_baseline != named
+    for _ in range(FRAMES):
+        judge.add(shown.evidence(knocked(off, (1e-4, 0.0, 0.0))))
+    assert (judge.explanation(shown.reference).probable.cause is Cause.CAMERA_MOUNT) == named
+
+
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_what_an_edge_shows_that_belongs_to_something_else_is_the_integral_over_all_borders(count: int):
     """Against the integral over the edge's own offset where it shows nothing odd, which all models share."""

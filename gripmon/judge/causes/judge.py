@@ -91,6 +91,7 @@ class CauseJudge:
         self._reference_sigma = reference_sigma
         self._well: list[EdgeEvidence] = []
         self._baseline: Baseline | None = None
+        self._learning = True
         self.reset()
 
     def reset(self) -> None:
@@ -105,7 +106,7 @@ class CauseJudge:
     @property
     def wants_baseline(self) -> bool:
         """Whether frames in which all is well still teach anything."""
-        return len(self._well) < LEARNT
+        return self._learning and len(self._well) < LEARNT
 
     def well(self, evidence: EdgeEvidence) -> None:
         """A frame in which all seems well."""
@@ -114,9 +115,13 @@ class CauseJudge:
             self._baseline = None
 
     def knocked(self) -> None:
-        """The camera is elsewhere from now on: frames from before and after a knock are no baseline together."""
-        if self.wants_baseline:
-            self._well, self._baseline = [], None
+        """The camera is elsewhere from now on: frames from before and after a knock are no baseline together.  Those
+        from before stay one if they suffice.
+        """
+        if len(self._well) < SETTLED:
+            self._well = []
+        else:
+            self._learning = False
 
     def add(self, evidence: EdgeEvidence) -> None:
         """A frame in which something may be wrong, measured or not."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,50 +179,105 @@ class Weighed:
 
 
 def weigh(view: EdgeView, gripper: Gripper, model: Model, start: State, first: State, errors: Errors) -> Weighed:
-    """Evidence of a model whose prior is centred on the state ``start``; the fit begins at ``first``."""
+    """Evidence of a model whose prior is centred on the state ``start``; the fit begins at ``first``.
+
+    At first all pieces count alike, so that the way may be long; where edges belong to something else they may have
+    dragged the fit along, which then begins once more without that, and the likelier one counts.
+    """
     largest = model.precision(float(model.sizes.max(initial=0.0)))
     free = np.flatnonzero(np.isfinite(largest))
-    belongs = (errors.edge[:, None] == np.arange(errors.edges)).astype(float)
-    spread_px = errors.of_edge_px
-    state, off_px = first, np.zeros(errors.edges)
-    for round_ in range(_COARSE_ROUNDS + _FINE_ROUNDS):
-        residual, jacobian = view.residual(state)
-        residual, motion = residual - errors.bias_px, state.since(start)
-        coarse_px = _COARSE_PX if round_ < _COARSE_ROUNDS else 0.0
-        weight, spread_weight = _weights(residual, off_px, errors, spread_px, coarse_px)
-        if coarse_px == 0.0:
-            own = _of_edges(residual, off_px, errors)[1]
-            weight, spread_weight = weight * own[errors.edge], spread_weight * own
-        design = np.hstack([jacobian[:, free], belongs])
-        at = np.concatenate([motion[free], off_px])
-        precision = np.concatenate([largest[free], spread_weight])
-        rest = residual - off_px[errors.edge]
-        normal = (design.T * weight) @ design
+    problem = _Problem(view, gripper, model, start, errors, free, largest[free])
+    fit = problem.fitted(problem.approached(first))
+    if (fit.own > 0.5).all():
+        return fit
+    other = problem.fitted(problem.point(first))
+    return max(fit, other, key=lambda fit: fit.log_evidence)
+
+
+class _Point(NamedTuple):
+    """A state with offsets (k,) of the edges, the residual (s,) that it leaves, in px, the motion (m,) from the prior's
+    centre, and what residuals change by with the free unknowns and the offsets (s, n + k).
+    """
+
+    state: State
+    off_px: Array
+    residual: Array
+    motion: Array
+    design: Array
+
+
+class _Problem:
+    """What one model's fit is made of: the numbers ``free`` (n,) of its unknowns, and the ``precision`` (n,) of the
+    widest prior of them.
+    """
+
+    def __init__(
+        self,
+        view: EdgeView,
+        gripper: Gripper,
+        model: Model,
+        start: State,
+        errors: Errors,
+        free: NDArray[np.intp],
+        precision: Array,
+    ):
+        self._view, self._gripper, self._model, self._start, self._errors = view, gripper, model, start, errors
+        self._free, self._precision = free, precision
+        self._belongs = (errors.edge[:, None] == np.arange(errors.edges)).astype(float)
+        self._spread_px = errors.of_edge_px
+
+    def approached(self, first: State) -> _Point:
+        """Nearer to the solution from far away: all pieces count alike."""
+        point = self.point(first)
+        weights = 1.0 / (self._errors.sigma_px**2 + _COARSE_PX**2), 1.0 / self._spread_px**2
+        for _ in range(_COARSE_ROUNDS):
+            point = self._moved(point, self._step(point, *weights))
+        return point
+
+    def fitted(self, point: _Point) -> Weighed:
+        """The solution that is reached from there, each piece and each edge weighed by how well it agrees."""
+        model = self._model
+        for _ in range(_FINE_ROUNDS):
+            step = self._step(point, *self._weights(point))
+            converged = float(np.abs(point.design @ step).max(initial=0.0)) < _CONVERGED_PX
+            point = self._moved(point, step)
+            if converged:
+                break
+        logs, own = _of_edges(point.residual, point.off_px, self._errors)
+        priors = np.array([model.precision(size)[self._free] for size in (model.sizes.tolist() or [0.0])])
+        log = logs.sum() + _volume(point.design, *self._weights(point), point.motion[self._free], priors)
+        evidence = float(np.logaddexp.reduce(log)) - math.log(len(log))
+        return Weighed(evidence, point.state, point.motion, point.residual, own)
+
+    def point(self, state: State, off_px: Array | None = None) -> _Point:
+        """No edge is off, unless told."""
+        residual, jacobian = self._view.residual(state)
+        design = np.hstack([jacobian[:, self._free], self._belongs])
+        off_px = np.zeros(self._errors.edges) if off_px is None else off_px
+        return _Point(state, off_px, residual - self._errors.bias_px, state.since(self._start), design)
+
+    def _moved(self, point: _Point, step: Array) -> _Point:
+        full = np.zeros(len(point.motion))
+        full[self._free] = step[: len(self._free)]
+        return self.point(point.state.moved(full, self._gripper), point.off_px + step[len(self._free) :])
+
+    def _step(self, point: _Point, weight: Array, spread_weight: Array) -> Array:
+        """(n + k,) of the unknowns and the offsets."""
+        precision = np.concatenate([self._precision, spread_weight])
+        at = np.concatenate([point.motion[self._free], point.off_px])
+        normal = (point.design.T * weight) @ point.design
         normal.flat[:: len(normal) + 1] += precision
-        step = np.linalg.solve(normal, design.T @ (weight * rest) - precision * at)
-        full = np.zeros(len(largest))
-        full[free] = step[: len(free)]
-        state, off_px = state.moved(full, gripper), off_px + step[len(free) :]
-        if round_ >= _COARSE_ROUNDS and float(np.abs(design @ step).max(initial=0.0)) < _CONVERGED_PX:
-            break
-    residual, jacobian = view.residual(state)
-    residual, motion = residual - errors.bias_px, state.since(start)
-    weight, spread_weight = _weights(residual, off_px, errors, spread_px, 0.0)
-    logs, own = _of_edges(residual, off_px, errors)
-    weight, spread_weight = weight * own[errors.edge], spread_weight * own
-    priors = np.array([model.precision(size)[free] for size in (model.sizes.tolist() or [0.0])])
-    design = np.hstack([jacobian[:, free], belongs])
-    log = logs.sum() + _volume(design, weight, spread_weight, motion[free], priors)
-    return Weighed(float(np.logaddexp.reduce(log)) - math.log(len(log)), state, motion, residual, own)
+        rest = point.residual - self._belongs @ point.off_px
+        return np.linalg.solve(normal, point.design.T @ (weight * rest) - precision * at)
 
-
-def _weights(residual: Array, off_px: Array, errors: Errors, spread_px: Array, coarse_px: float) -> tuple[Array, Array]:
-    """What pieces (s,) and the edges' offsets (k,) count, 1/px²; ``coarse_px``: far from the solution all alike."""
-    rest = residual - off_px[errors.edge]
-    if coarse_px > 0.0:
-        return 1.0 / (errors.sigma_px**2 + coarse_px**2), np.asarray(1.0 / spread_px**2)
-    weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.sigma_px**2 + rest**2)
-    return weight, (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * spread_px**2 + off_px**2)
+    def _weights(self, point: _Point) -> tuple[Array, Array]:
+        """What pieces (s,) and the edges' offsets (k,) count, 1/px²."""
+        sigma_px, spread_px = self._errors.sigma_px, self._spread_px
+        own = _of_edges(point.residual, point.off_px, self._errors)[1]
+        rest = point.residual - self._belongs @ point.off_px
+        weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * sigma_px**2 + rest**2)
+        spread_weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * spread_px**2 + point.off_px**2)
+        return weight * own[self._errors.edge], spread_weight * own
 
 
 def _student(error: Array, scale: Array) -> Array:
@@ -243,6 +299,7 @@ def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[Array, Ar
 def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: float) -> Array:
     """(k,) see :class:`Errors`: a straight border whose distance from each end of the edge is anything up to
     ``reach_px``; ``residual`` (s,) of any model, which differs from others by a line, ``fraction`` (s,) along the edge.
+    Borders beside a curved edge are curved as it is, and one beyond the reach costs no more.
     """
     out = np.zeros(errors.edges)
     weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.sigma_px**2)
@@ -268,7 +325,7 @@ def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: f
 
 def _volume(design: Array, weight: Array, spread_weight: Array, motion: Array, priors: Array) -> Array:
     """(n,) for priors (n, free): the height of each at the solution, moved to where it is best, and how much of its
-    volume agrees.
+    volume agrees.  The curvature is that of the weights as they are, without what a step changes them by.
     """
     normal = (design.T * weight) @ design
     normal.flat[:: len(normal) + 1] += np.concatenate([np.zeros(len(motion)), spread_weight])
