@@ -1,7 +1,7 @@
 """Monitor a folder of images: where does the camera stand against the gripper, and may a controller use it?
 
 It simulates the images first, so it needs no hardware.  With your own, begin at ``load_config``:
-``config.yaml`` describes your camera, gripper and calibration (docs/configuration.md).
+``config.yaml`` describes your camera, gripper and calibration (its keys: Reference, Configuration).
 """
 
 from __future__ import annotations
