@@ -250,6 +250,9 @@ def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys:
         "provenance": {"gripmon": "0", "time": "2026-01-01T00:00:00", "command": "test"},
     }  # fmt: skip
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    wrong = ["gripper", "from-images", "nowhere", "--camera", str(tmp_path / "camera.yaml")]
+    assert main([*wrong, "--out", str(tmp_path / "gripper.yaml")]) == 2
+    assert "nowhere: the file is missing; an image file, or a folder with images" in capsys.readouterr().err
     words = ["gripper", "from-images", str(folder), "--camera", str(tmp_path / "camera.yaml")]
     outputs = ["--out", str(tmp_path / "gripper.yaml"), "--reference-out", str(tmp_path / "reference.yaml")]
     outputs += ["--picture", str(tmp_path / "gripper.png")]

@@ -364,6 +364,14 @@ def test_steps_as_commands(images: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert found["target"] == new_user.TARGET
     assert found["provenance"]["command"].startswith("gripmon calibrate intrinsics plate --target circles:")
     assert abs(found["camera"]["fx_px"] - 962.0) < 1.0
+    # A folder without the target is no success.
+    other, bare = tmp_path / "other", tmp_path / "bare"
+    bare.mkdir()
+    cv2.imwrite(str(bare / "0.png"), np.full((576, 768), 90, np.uint8))
+    assert main(["setup", str(other), "--source", str(bare), "--step", "camera"]) == 0
+    assert main(["setup", str(other), "--step", "target"]) == 0
+    assert main(["setup", str(other), "--step", "plate"]) == 3
+    assert "plate: no image was taken" in capsys.readouterr().err
     # A command that fails says why, and what was there stays.
     project = Project(folder)
     project.keep({"target": "chequerboard:9x6:0.02"})

@@ -49,7 +49,9 @@ exit codes: 0 written; 2 wrong usage or files, one line says what would be right
 def _view(text: str) -> tuple[float, float]:
     values = two_numbers(text)
     if values is None or not (0.0 < values[0] <= 2.0 and 0.0 <= values[1] <= 180.0):
-        raise argparse.ArgumentTypeError(f"'{text}' isn't D:TILT; metres and degrees, e.g. 0.12:30")
+        raise argparse.ArgumentTypeError(
+            f"'{text}' isn't D:TILT; metres (2 at most; millimetres?) and degrees, e.g. 0.12:30"
+        )
     return values
 
 

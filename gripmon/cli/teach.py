@@ -136,7 +136,7 @@ def _summary(config: Config, taught: Taught, out: Path) -> str:
     lines.append(f"written: {out}")
     if config.taught_path is None or config.taught_path.resolve() != out.resolve():
         name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
-        lines.append(f"next: put the line `taught: {name}` into {config.path} (--into-config does)")
+        lines.append(f"next: put the line `taught: {name}` into {config.path} (--into-config --force does)")
     return "\n".join(lines)
 
 

@@ -35,10 +35,12 @@ def natural_key(name: str) -> tuple[list[Any], str]:
 
 def image_paths(names: Sequence[str | Path]) -> list[Path]:
     """The images that are meant: files as they are named, for a folder all images in it, in natural order.
-    :class:`~gripmon.model.errors.InputError` for a folder without any.
+    :class:`~gripmon.model.errors.InputError` for a folder without any, and where there is nothing.
     """
     paths: list[Path] = []
     for path in map(Path, names):
+        if not path.exists():
+            raise InputError(f"{path}: the file is missing; an image file, or a folder with images")
         if not path.is_dir():
             paths.append(path)
             continue

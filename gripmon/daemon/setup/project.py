@@ -130,6 +130,8 @@ class Project:
                 note(text)
         finally:
             capture.stop()
+        if not capture.images():
+            raise NoResultError(f"{name}: no image was taken; images in which that is seen, sharp and still")
         return [Line(f"{len(capture.images())} images in {name}", "OK")]
 
     def _state(self, step: Step) -> StepState:
