@@ -204,7 +204,13 @@ def _see_openings(
         if seen and len(own) < FEWEST_IMAGES:
             notes.append(f"opening {opening:g} m: {len(own)} images aren't used; {FEWEST_IMAGES} or more")
             continue
-        seen[opening] = see_opening(camera, [grey[k] for k in own], least_noise, step)
+        try:
+            seen[opening] = see_opening(camera, [grey[k] for k in own], least_noise, step)
+        except NoResultError as refused:
+            if len(groups) == 1:
+                raise
+            of = f"{len(own)} of {len(files)} images show one opening, from {files[own[0]]} to {files[own[-1]]}"
+            raise NoResultError(f"{of}; of them {refused}") from None
         left_out.update({files[own[k]]: why for k, why in seen[opening].left_out.items()})
     first, *others = seen
     pronged = apart_by_motion(camera, seen[first], [seen[opening] for opening in others])

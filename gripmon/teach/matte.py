@@ -90,7 +90,7 @@ def find_matte(
             break
         for k in np.flatnonzero(bad).tolist():
             left_out[int(kept[k])] = (
-                f"shows {100.0 * alike[k]:.0f} % of the gripper where the others do, at least "
+                f"shows {100.0 * alike[k]:.1f} % of the gripper where the others do, at least "
                 f"{100.0 * ALIKE_SHARE:.0f} %: the camera or the jaws moved, something hides it, or another gripper"
             )
         if np.count_nonzero(~bad) < max(FEWEST_IMAGES, (len(images) + 2) // 2):
@@ -111,7 +111,7 @@ def sets_refused(counts: Sequence[int]) -> NoResultError:
     said = " and ".join(map(str, counts))
     return NoResultError(
         f"the images fall into {len(counts)} sets, of {said}, in which different parts stay the same; images of one "
-        "gripper, a camera fixed to it, each before another background"
+        "gripper, a camera fixed to it, jaws that stand, each before another background"
     )
 
 
