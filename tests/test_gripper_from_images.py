@@ -222,7 +222,7 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
         with pytest.raises(NoResultError, match=word) as caught:
             gripper_from_images(wrong, PAPER_LENS, distance_m=DISTANCE)
         assert "\n" not in str(caught.value)
-    with pytest.raises(NoResultError, match="10 of 25 images show one opening, from image 16 to image 25; .* blurred"):
+    with pytest.raises(NoResultError, match=r"10 of 25 images show one opening, from image 16 to image 25; .* blurred"):
         gripper_from_images([*images[15:30], *blurred[:10]], PAPER_LENS, openings_m=[0.03] * 15 + [0.02] * 10)
 
 
