@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         print(f"integrity: {error.filename}: {error.strerror}; a place that can be written to", file=sys.stderr)
         return 2
-    results = integrity_report.summarize(plan, lines)
+    results = integrity_report.summarize(lines, plan.seed, plan.scenes, plan.frames)
     if plan.scene is not None:
         print("\n".join(text for line in lines for text in integrity_table.frame_lines(line)))
     print(integrity_table.as_text(results))
@@ -158,7 +158,9 @@ def _key(task: tuple[str, int], plan: Plan) -> tuple[Any, ...]:
 
 
 def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Finished scenes by condition, number, seed and frames.  A last line that was cut off doesn't count."""
+    """Finished scenes by condition, number, seed and frames.  A last line that was cut off doesn't count, nor one of an
+    earlier version that didn't count false alerts.
+    """
     if file is None or not file.exists():
         return {}
     out = {}
@@ -167,7 +169,8 @@ def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue
-        out[line["condition"], line["scene"], line["seed"], line["asked"]] = line
+        if "false_alerts" in line:
+            out[line["condition"], line["scene"], line["seed"], line["asked"]] = line
     return out
 
 

@@ -5,20 +5,17 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from benchmarks import integrity_table, machine
 from benchmarks.integrity_runs import about
 from benchmarks.integrity_stats import by_scale, figures, targets, worst
 
-if TYPE_CHECKING:
-    from benchmarks.integrity import Plan
-
 PICTURES = "integrity"
 
 
-def summarize(plan: Plan, lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of each condition and of all, as plain values."""
+def summarize(lines: list[dict[str, Any]], seed: int, scenes: int, frames: int) -> dict[str, Any]:
+    """Figures of each condition and of all, as plain values; ``scenes`` of each condition, ``frames`` of each scene."""
     by_name: dict[str, list[dict[str, Any]]] = {}
     for line in lines:
         by_name.setdefault(line["condition"], []).append(line)
@@ -26,7 +23,7 @@ def summarize(plan: Plan, lines: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "machine": machine.description(),
         "commits": sorted({line["commit"] for line in lines}),
-        "plan": {"seed": plan.seed, "scenes": plan.scenes, "frames": plan.frames},
+        "plan": {"seed": seed, "scenes": scenes, "frames": frames},
         "limit_m": lines[0]["limit_m"],
         "limit_rad": lines[0]["limit_rad"],
         "rows": {name: {"what": about(name), **figures(own)} for name, own in by_name.items()},

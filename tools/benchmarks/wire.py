@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -67,7 +68,7 @@ def measure(plan: Any) -> dict[str, Any]:
         for name, function in (
             ("conditions", wire_runs.conditions),
             ("restarts", wire_runs.restarts),
-            ("slow", wire_slow.slow_links),
+            ("slow", partial(wire_slow.slow_links, max_age_s=MAX_AGE_S)),
         ):
             print(f"{name} …", file=sys.stderr)
             results[name] = rings.in_new_process(function, path, plan)

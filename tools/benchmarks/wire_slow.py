@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 
 from benchmarks.slow_link import SlowLink
-from benchmarks.wire import MAX_AGE_S
 from benchmarks.wire_others import RouterProcess, free_endpoint
 from gripmon.client import Policy, TransformClient
 from gripmon.io.publish import ZenohPublisher
@@ -23,7 +22,6 @@ from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 
 RATES_BYTES_PER_S = (100e3, 70e3, 30e3)
-POLICY = Policy(max_age_s=MAX_AGE_S)
 _FPS = 30.0
 _POLL_S = 0.002
 _CORNERS = 8
@@ -89,9 +87,10 @@ class _Seen:
         }
 
 
-def slow_links(_: Path, plan: Any) -> dict[str, Any]:
+def slow_links(_: Path, plan: Any, max_age_s: float) -> dict[str, Any]:
     """By condition: the link's rate, a link that was slow from the start, a router that stands still."""
     results: dict[str, Any] = {}
+    policy = Policy(max_age_s=max_age_s)
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch, ExitStack() as opened:
         endpoint, router = free_endpoint(), RouterProcess(Path(scratch))
         opened.callback(router.close)
@@ -104,7 +103,7 @@ def slow_links(_: Path, plan: Any) -> dict[str, Any]:
             publisher = ZenohPublisher(Link(settings), "bench", "wrist")
             opened.callback(publisher.close)
             opened.callback(_Camera(publisher).close)
-        with _client(relay.endpoint) as relayed:
+        with _client(relay.endpoint, policy) as relayed:
             for rate in (None, *RATES_BYTES_PER_S):
                 relay.bytes_per_s = rate
                 seen = _Seen()
@@ -113,17 +112,17 @@ def slow_links(_: Path, plan: Any) -> dict[str, Any]:
                 seen.poll(relayed, plan.slow_after_s)
                 results["no limit" if rate is None else f"{1e-3 * rate:g} kB/s"] = seen.summary()
         relay.bytes_per_s = RATES_BYTES_PER_S[-1]
-        with TransformClient("bench", connect=[relay.endpoint], policy=POLICY) as late:
+        with TransformClient("bench", connect=[relay.endpoint], policy=policy) as late:
             seen = _Seen()
             seen.poll(late, plan.slow_s)
         results[f"{1e-3 * RATES_BYTES_PER_S[-1]:g} kB/s from the start"] = seen.summary()
-        with _client(router.endpoint) as routed:
+        with _client(router.endpoint, policy) as routed:
             results[f"router stopped for {plan.stopped_s:g} s"] = _stopped(routed, router, plan)
     return results
 
 
-def _client(endpoint: str) -> TransformClient:
-    client = TransformClient("bench", connect=[endpoint], policy=POLICY)
+def _client(endpoint: str, policy: Policy) -> TransformClient:
+    client = TransformClient("bench", connect=[endpoint], policy=policy)
     end_s = time.monotonic() + 30.0
     while not client.latest().usable:
         if time.monotonic() > end_s:
