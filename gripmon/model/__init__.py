@@ -1,1 +1,1 @@
-"""The base: cameras and lenses, the gripper, SE(3), the records that leave the monitor."""
+"""The base room: cameras and lenses, the gripper model, SE(3), and the records that leave the monitor."""

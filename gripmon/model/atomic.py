@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic file writes: a file is there completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from gripmon.model.errors import InputError
 
 
 def writable_folder(path: Path, argument: str = "out") -> Path:
-    """The folder, made where it is missing.  :class:`InputError` about this argument where it can't be written to."""
+    """Return the folder, created if it is missing.  Raises :class:`InputError` about ``argument`` if it isn't
+    writable.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -25,24 +27,25 @@ def writable_folder(path: Path, argument: str = "out") -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """A whole file at once, see :func:`opened_atomically`."""
+    """Write a whole file at once, see :func:`opened_atomically`."""
     with opened_atomically(path) as file:
         file.write(data)
 
 
 @contextlib.contextmanager
 def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
-    """Write under another name beside ``path``, then rename: a reader sees the old file or the new one, and a fault
-    leaves the old one.  When the context ends, the new one survives a power cut.  OSError if it can't be written.
+    """Write to a temporary file beside ``path``, then rename it: a reader sees either the old or the new file, and a
+    failure leaves the old one.  Once the context ends, the new file survives a power cut.  OSError if it can't be
+    written.
 
-    A device or a pipe is written to: a rename would put a file in its place, for every program of the machine.
+    A device or a pipe is written to directly: a rename would replace it with a file, for every program on the machine.
     """
     if path.exists() and not path.is_file():
         with path.open("wb") as file:
             yield file
         return
     name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
-    # With the mode that any new file gets: mkstemp's is narrower, and the umask can't be read without changing it.
+    # Use the mode of any new file: mkstemp's is narrower, and the umask can't be read without changing it.
     descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as file:
@@ -58,20 +61,20 @@ def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove what processes that were killed while they wrote ``path`` have left beside it.
+    """Remove temporary files left beside ``path`` by processes that were killed while writing it.
 
-    Only for the one process that writes this file.  OSError if it may not be done.
+    Only for the one process that writes this file.  OSError if a file can't be removed.
     """
     for leftover in path.parent.glob(f".{glob.escape(path.name)}-*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
-    """The new name itself survives a power cut; file systems that can't do that for folders say so, and are let off."""
+    """Make the rename itself survive a power cut; an error from file systems that can't sync a folder is ignored."""
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:
-        return  # a folder that may be written but not read
+        return  # a folder that can be written but not read
     try:
         with contextlib.suppress(OSError):
             os.fsync(descriptor)

@@ -1,13 +1,13 @@
-"""Camera models: a pinhole with one of three lenses, every direction vectorised and with analytic Jacobians.
+"""Camera models: a pinhole with one of three lenses; every mapping is vectorised and has an analytic Jacobian.
 
 Pixel centres lie at integer coordinates, as in OpenCV; the camera frame is x right, y down, z forward.  Three kinds of
 image coordinates occur:
 
 * ``uv_px``: pixels in the image as the camera delivers it (distorted);
 * ``xy``: ideal normalised coordinates ``x/z, y/z`` of a point in the camera frame (no unit);
-* inside this module ``q``: distorted normalised coordinates ``((u - cx)/fx, (v - cy)/fy)``.
+* ``q``, inside this module only: distorted normalised coordinates ``((u - cx)/fx, (v - cy)/fy)``.
 
-Outside a lens's domain (behind the camera, beyond the radius where the model folds back on itself) results are NaN.
+Outside a lens's domain (behind the camera, or beyond the radius where the model folds back on itself) results are NaN.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MAX_STRETCH = 3.0  # ideal over distorted radius, or the reverse, at the image'
 
 
 class PinholeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every camera model has in common."""
+    """The parameters that all camera models share."""
 
     width_px: Annotated[int, msgspec.Meta(ge=16, le=20000, description="image width (px)")]
     height_px: Annotated[int, msgspec.Meta(ge=16, le=20000, description="image height (px)")]
@@ -42,7 +42,7 @@ class PinholeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 class PaperLens(PinholeSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="model", tag="paper"):
     """Equation (4) of the self-viewing method: ``ideal = distorted * (1 + kappa r²)``, r from the principal point.
 
-    With pixels that are not square the row offset counts in units of the column's: ``r² = du² + (dv fx/fy)²``.
+    If pixels are not square, the row offset is scaled to column units: ``r² = du² + (dv fx/fy)²``.
     """
 
     kappa_per_px2: Annotated[
@@ -73,7 +73,7 @@ LensSettings = PaperLens | BrownConradyLens | FisheyeLens
 
 
 class Camera:
-    """A pinhole camera with a lens.  Build it with :func:`make_camera`, which refuses absurd calibrations."""
+    """A pinhole camera with a lens.  Build it with :func:`make_camera`, which rejects implausible calibrations."""
 
     def __init__(self, settings: LensSettings, lens: LensMap) -> None:
         self.settings = settings
@@ -86,12 +86,12 @@ class Camera:
         self._centre_px = np.array([self.cx_px, self.cy_px])
 
     def project(self, points_cam_m: Array) -> Array:
-        """Points in the camera frame (n, 3), m -> distorted pixels (n, 2); NaN outside the domain."""
+        """Project points in the camera frame (n, 3), m, to distorted pixels (n, 2); NaN outside the domain."""
         xy, _ = _normalise(points_cam_m)
         return self._to_pixels(self._lens.distort(xy))
 
     def project_with_jacobian(self, points_cam_m: Array) -> tuple[Array, Array]:
-        """As :meth:`project`, and ``d_uv_d_point`` (n, 2, 3), px/m; both NaN outside the domain."""
+        """Like :meth:`project`, plus ``d_uv_d_point`` (n, 2, 3), px/m; both are NaN outside the domain."""
         xy, per_z = _normalise(points_cam_m)
         q, (j00, j01, j10, j11) = self._lens.distort_with_jacobian(xy)
         x, y = xy
@@ -110,7 +110,7 @@ class Camera:
         return np.ascontiguousarray(self._lens.undistort(self._from_pixels(uv_px)).T)
 
     def undistort_with_jacobian(self, uv_px: Array) -> tuple[Array, Array]:
-        """As :meth:`undistort`, and ``d_xy_d_uv`` (n, 2, 2), 1/px."""
+        """Like :meth:`undistort`, plus ``d_xy_d_uv`` (n, 2, 2), 1/px."""
         xy, (j00, j01, j10, j11) = self._lens.undistort_with_jacobian(self._from_pixels(uv_px))
         d_xy_d_uv = np.empty((len(uv_px), 2, 2))
         d_xy_d_uv[:, 0, 0] = j00 / self.fx_px
@@ -137,7 +137,7 @@ class Camera:
 
 
 def _normalise(points_cam_m: Array) -> tuple[Array, Array]:
-    """(n, 3) -> x/z, y/z (2, n) and 1/z (n,); NaN where z is not in front of the camera."""
+    """(n, 3) -> x/z, y/z (2, n) and 1/z (n,); NaN where the point is not in front of the camera."""
     assert points_cam_m.ndim == 2 and points_cam_m.shape[1] == 3, f"expected (n, 3), got {points_cam_m.shape}"
     rows = np.ascontiguousarray(points_cam_m.T, dtype=np.float64)
     z = rows[2]
@@ -146,7 +146,7 @@ def _normalise(points_cam_m: Array) -> tuple[Array, Array]:
 
 
 def make_camera(settings: LensSettings) -> Camera:
-    """Build the camera; ValueError "key: what is wrong; what would be right" for a calibration that can't be meant."""
+    """Build the camera.  ValueError "key: what is wrong; what would be right" for an implausible calibration."""
     _check_pinhole(settings)
     lens: LensMap
     match settings:
@@ -209,7 +209,7 @@ def _check_pinhole(settings: PinholeSettings) -> None:
 
 
 def _check_lens(camera: Camera, lens: LensMap, key: str) -> None:
-    """Refuse a lens that folds, or distorts past belief, inside the image."""
+    """Reject a lens that folds, or distorts implausibly, inside the image."""
     last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     fractions = np.linspace(0.0, 1.0, 33)
     grid_px = np.stack(np.meshgrid(fractions, fractions), axis=-1).reshape(-1, 2) * last_px
@@ -222,7 +222,7 @@ def _check_lens(camera: Camera, lens: LensMap, key: str) -> None:
             "calibration that stays monotonic up to the image corners"
         )
     xy, (j00, j01, j10, j11) = lens.undistort_with_jacobian(q)
-    # The corners of a fisheye image may see beyond 89 degrees; with the other lenses all of the image must be inside.
+    # A fisheye's image corners may lie beyond 89 degrees; with the other lenses the whole image must be in the domain.
     inside = radius < lens.fold_q if isinstance(lens, FisheyeMap) else np.full(radius.shape, True)
     if not np.all(j00[inside] * j11[inside] - j01[inside] * j10[inside] > 0.0):
         raise ValueError(

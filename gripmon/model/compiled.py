@@ -1,7 +1,7 @@
-"""Machine code for the arithmetic that every frame needs, by numba; without it NumPy does the same, more slowly.
+"""Machine code, by numba, for the per-frame arithmetic; without numba the same code runs in NumPy, more slowly.
 
-Numba keeps what it has compiled beside the sources, in the user's cache or in ``NUMBA_CACHE_DIR``, and goes by the file
-of a function alone to see whether it has changed: compiled functions that call one another stand in one file.
+Numba caches compiled code beside the sources, in the user's cache or in ``NUMBA_CACHE_DIR``, and checks only a
+function's own file for changes.  Compiled functions that call one another must therefore share a file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 
 try:
     import numba
-except ImportError:  # no build of it for this machine
+except ImportError:  # no build for this machine
     COMPILES = False
 else:
     COMPILES = not getattr(numba.config, "DISABLE_JIT", False)
@@ -20,15 +20,15 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def compiled(function: _F) -> _F:
-    """``function``, compiled when it is first called with arguments of some types; as it is where nothing compiles.
+    """Compile ``function`` at its first call for each set of argument types; return it unchanged where numba can't run.
 
-    Arithmetic is as written, neither fused nor reordered, so that a replay on another machine decides alike; a division
-    by zero gives what NumPy's does.  The interpreter stays locked meanwhile: to get it back takes longer than a kernel.
+    Arithmetic is done as written, neither fused nor reordered, so that a replay on another machine decides the same;
+    division by zero behaves as in NumPy.  The GIL is held: reacquiring it takes longer than a kernel runs.
     """
     if not COMPILES:
         return function
     try:
         made: Any = numba.njit(cache=True, error_model="numpy")(function)
-    except RuntimeError:  # no folder in which it could be kept: every start compiles
+    except RuntimeError:  # no folder for the cache: every start compiles
         made = numba.njit(error_model="numpy")(function)
     return cast("_F", made)

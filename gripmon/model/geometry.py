@@ -1,8 +1,8 @@
-"""SE(3) in plain arrays, for the per-frame path.  Off that path use ``scipy.spatial.transform``.
+"""SE(3) in plain arrays, for the per-frame path.  Elsewhere use ``scipy.spatial.transform``.
 
-A transform is a 4x4 float64 array ``a_T_b`` that maps homogeneous coordinates in frame b to frame a.  A perturbation
-of a transform is ``xi = (rho, omega)``: ``t_true = t + rho`` and ``R_true = exp(omega) R``, both in axes of frame a,
-as in the published covariance.
+A transform is a 4x4 float64 array ``a_T_b`` that maps homogeneous coordinates in frame b to frame a.  A perturbation of
+a transform is ``xi = (rho, omega)``: ``t_true = t + rho`` and ``R_true = exp(omega) R``, both in axes of frame a, as in
+the published covariance.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def invert(a_T_b: Array) -> Array:
 def perturb(a_T_b: Array, xi: Array) -> Array:
     """Apply ``xi = (rho, omega)`` (6,): translation plus rho, rotation exp(omega) from the left, re-orthonormalised."""
     rotation = exp_rotation(xi[3:]) @ a_T_b[:3, :3]
-    # One Newton step towards the nearest rotation: rounding does not pile up over millions of frames.
+    # One Newton step towards the nearest rotation, so that rounding errors don't build up over millions of frames.
     rotation = rotation @ (_THREE_HALVES - 0.5 * (rotation.T @ rotation))
     return make_transform(rotation, a_T_b[:3, 3] + xi[:3])
 

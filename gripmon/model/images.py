@@ -1,4 +1,4 @@
-"""Image files: one by one, several that belong together, and all of a folder in the order in which a person counts."""
+"""Image files: one, several from the same camera, or all in a folder, in natural order."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 _SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
 IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
 LARGEST_BYTES = 1 << 30
-"""More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
+"""Larger files are neither images nor tables: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-"""How such a file begins."""
+"""First bytes of such a file."""
 _PNG_END = b"IEND"
 _PNG_END_BYTES = 8
-"""The last chunk's name and checksum."""
+"""Length of the last chunk's name and checksum (bytes)."""
 
 
 def natural_key(name: str) -> tuple[list[Any], str]:
-    """Order in which a person counts: digits as numbers, the rest as text; equal numbers by the name itself."""
+    """Natural sort key: digits compare as numbers, the rest as text; ties by the name itself."""
     parts = re.split(r"([0-9]+)", name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
 def image_paths(names: Sequence[str | Path]) -> list[Path]:
-    """The images that are meant: files as they are named, for a folder all images in it, in natural order.
-    :class:`~gripmon.model.errors.InputError` for a folder without any, and where there is nothing.
+    """The image files to read: files as named, and for a folder all images in it, in natural order.
+    :class:`~gripmon.model.errors.InputError` for a folder without images and for a missing file.
     """
     paths: list[Path] = []
     for path in map(Path, names):
@@ -52,8 +52,8 @@ def image_paths(names: Sequence[str | Path]) -> list[Path]:
 
 
 def images_of_one_camera(images: Sequence[str | Path | Image]) -> Iterator[tuple[str, Image]]:
-    """Each with its name (of an array "image 1", ...), all of one size.  :class:`~gripmon.model.errors.InputError` for
-    one that can't be read, has another size, or is the same as another.
+    """Yield each image with its name ("image 1", ... for arrays); all must have one size.
+    :class:`~gripmon.model.errors.InputError` for one that can't be read, has another size, or equals an earlier one.
     """
     seen: dict[bytes, str] = {}
     first_shape: tuple[str, tuple[int, ...]] | None = None
@@ -62,7 +62,7 @@ def images_of_one_camera(images: Sequence[str | Path | Image]) -> Iterator[tuple
             name, image = str(given), image_in(Path(given))
         else:
             name, image = f"image {number}", given
-        # The same image twice would make every uncertainty too small.
+        # A duplicate image would make every uncertainty too small.
         first = seen.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
         if len(seen) < number:
             raise InputError(f"{name}: is the same image as {first}; each image once")
@@ -87,7 +87,7 @@ def image_in(path: Path) -> Image:
 
 
 def check_size(name: str, image: Image, width_px: int, height_px: int) -> None:
-    """:class:`~gripmon.model.errors.InputError` for an image that isn't of a camera's size."""
+    """:class:`~gripmon.model.errors.InputError` for an image that doesn't have the camera's size."""
     height, width = image.shape[:2]
     if (width, height) != (width_px, height_px):
         raise InputError(
@@ -96,7 +96,7 @@ def check_size(name: str, image: Image, width_px: int, height_px: int) -> None:
 
 
 def read_image(path: Path) -> tuple[Image | None, str | None]:
-    """The image, or why there is none."""
+    """The image and None, or None and the reason why there is none."""
     import cv2
     import numpy as np
 
@@ -109,9 +109,9 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
     if not data:
         return None, "the file is empty"
     if data.startswith(PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
-        return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
+        return None, "truncated, damaged or not an image"  # libpng would print its own message to stderr
     try:
-        # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.
+        # Decoding from memory makes a truncated JPEG fail; reading from a file would fill the rest with grey.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         return None, f"not an image: {error.err}"
@@ -125,7 +125,7 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
 
 
 def regular_bytes(path: Path) -> bytes:
-    """A file's content.  OSError, too, for what is none: a pipe or a device might be waited for without end."""
+    """The content of a regular file.  OSError for anything else too: reading a pipe or a device might never end."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(descriptor)

@@ -1,12 +1,12 @@
 """Robust non-linear least squares, also on manifolds: the one minimiser of the off-line methods.
 
 Levenberg-Marquardt (Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963) with columns
-scaled to unit length, so that metres, radians and pixels may stand beside each other.  A problem gives what it
-minimises as functions of its own kind of state (an array, a transform, several of them); ``retract`` moves a state by a
-step, on the manifold where it is one.  Costs are sums of squared whitened residuals, or of a robust loss of them.
+scaled to unit length, so that metres, radians and pixels can be mixed.  A problem provides its cost and equations as
+functions of its own state type (an array, a transform, several of them); ``retract`` moves a state by a step, on the
+manifold if it lies on one.  Costs are sums of squared whitened residuals, or of a robust loss of them.
 
-``scipy.optimize.least_squares`` does the same for vectors alone, with dense Jacobians and without normal equations that
-are assembled view by view; problems of that kind go there.
+``scipy.optimize.least_squares`` does the same for plain vectors with dense Jacobians, without normal equations
+assembled view by view; problems of that kind use it.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ Equations = tuple[Array, Array]
 """Normal matrix ``JᵀWJ`` (p, p) and right-hand side ``JᵀWr`` (p,), r measured less predicted."""
 
 TUKEY = 4.685
-"""Residual in standard deviations from which Tukey's biweight gives no weight: 95 % efficiency for normal errors
-(Holland and Welsch, "Robust regression using iteratively reweighted least-squares", 1977)."""
+"""Residual, in standard deviations, beyond which Tukey's biweight is zero: 95 % efficiency for normal errors (Holland
+and Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
+"""
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
 _DETERMINED = 1e13
-"""Condition number of scaled normal equations beyond which rounding alone decides (doubles have 16 digits)."""
+"""Condition number of scaled normal equations above which the solution is rounding noise (doubles have 16 digits)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Minimum(Generic[S]):
-    """Where a minimisation ended: the best ``state`` with its ``cost``; ``converged`` is False if ``iterations`` ran
-    out before the cost stood still.
+    """Result of a minimisation: the best ``state`` with its ``cost``; ``converged`` is False if ``iterations`` ran out
+    before the cost settled.
     """
 
     state: S
@@ -46,12 +47,12 @@ class Minimum(Generic[S]):
 
 
 def chi_square_limit(chance: float, dimensions: int = 6) -> float:
-    """Squared normalised size that so many normal errors exceed with the probability ``chance``."""
+    """Squared normalised length that ``dimensions`` normal errors exceed with probability ``chance``."""
     return float(chdtri(dimensions, chance))
 
 
 CONTRADICTION_SQUARE = chi_square_limit(1e-5)
-"""Of six numbers that contradict each other: noise exceeds it once in 100,000 frames, the default integrity risk."""
+"""Gate for six numbers that should agree: noise exceeds it once in 100,000 frames, the default integrity risk."""
 
 
 def minimise(
@@ -66,9 +67,9 @@ def minimise(
 ) -> Minimum[S]:
     """The state near ``start`` with the least cost.
 
-    A state that isn't allowed costs infinity (or NaN), and is not entered.  Ends when the cost, or what is expected of
-    a step that fails, decreases by less than ``tolerance`` of it.  A small ``damping`` is Gauss-Newton's method.
-    A direction that the equations say nothing about isn't moved in.
+    A forbidden state costs infinity (or NaN) and is never accepted.  Stops when the cost decreases by less than a
+    fraction ``tolerance``, or when that little is predicted of a step that fails.  A small ``damping`` makes this
+    Gauss-Newton.  Directions that the equations don't determine are left alone.
     """
     state, current = start, cost(start)
     for iteration in range(1, iterations + 1):
@@ -99,8 +100,8 @@ def fit(
     iterations: int = 20,
     tolerance: float = 1e-12,
 ) -> Minimum[S]:
-    """:func:`minimise` for a small problem that begins near its end: ``linearised`` gives whitened Jacobian rows
-    (m, p), or (n, d, p), and residuals (m,) or (n, d), measured less predicted.
+    """:func:`minimise` for a small problem with a good start: ``linearised`` gives whitened Jacobian rows (m, p) or (n,
+    d, p), and residuals (m,) or (n, d), measured less predicted.
     """
 
     def cost(state: S) -> float:
@@ -113,7 +114,7 @@ def fit(
 
 
 def normal_equations(rows: Array, values: Array, weights: Array | None = None) -> Equations:
-    """Of whitened Jacobian rows (n, d, p) and residuals (n, d), or (m, p) and (m,), with ``weights`` (n,)."""
+    """From whitened Jacobian rows (n, d, p) and residuals (n, d), or (m, p) and (m,), with ``weights`` (n,)."""
     if weights is not None:
         root = np.sqrt(weights)
         rows, values = rows * root.reshape(-1, *[1] * (rows.ndim - 1)), values * root[:, None]
@@ -122,7 +123,7 @@ def normal_equations(rows: Array, values: Array, weights: Array | None = None) -
 
 
 def covariance_of(normal: Array, variance: float = 1.0) -> Array:
-    """(p, p), ``variance`` times the inverse of a normal matrix.  :class:`numpy.linalg.LinAlgError` where it leaves a
+    """(p, p), ``variance`` times the inverse of a normal matrix.  :class:`numpy.linalg.LinAlgError` if it leaves a
     direction undetermined.
     """
     size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
@@ -134,25 +135,27 @@ def covariance_of(normal: Array, variance: float = 1.0) -> Array:
 
 
 def whitening(covariance: Array) -> Array:
-    """(..., d, d) that makes errors of a covariance (..., d, d) independent with unit variance."""
+    """(..., d, d) matrix that makes errors with a covariance (..., d, d) independent with unit variance."""
     out: Array = np.linalg.inv(np.linalg.cholesky(covariance))
     return out
 
 
 def tukey_weights(sizes: Array, width: float) -> Array:
-    """Weights (n,) of residuals of these sizes (n,): Tukey's biweight, 0 from ``width`` on (infinite sizes, too)."""
+    """Weights (n,) of residuals with these norms (n,): Tukey's biweight, 0 from ``width`` on (for infinite norms,
+    too).
+    """
     out: Array = np.square(1.0 - np.square(np.minimum(sizes / width, 1.0)))
     return out
 
 
 def tukey_cost(sizes: Array, width: float) -> float:
-    """The sum of the loss whose weights :func:`tukey_weights` are: squared sizes where small, ``width²/3`` at most."""
+    """The sum of the loss that belongs to :func:`tukey_weights`: squared for small norms, ``width²/3`` at most."""
     return float((width**2 / 3.0 * (1.0 - (1.0 - np.square(np.minimum(sizes / width, 1.0))) ** 3)).sum())
 
 
 def robust_scale(sizes: Array, dimensions: int) -> float:
-    """Standard deviation of one coordinate, from lengths (n,) of residual vectors of as many dimensions: their median
-    over the chi distribution's; half of them may be wrong.
+    """Standard deviation of one coordinate, from the norms (n,) of residual vectors with ``dimensions`` coordinates:
+    the median norm over the chi distribution's median; up to half of them may be outliers.
     """
     return float(np.median(sizes)) / _chi_median(dimensions)
 

@@ -12,19 +12,19 @@ import numpy as np
 
 from gripmon.model.records import Array
 
-_WIDEST_RAD = math.radians(89.0)  # beyond it x/z is no useful coordinate
+_WIDEST_RAD = math.radians(89.0)  # beyond it x/z is not a useful coordinate
 _TABLE_SIZE = 2048
 _NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-7  # of the last step; convergence is quadratic, what remains is of the order of 1e-14
+_NEWTON_TOLERANCE = 1e-7  # of the last step; convergence is quadratic, so the remaining error is about 1e-14
 
 Jacobian = tuple[Array, Array, Array, Array]  # 2x2 by entries, row by row, each (n,)
 
 
 class LensMap(Protocol):
-    """Ideal (2, n) <-> distorted (2, n) normalised coordinates; NaN outside the domain."""
+    """Maps ideal (2, n) <-> distorted (2, n) normalised coordinates; NaN outside the domain."""
 
     fold_q: float  # distorted radius at which the model ends: it folds, or reaches the widest angle
-    folds: bool  # whether that end is a fold
+    folds: bool  # whether the model ends by folding
 
     def distort(self, xy: Array) -> Array: ...
     def distort_with_jacobian(self, xy: Array) -> tuple[Array, Jacobian]: ...
@@ -44,7 +44,7 @@ class PaperMap:
     def distort(self, xy: Array) -> Array:
         x, y = xy
         # s + k s³ = r has s = (2/w) sinh(asinh(1.5 w)/3) r with w = sqrt(3 k) r; sines where k < 0.  The tiny addend
-        # keeps w > 0 on the axis, where the quotient then is exactly 1.
+        # keeps w > 0 on the axis, where the quotient is then exactly 1.
         w = np.sqrt((3.0 * abs(self._k)) * (x * x + y * y) + 1e-300)
         if self.folds:
             domain = np.where(w < 2.0 / 3.0, w, np.nan)
@@ -81,7 +81,9 @@ class PaperMap:
 
 
 class BrownMap:
-    """OpenCV's rational polynomial with tangential and thin-prism terms; its inverse by Newton in two dimensions."""
+    """OpenCV's rational polynomial with tangential and thin-prism terms; inverted by Newton's method in two
+    dimensions.
+    """
 
     def __init__(self, coefficients: tuple[float, ...]) -> None:
         padded = (*coefficients, *([0.0] * (12 - len(coefficients))))
@@ -92,13 +94,13 @@ class BrownMap:
         top = np.polynomial.Polynomial([1.0, k1, k2, k3])
         bottom = np.polynomial.Polynomial([1.0, k4, k5, k6])
         t = np.polynomial.Polynomial([0.0, 1.0])
-        # d/dr of r N(r²)/D(r²) vanishes with this polynomial in t = r²; the model also ends where D does.
+        # d/dr of r N(r²)/D(r²) is zero where this polynomial in t = r² is; the model also ends where D is zero.
         slope = top * bottom + 2.0 * t * (top.deriv() * bottom - top * bottom.deriv())
         fold_r2 = min(_first_positive_root(slope), _first_positive_root(bottom))
         self.folds = fold_r2 < math.tan(_WIDEST_RAD) ** 2
         fold_rad = math.atan(math.sqrt(fold_r2)) if self.folds else _WIDEST_RAD
         self._max_r2 = math.tan(fold_rad) ** 2
-        # The fold itself has no inverse: the table stops a hair before it.
+        # The map can't be inverted at the fold itself: the table stops just before it.
         self._table_r = np.tan(np.linspace(0.0, fold_rad * (1.0 - 1e-9), _TABLE_SIZE))
         r2 = self._table_r**2
         self._table_q: Array = self._table_r * top(r2) / bottom(r2)
@@ -161,7 +163,7 @@ class BrownMap:
             inverse = (j11 * per_det, -j01 * per_det, -j10 * per_det, j00 * per_det)
             step = np.stack((inverse[0] * ex + inverse[1] * ey, inverse[2] * ex + inverse[3] * ey))
             xy = xy + step
-            unfinished = np.abs(step) > _NEWTON_TOLERANCE  # False for NaN: what left the domain stays NaN
+            unfinished = np.abs(step) > _NEWTON_TOLERANCE  # False for NaN: points that left the domain stay NaN
             if not unfinished.any():
                 return xy, inverse
         mask = np.where(unfinished.any(axis=0), np.nan, 1.0)
@@ -169,7 +171,7 @@ class BrownMap:
 
 
 class FisheyeMap:
-    """Purely radial in the angle from the axis; its inverse by Newton in one dimension."""
+    """Purely radial in the angle from the axis; inverted by Newton's method in one dimension."""
 
     def __init__(self, coefficients: tuple[float, ...]) -> None:
         k1, k2, k3, k4 = coefficients

@@ -1,24 +1,24 @@
-"""The columns that extrinsics have in a LeRobot dataset, whoever writes them."""
+"""The columns for extrinsics in a LeRobot dataset, the same for every writer."""
 
 from __future__ import annotations
 
 from typing import Any
 
 POSE_NAMES = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
-"""``cam_T_grip``: position (m), quaternion; all 0, which is no rotation, where it isn't known."""
+"""``cam_T_grip``: position (m), quaternion; all 0, which is not a rotation, where it is unknown."""
 
 
 def extrinsics_names(camera: str) -> tuple[str, str]:
-    """Of a camera (``wrist``, or its feature ``observation.images.wrist``): the feature with ``cam_T_grip``, and that
-    with its flag: 1 where it may be used.
+    """Feature names for a camera (``wrist``, or its feature ``observation.images.wrist``): the feature with
+    ``cam_T_grip``, and its flag: 1 where it may be used.
     """
     name = camera.removeprefix("observation.").removeprefix("images.")
     return f"observation.extrinsics.{name}", f"observation.extrinsics_valid.{name}"
 
 
 def extrinsics_features(camera: str) -> dict[str, dict[str, Any]]:
-    """Both as ``meta/info.json`` describes features.  A number's name is unique in the dataset, for LeRobot finds the
-    values of an observation by it.
+    """Both features as ``meta/info.json`` describes them.  Value names must be unique in the dataset, because LeRobot
+    looks up the values of an observation by name.
     """
     pose, flag = extrinsics_names(camera)
     values = {pose: [f"{pose.removeprefix('observation.')}.{one}" for one in POSE_NAMES]}

@@ -1,4 +1,4 @@
-"""Raw pixels as cameras send them, by ROS's names of their formats, and 16-bit ones of which they fill a part."""
+"""Raw pixels as cameras send them, named as in ROS, and 16-bit pixels of which the camera uses only part."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ BLUE, GREEN, RED = 0.114, 0.587, 0.299
 """Luma weights of ITU-R BT.601."""
 
 GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
-"""The same in OpenCV's channel order."""
+"""The same weights in OpenCV's channel order."""
 
 
 class Pixels(NamedTuple):
-    """How a pixel lies in memory.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the way to
-    BGR; neither where nothing is to be done.
+    """Memory layout of a pixel.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the
+    conversion to BGR; both are None if nothing has to be done.
     """
 
     channels: int
@@ -29,12 +29,12 @@ class Pixels(NamedTuple):
 
     @property
     def item_bytes(self) -> int:
-        """Of one channel."""
+        """Bytes of one channel."""
         return int(self.dtype[1])
 
 
 def _bayer() -> dict[str, Pixels]:
-    # Both ROS and OpenCV name the first two pixels of the first two rows here; OpenCV's short names don't.
+    # ROS and OpenCV's long names both name the first two pixels of the first two rows; OpenCV's short names don't.
     patterns = ("rggb", "bggr", "gbrg", "grbg")
     return {f"bayer_{p}{8 * n}": Pixels(1, f"u{n}", f"COLOR_Bayer{p.upper()}2BGR") for p in patterns for n in (1, 2)}
 
@@ -51,24 +51,24 @@ ENCODINGS: dict[str, Pixels] = {
     "rgb16": Pixels(3, "u2", "COLOR_RGB2BGR"),
     "bgra8": Pixels(4, "u1", "COLOR_BGRA2BGR"),
     "rgba8": Pixels(4, "u1", "COLOR_RGBA2BGR"),
-    # Brightness alone: it is all that is measured.
+    # Keep only the luma: it is all that is measured.
     "yuv422_yuy2": Pixels(2, "u1", only=0),
     "yuv422": Pixels(2, "u1", only=1),
     **_bayer(),
 }
-"""Formats of raw pixels, named as in ROS 2."""
+"""Raw pixel formats, named as in ROS 2."""
 
 
 def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
-    """H x W, or H x W x 3 (BGR), of rows (H, n) of channels in any byte order, what is beyond ``width`` pixels left
-    out; it may be a view of them.
+    """H x W, or H x W x 3 (BGR), from rows (H, n) of channels in any byte order, without what lies beyond ``width``
+    pixels; it may be a view of ``rows``.
     """
     image = rows[:, : width * pixels.channels]
     if pixels.channels > 1:
         image = image.reshape(len(rows), width, pixels.channels)
     if pixels.only is not None:
         image = image[:, :, pixels.only]
-    # In the machine's own byte order, of which OpenCV knows no other.
+    # OpenCV handles only the machine's own byte order.
     image = np.ascontiguousarray(image, dtype=f"={pixels.dtype}")
     if pixels.conversion is None:
         return image
@@ -79,15 +79,15 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
 
 
 def in_full_scale(frame: Frame, bit_depth: int) -> Frame:
-    """The frame with 16-bit grey levels up to 65535, of an image whose camera fills only the lowest ``bit_depth`` of
-    the 16 bits; without an image, and a fault that says why, where it holds more than these.
+    """The frame with 16-bit grey levels scaled to 65535, for a camera that fills only the lowest ``bit_depth`` of the
+    16 bits; if the image holds larger values, the frame without image and with a fault that gives the reason.
 
-    An image that this has been done to stays as it is, as a recorded one.
+    An image that was scaled already, for example a recorded one, stays as it is.
     """
     image = frame.image
     if bit_depth == 16 or not isinstance(image, np.ndarray) or image.dtype != np.uint16 or not image.size:
         return frame
-    # A look at some of them spares most images the whole comparison.
+    # Checking a subsample first spares most images the full comparison.
     if all(np.array_equal(part, _filled(_levels(part, bit_depth), bit_depth)) for part in (image[::16, ::16], image)):
         return frame
     brightest, top = int(image.max()), (1 << bit_depth) - 1
@@ -103,5 +103,7 @@ def _levels(image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
 
 
 def _filled(levels: NDArray[Any], bit_depth: int) -> NDArray[Any]:
-    """Grey levels of so many bits in 16: the high bits again as the low ones, so that the brightest becomes 65535."""
+    """Grey levels of ``bit_depth`` bits as 16 bits: the high bits are repeated as the low ones, so that white is
+    65535.
+    """
     return np.asarray((levels << (16 - bit_depth)) | (levels >> (2 * bit_depth - 16)), dtype=np.uint16)

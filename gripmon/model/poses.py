@@ -1,6 +1,6 @@
-"""SE(3) for every frame, compiled: the functions of :mod:`gripmon.model.geometry` that have the same names.
+"""SE(3) for every frame, compiled: same names as the functions of :mod:`gripmon.model.geometry`.
 
-Where nothing compiles they are those.  A transform is a contiguous float64 (4, 4) array here.
+Where numba can't run these names are those functions.  A transform is a contiguous float64 (4, 4) array here.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _perturb(a_T_b: Array, xi: Array) -> Array:
     for i in range(3):
         for j in range(3):
             turned[i, j] = turn[i][0] * a_T_b[0, j] + turn[i][1] * a_T_b[1, j] + turn[i][2] * a_T_b[2, j]
-    # One Newton step towards the nearest rotation: rounding does not pile up over millions of frames.
+    # One Newton step towards the nearest rotation, so that rounding errors don't build up over millions of frames.
     for j in range(3):
         for k in range(3):
             square = turned[0, k] * turned[0, j] + turned[1, k] * turned[1, j] + turned[2, k] * turned[2, j]
@@ -122,7 +122,7 @@ def to_record(a_T_b: Array) -> Transform:
 
 
 def warm_up() -> None:
-    """Compile, or load what was compiled."""
+    """Compile the functions, or load them from the cache."""
     here = np.eye(4)
     motion_between(here, perturb(here, perturbation_between(here, here)))
     to_record(here)

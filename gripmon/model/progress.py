@@ -1,4 +1,4 @@
-"""How long work tells that it goes on: whoever calls it decides how that is shown."""
+"""Progress callbacks: long work reports its steps, and the caller decides how to show them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 Progress = Callable[[int | None, str], AbstractContextManager[Callable[[], None]]]
-"""From the number of steps (None: unknown) and their unit to a context, which gives a function to call at each step."""
+"""Takes the number of steps (None: unknown) and their unit; returns a context that gives a function to call per
+step.
+"""
 
 
 def quiet(_total: int | None, _unit: str) -> AbstractContextManager[Callable[[], None]]:
-    """Shows nothing."""
+    """Show nothing."""
     return nullcontext(lambda: None)

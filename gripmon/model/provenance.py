@@ -1,4 +1,4 @@
-"""Where a file that was written comes from: command, time, versions, and what went in, to the byte."""
+"""Provenance of a written file: command, time, versions, and digests of the inputs."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, 64 
 
 
 class InputFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A file that a result was made of."""
+    """A file that a result was made from."""
 
     file: Annotated[str, Meta(description="its path, as it was given")]
     sha256: Digest
 
 
 class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How a file came about."""
+    """How a file was made."""
 
     gripmon: Annotated[str, Meta(description="version of gripmon that wrote it")]
     time: Annotated[str, Meta(description="when, UTC, ISO 8601")]
@@ -39,7 +39,7 @@ class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def provenance_of(command: str, inputs: Sequence[Path] = (), seed: int | None = None) -> Provenance:
-    """Of something that is written now.  OSError for an input that can't be read."""
+    """Provenance of a file that is written now.  OSError for an input that can't be read."""
     return Provenance(
         gripmon=__version__,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -51,7 +51,7 @@ def provenance_of(command: str, inputs: Sequence[Path] = (), seed: int | None = 
 
 
 def sha256_of(path: Path) -> str:
-    """Digest of a file's bytes.  OSError if it can't be read."""
+    """SHA-256 of a file's bytes.  OSError if it can't be read."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):

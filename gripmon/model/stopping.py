@@ -1,4 +1,6 @@
-"""Ends: requests by SIGINT and SIGTERM, from the first import to the last file that is closed, and a parent's end."""
+"""Stopping: SIGINT and SIGTERM, from the first import to the last file that is closed, and the end of a parent
+process.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ _Handler = Callable[[int, FrameType | None], None]
 
 
 class StopRequest:
-    """Asks the loop to end; a signal handler or any thread may do so.  The first request counts."""
+    """Asks the loop to stop; a signal handler or any thread may call it.  Only the first request counts."""
 
     def __init__(self) -> None:
         self.exit_code: int | None = None
@@ -31,11 +33,11 @@ class StopRequest:
 
 @contextlib.contextmanager
 def signals_exit() -> Iterator[StopRequest]:
-    """Around a start-up: SIGINT raises KeyboardInterrupt and SIGTERM SystemExit(0), which close what is open.
+    """For start-up: SIGINT raises KeyboardInterrupt and SIGTERM SystemExit(0), so that open resources are closed.
 
-    Python drops an exception that a handler raises while a destructor or a weak reference's callback runs, as they do
-    during every import.  The request that this gives stands all the same, for the loop that follows.  SIGINT is heard
-    also where a shell's background job began with ignoring it, as in the loop itself.
+    Python drops an exception that a handler raises while a destructor or a weak reference's callback runs, as happens
+    during every import.  The request object keeps the signal anyway, for the loop that follows.  As in the loop itself,
+    SIGINT is handled even if a shell started this background job with SIGINT ignored.
     """
     stop = StopRequest()
 
@@ -49,14 +51,14 @@ def signals_exit() -> Iterator[StopRequest]:
 
 @contextlib.contextmanager
 def signals_request(stop: StopRequest) -> Iterator[None]:
-    """Around a loop that looks at ``stop``: nothing is raised."""
+    """For a loop that polls ``stop``: nothing is raised."""
     with _handling(lambda number, _frame: _take(stop, number)):
         yield
 
 
 def end_with_parent() -> None:
-    """In a worker that :mod:`multiprocessing` spawned: ends it when its parent ends, also by SIGKILL or for want of
-    memory.  By itself it would wait for work for ever, with all of its memory.
+    """In a worker that :mod:`multiprocessing` spawned: exit when the parent ends, even if it was killed by SIGKILL or
+    for lack of memory.  Otherwise the worker would wait for work forever and keep all of its memory.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None, "only a spawned process has a parent to follow"
@@ -74,7 +76,9 @@ def _take(stop: StopRequest, number: int) -> None:
 
 @contextlib.contextmanager
 def _handling(handler: _Handler) -> Iterator[None]:
-    """A handler for a while.  Python allows that in the main thread only; elsewhere signals are left alone."""
+    """Install a signal handler temporarily.  Python allows that only in the main thread; elsewhere nothing is
+    changed.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

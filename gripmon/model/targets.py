@@ -1,4 +1,4 @@
-"""Flat calibration targets, as they are described on a command line or in a file."""
+"""Flat calibration targets, as described on a command line or in a file."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gripmon.model.errors import InputError
 _Count = Annotated[int, Meta(ge=2, le=200)]
 _Length = Annotated[float, Meta(gt=0.0, le=2.0)]
 FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9}
-"""Points that a view must show."""
+"""Minimum number of points in a view."""
 _WIDEST = 2.0
-"""A square beyond this many metres was meant in millimetres."""
+"""Largest square, m: a larger number was meant in millimetres."""
 
 
 class TargetError(InputError):
-    """A target that can't be; ``str()`` is one line: what is wrong; what would be right."""
+    """An impossible target; ``str()`` is one line: what is wrong; what would be right."""
 
     argument = "target"
 
@@ -32,7 +32,7 @@ class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
 
 
 class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="charuco"):
-    """A chequerboard with ArUco marks in white squares; ``columns`` and ``rows`` count *squares*, as OpenCV does."""
+    """A chequerboard with ArUco markers in white squares; ``columns`` and ``rows`` count *squares*, as OpenCV does."""
 
     columns: _Count
     rows: _Count
@@ -42,7 +42,7 @@ class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field
 
 
 class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="circles"):
-    """Discs on a square lattice, such as the self-viewing method's 8 x 8; dark on light or the reverse."""
+    """Discs on a square lattice, such as the self-viewing method's 8 x 8; dark on light or light on dark."""
 
     columns: _Count
     rows: _Count
@@ -59,7 +59,7 @@ _FORMS: dict[str, str] = {
 
 
 def parse_target(text: str) -> Target:
-    """A target from a command line.  Raises :class:`TargetError`."""
+    """Parse a target from a command line.  Raises :class:`TargetError`."""
     kind, *parts = text.split(":")
     kind = "chequerboard" if kind == "checkerboard" else kind
     if kind not in _FORMS:
@@ -83,7 +83,7 @@ def parse_target(text: str) -> Target:
 
 
 def checked(fields: dict[str, object], text: str, right: str) -> Target:
-    """A target from its fields.  Raises :class:`TargetError`."""
+    """Build a target from its fields.  Raises :class:`TargetError`."""
     if max((v for k, v in fields.items() if k.endswith("_m") and isinstance(v, float)), default=0.0) > _WIDEST:
         raise TargetError(
             f"'{text}': {fields.get('square_m', fields.get('spacing_m'))} m between its points (millimetres?); {right}"
@@ -108,7 +108,7 @@ def checked(fields: dict[str, object], text: str, right: str) -> Target:
 
 
 def name_of(target: Target) -> str:
-    """The target as :func:`parse_target` reads it."""
+    """The target in the form that :func:`parse_target` reads."""
     size = f"{target.columns}x{target.rows}"
     if isinstance(target, Chequerboard):
         return f"chequerboard:{size}:{target.square_m:g}"
@@ -118,8 +118,8 @@ def name_of(target: Target) -> str:
 
 
 def tells_its_turn(target: Target) -> bool:
-    """Whether an image of it tells which way up it is: by marks, or by the colours of a board whose numbers of corners
-    are one even, one odd (:mod:`gripmon.calibrate.detection`).
+    """Whether an image shows the target's orientation without ambiguity: by markers, or by the colours of a board with
+    one odd and one even number of corners (:mod:`gripmon.calibrate.detection`).
     """
     if isinstance(target, Chequerboard):
         return (target.columns + target.rows) % 2 == 1

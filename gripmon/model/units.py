@@ -1,4 +1,4 @@
-"""Lengths and angles as a person reads them, in two digits: 0.61, 1.2, 340."""
+"""Lengths and angles for people, with two significant digits: 0.61, 1.2, 340."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML as people mean it: duplicate keys refused, ``1e-3`` is a number, ``on`` and ``12:30`` are text."""
+"""YAML as people expect it: duplicate keys are rejected, ``1e-3`` is a number, ``on`` and ``12:30`` are text."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _TAG = "tag:yaml.org,2002:"
 
 
 class YamlFault(Exception):
-    """A text that can't be read: ``where`` (``line 3``, or empty) something is ``wrong``, and what would be ``right``
-    where that isn't the same for every file.
+    """A text that can't be parsed: ``where`` (``line 3``, or empty), what is ``wrong``, and what would be ``right`` if
+    that depends on the case and not on the file.
     """
 
     def __init__(self, where: str, wrong: str, right: str = "") -> None:
@@ -64,7 +64,7 @@ Loader.add_constructor(_TAG + "map", _mapping)
 
 
 def parse_yaml(text: str) -> Any:
-    """What a document holds.  Raises :class:`YamlFault`."""
+    """The contents of a document.  Raises :class:`YamlFault`."""
     try:
         return yaml.load(text, Loader)
     except yaml.MarkedYAMLError as error:

@@ -1,8 +1,8 @@
 """What the camera sees of the gripper: corners, edges and faces of its fingers, and how they move with the jaws.
 
 Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes
-from a YAML file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or
-as a table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
+from a YAML file; its coordinates hold at the nominal jaw opening.  Each finger translates without rotation, along an
+axis or as a table over the opening (adaptive grippers move on an arc, so that their fingertips also change depth).
 """
 
 from __future__ import annotations

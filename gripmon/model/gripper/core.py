@@ -1,4 +1,4 @@
-"""A gripper model in arrays: where its points are at an opening, and what of it shows from where."""
+"""A gripper model in arrays: where its points are at a jaw opening, and which parts are visible from a viewpoint."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ SMALLEST_SPREAD_RATIO = 0.02
 
 @dataclass(frozen=True, slots=True)
 class EdgeView:
-    """How the edges show from one viewpoint: arrays over all edges of the gripper.
+    """Visibility of all edges from one viewpoint: arrays over the gripper's edges.
 
-    ``visible``: at least one adjacent face looks at the camera (or the gripper has no faces there).  ``crease``: both
-    adjacent faces do, so that the edge is a line between two shades of the finger, not its outline.
-    ``inside_point_m`` (e, 3): a point of the visible adjacent face, gripper frame, that tells on which side of an
-    outline the finger lies; NaN if unknown.
+    ``visible``: at least one adjacent face is turned towards the camera (or the edge has no faces).  ``crease``: both
+    adjacent faces are, so that the edge separates two shades of the finger and is not its outline.  ``inside_point_m``
+    (e, 3): a point of the visible adjacent face, gripper frame, which shows on which side of an outline the finger
+    lies; NaN if unknown.
     """
 
     visible: NDArray[np.bool_]
@@ -44,9 +44,9 @@ class EdgeView:
 
 
 class Gripper:
-    """A checked gripper model in arrays.  Raises :class:`GripperError` when the model can't work.
+    """A validated gripper model in arrays.  Raises :class:`GripperError` if the model can't work.
 
-    ``faces`` are flat: one that the file has skewed is several here, and ``notes`` says so in words.
+    ``faces`` are planar: a face that isn't planar in the file is split into several, and ``notes`` reports it in words.
     """
 
     def __init__(self, model: GripperModel):
@@ -85,8 +85,8 @@ class Gripper:
         self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._point_faces = self._adjacency()
         self.landmarks = self._stand_for_the_tips()
-        """(l,) the points by which a view of the fingertips is judged: the corners; with fewer than three of them the
-        ends of curved edges, too, and if that isn't enough all points.
+        """(l,) points by which visibility of the fingertips is judged: the corners; with fewer than three corners also
+        the ends of curved edges, and if that isn't enough all points.
         """
         self.landmark_ids = tuple(self.point_ids[i] for i in self.landmarks)
         jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
@@ -98,8 +98,8 @@ class Gripper:
         self._check()
 
     def points_grip_m(self, jaw_opening_m: float | None = None, eye_grip_m: Array | None = None) -> Array:
-        """All points (p, 3) in the gripper frame at an opening (nominal if None); outside the jaw's range:
-        ValueError.  Points on what is round: where ``eye_grip_m`` (3,) sees its outline; as the file has them if None.
+        """All points (p, 3) in the gripper frame at an opening (nominal if None).  ValueError outside the jaw's range.
+        Points on round surfaces lie where ``eye_grip_m`` (3,) sees the outline; if it is None, where the file has them.
         """
         if jaw_opening_m is None or not self.has_jaw:
             return self._rounds.seen_from(eye_grip_m, self._nominal_points_m, np.zeros((1, 3)))
@@ -109,8 +109,8 @@ class Gripper:
         return self._rounds.seen_from(eye_grip_m, self._nominal_points_m + offsets_m, offsets_m)
 
     def point_motion(self, jaw_opening_m: float) -> Array:
-        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is
-        piecewise linear).
+        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is piecewise
+        linear).
         """
         low, high = max(jaw_opening_m - 5e-5, self.jaw_min_m), min(jaw_opening_m + 5e-5, self.jaw_max_m)
         if not high > low:
@@ -121,10 +121,11 @@ class Gripper:
     def tangents_m(
         self, points_m: Array, edge: NDArray[np.intp], fraction: Array, rotation: Array | None = None
     ) -> tuple[Array, Array]:
-        """``start`` and ``end`` (n, 3) for fractions (n,) of edges (n,): the place is ``start + fraction * (end -
-        start)``, and the edge goes ``end - start`` there.  A straight edge's two ends; on a curved one its tangent's.
+        """Tangents of edges (n,) at fractions (n,): ``start`` and ``end`` (n, 3), so that the place is ``start +
+        fraction * (end - start)`` and the edge's direction there is ``end - start``.  On a straight edge these are its
+        two ends, on a curved one those of its tangent.
 
-        ``points_m`` (p, 3): the gripper's points, in a frame that ``rotation`` (3, 3) turns its axes to.
+        ``points_m`` (p, 3): the gripper's points in any frame; ``rotation`` (3, 3) rotates gripper axes to that frame.
         """
         ends = self.edge_points[edge]
         start, end = points_m[ends[:, 0]], points_m[ends[:, 1]]
@@ -137,7 +138,7 @@ class Gripper:
         return start, end
 
     def outlines_m(self, points_m: Array, edges: NDArray[np.intp], count: int, rotation: Array | None = None) -> Array:
-        """(k, count, 3) places along edges (k,), evenly from end to end; ``points_m``, ``rotation`` as for
+        """(k, count, 3) places along edges (k,), evenly spaced from end to end; ``points_m``, ``rotation`` as for
         :meth:`tangents_m`.
         """
         edge, fraction = np.repeat(edges, count), np.tile(np.linspace(0.0, 1.0, count), len(edges))
@@ -145,7 +146,7 @@ class Gripper:
         return np.asarray(start + fraction[:, None] * (end - start)).reshape(len(edges), count, 3)
 
     def edge_view(self, points_grip_m: Array, eye_grip_m: Array) -> EdgeView:
-        """Which edges show from ``eye_grip_m`` (3,), the camera's centre in the gripper frame."""
+        """Which edges are visible from ``eye_grip_m`` (3,), the camera's centre in the gripper frame."""
         facing = self._facing(points_grip_m, eye_grip_m)
         seen = facing[self._edge_faces]
         known = self._edge_faces >= 0
@@ -158,11 +159,13 @@ class Gripper:
         return EdgeView(np.asarray(visible), crease, inside)
 
     def corners_visible(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
-        """(c,) whether a face at the corner looks at the camera; True for corners without faces."""
+        """(c,) whether a face at the corner is turned towards the camera; True for corners without faces."""
         return self.points_visible(points_grip_m, eye_grip_m, self.corner_points)
 
     def points_visible(self, points_grip_m: Array, eye_grip_m: Array, points: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(k,) whether a face at one of the ``points`` (k,) looks at the camera; True for those without faces."""
+        """(k,) whether a face at each of the ``points`` (k,) is turned towards the camera; True for points without
+        faces.
+        """
         facing, touching = self._facing(points_grip_m, eye_grip_m), self._point_faces[points]
         return np.asarray(~touching.any(axis=1) | (touching & facing[:-1]).any(axis=1))
 
@@ -173,18 +176,18 @@ class Gripper:
         return self._edges_at_corner[corner]
 
     def innermost_corners(self, among: NDArray[np.bool_], count: int | None) -> NDArray[np.bool_]:
-        """(c,) at most ``count`` (None: all) of the corners ``among`` (c,): the nearest to the TCP, fingers taking
-        turns.
+        """(c,) mask of at most ``count`` (None: all) of the corners ``among`` (c,): the nearest to the TCP, taken from
+        the fingers in turn.
 
-        On two fingertips with the inner corners ``among`` them, 4 is the paper's rectangle about the TCP, 5 adds an
-        outer corner, 3 leaves out one of the rectangle.  A finger of which none is ``among`` them is passed over; where
-        those taken would lie on a line, the last one gives way to the next one that doesn't.
+        With the inner corners of two fingertips ``among`` them, 4 gives the paper's rectangle around the TCP, 5 adds an
+        outer corner, 3 drops one of the rectangle.  A finger without corners ``among`` them is skipped.  If the chosen
+        corners would be collinear, the last is replaced by the next one that avoids this.
         """
         if count is None:
             return among
         outwards = self._corners_outwards[among[self._corners_outwards]]
         finger = self.point_finger[self.corner_points[outwards]]
-        # How many corners of the same finger lie further inside: the turn in which this one comes.
+        # A corner's turn: how many corners of the same finger are nearer to the TCP.
         turn = np.array([np.count_nonzero(finger[:i] == finger[i]) for i in range(len(finger))], dtype=np.intp)
         order = outwards[np.argsort(turn, kind="stable")]
         taken = order[:count]
@@ -198,7 +201,7 @@ class Gripper:
 
     def _from_the_tcp_outwards(self) -> NDArray[np.intp]:
         """(c,) indices of the corners by distance from the TCP at the nominal opening, so that the order doesn't change
-        while jaws move; equally far ones (to a tenth of a millimetre) as the file has them.
+        while the jaws move; ties (within 0.1 mm) keep the file's order.
         """
         distance_m = np.linalg.norm(self._nominal_points_m[self.corner_points], axis=1)
         return np.argsort(np.round(distance_m, 4), kind="stable")
@@ -247,7 +250,7 @@ class Gripper:
         return [FaceLoop(finger, loop[list(flat)]) for flat in self._flat(f"faces[{index}].points", corners)]
 
     def _check_outwards(self) -> None:
-        """Refuse faces that look into their finger; see :func:`gripmon.model.gripper.faces.inwards`."""
+        """Reject faces whose normal points into the finger; see :func:`gripmon.model.gripper.faces.inwards`."""
         loops = [tuple(self._point_index[p] for p in face.points) for face in self.model.faces]
         fingers = [face.finger for face in self.model.faces]
         wrong = inwards(fingers, loops, self._nominal_points_m)
@@ -257,7 +260,7 @@ class Gripper:
             )
 
     def _flat(self, key: str, corners: Array) -> list[tuple[int, ...]]:
-        """A face's corners (n, 3) by flat parts, each indices into them."""
+        """Split a face's corners (n, 3) into planar parts, each given as indices into the corners."""
         if not np.linalg.norm(normal_of(corners)) > 0.0:
             raise GripperError(f"{key}: these points lie on a line; the points in turn around the face")
         off_m = off_plane_m(corners)
@@ -276,14 +279,14 @@ class Gripper:
         return list(parts)
 
     def _spanning(self, face: FaceLoop) -> NDArray[np.intp]:
-        """Three consecutive points (3,) of a face that tell its plane best: others may lie on a straight line."""
+        """The three consecutive points (3,) of a face that define its plane best: others may be collinear."""
         loop = self._nominal_points_m[face.points]
         ahead, behind = np.roll(loop, -1, axis=0) - loop, np.roll(loop, 1, axis=0) - loop
         best = int(np.argmax(np.cross(ahead, behind) @ normal_of(loop)))
         return np.roll(face.points, 1 - best)[:3]
 
     def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Faces at each edge (e, 2), -1 for none, and whether a face touches a point (p, f)."""
+        """Adjacent faces of each edge (e, 2), -1 for none, and whether a face touches a point (p, f)."""
         members = [set(f.points.tolist()) for f in self.faces]
         edge_faces = np.full((len(self.edge_points), 2), -1, dtype=np.intp)
         for i, (start, end) in enumerate(self.edge_points.tolist()):
@@ -300,7 +303,7 @@ class Gripper:
         return next((some for some in (self.corner_points, of_curves) if len(some) >= 3), every)
 
     def _facing(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
-        """(f + 1,) which faces look at the eye; the last is False and stands for "no face" (index -1)."""
+        """(f + 1,) which faces are turned towards the eye; the last is False and stands for "no face" (index -1)."""
         out = np.zeros(len(self.faces) + 1, dtype=bool)
         if self.faces:
             first = points_grip_m[self._face_span]
@@ -345,6 +348,6 @@ POLARITY = {"any": 0, "right": 1, "left": -1}
 
 
 def on_a_line(points_m: Array) -> bool:
-    """Whether points (n, 3) lie on a line, or nearly so: two per cent of their extent beside it."""
+    """Whether points (n, 3) are collinear: they lie beside a line by at most two per cent of their extent."""
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
     return bool(spread[1] <= SMALLEST_SPREAD_RATIO * spread[0])

@@ -1,4 +1,4 @@
-"""Curved edges: smooth curves through points, as what they bulge from the straight line between their two ends."""
+"""Curved edges: smooth curves through points, stored as their offset from the straight line between the two ends."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 SHORTEST_PIECE_M = 1e-5
-"""Points of a curve nearer together than a file's digits tell apart are one point, m."""
+"""Minimum distance of a curve's points, m: points closer than a file's digits resolve are the same point."""
 
 
 class Curves:
-    """The curved ones among a gripper's edges, each a cubic spline over the length of the polyline through its points.
+    """A gripper's curved edges, each a cubic spline over the arc length of the polyline through its points.
 
-    A fraction of such an edge is one of that length.  Fingers move without turning, so that a curve keeps its shape
-    whatever the opening.
+    A fraction of such an edge is a fraction of that length.  Fingers don't rotate, so that a curve keeps its shape at
+    every opening.
     """
 
     def __init__(self, points_m: Sequence[Array | None], names: Sequence[str]):
@@ -33,8 +33,8 @@ class Curves:
         }  # fmt: skip
 
     def bulge_m(self, edge: NDArray[np.intp], fraction: Array) -> tuple[Array, Array]:
-        """How far (n, 3) points at fractions (n,) of edges (n,) lie from the straight line between the two ends,
-        gripper frame, and the derivative (n, 3) of that by the fraction; zero on straight edges.
+        """Offset (n, 3) from the straight line between the two ends at fractions (n,) of edges (n,), gripper frame, and
+        its derivative (n, 3) by the fraction; zero on straight edges.
         """
         bulge, rate = np.zeros((2, len(edge), 3))
         for i, spline in self._bulges.items():
@@ -44,8 +44,8 @@ class Curves:
 
 
 def _bulge(points_m: Array, name: str) -> CubicSpline:
-    """Through the points (n, 3), minus the way from the first to the last, by the fraction of the length."""
-    from scipy.interpolate import CubicSpline  # half a second, for a gripper that has a curve
+    """Spline through the points (n, 3) less the chord from first to last, over the fraction of the length."""
+    from scipy.interpolate import CubicSpline  # takes half a second: only for a gripper that has a curve
 
     length_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     if not (length_m > SHORTEST_PIECE_M).all():

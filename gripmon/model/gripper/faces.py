@@ -1,4 +1,4 @@
-"""Faces of a gripper: loops of points in one plane, or triangles where they aren't."""
+"""Faces of a gripper: planar loops of points, or triangles where a loop isn't planar."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from gripmon.model.records import Array
 
 LARGEST_WARP_M = 5e-4
-"""A loop this far off its plane still counts as flat: as exactly as callipers measure."""
+"""Deviation from its plane up to which a loop counts as planar, m: the accuracy of callipers."""
 
 LARGEST_SKEW = 0.1
-"""A loop farther off its plane, as a part of its extent, is not a face: one of its points is wrong."""
+"""Deviation from its plane, as a fraction of its extent, above which a loop is not a face: one of its points is
+wrong.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +26,12 @@ class FaceLoop:
 
 
 def normal_of(loop: Array) -> Array:
-    """Outward normal (3,) of a loop of points (n, 3) (Newell), not normalised."""
+    """Outward normal (3,) of a loop of points (n, 3) by Newell's method, not normalised."""
     return np.cross(loop, np.roll(loop, -1, axis=0)).sum(axis=0)
 
 
 def off_plane_m(loop: Array) -> float:
-    """How far points (n, 3) of a loop lie from their mean plane, at most."""
+    """Largest distance of points (n, 3) of a loop from their mean plane."""
     normal = normal_of(loop)
     return float(np.abs((loop - loop.mean(axis=0)) @ normal).max() / np.linalg.norm(normal))
 
@@ -40,11 +42,11 @@ def extent_m(loop: Array) -> float:
 
 
 def inwards(fingers: Sequence[str], loops: Sequence[tuple[int, ...]], points_m: Array) -> int | None:
-    """The first face that looks into its finger; None if there is none.
+    """The first face whose normal points into its finger; None if there is none.
 
-    A face runs through each edge in the way opposite to its neighbour's, and all faces of a finger together bound a
-    positive volume (what is open is closed towards the finger's middle).  So fingers need not be convex, nor closed; a
-    face without neighbours looks away from the middle.
+    Correct faces pass each shared edge in opposite directions, and all faces of a finger together bound a positive
+    volume (openings are closed towards the finger's centre).  So fingers need neither be convex nor closed; a face
+    without neighbours must face away from the centre.
     """
     of_finger: dict[str, set[int]] = {}
     for finger, loop in zip(fingers, loops, strict=True):
@@ -68,9 +70,9 @@ def inwards(fingers: Sequence[str], loops: Sequence[tuple[int, ...]], points_m: 
 
 
 def triangles(loop: Array) -> list[tuple[int, int, int]] | None:
-    """A loop (n, 3) that isn't flat as triangles, indices into it, turned as it is; None if it crosses itself.
+    """Triangulate a non-planar loop (n, 3): indices into it, with its orientation; None if it crosses itself.
 
-    Of the ways to cut it the one that bulges outwards: fingers are convex solids.
+    Of the possible triangulations it takes the one that bulges outwards: fingers are convex solids.
     """
     normal = normal_of(loop) / np.linalg.norm(normal_of(loop))
     left, out = list(range(len(loop))), []
@@ -89,7 +91,7 @@ def _corner(left: list[int], k: int) -> tuple[int, int, int]:
 
 
 def _is_ear(loop: Array, left: list[int], k: int, normal: Array) -> bool:
-    """Whether a corner can be cut off, seen along the normal: it juts out, and no other point lies in it."""
+    """Whether a corner can be cut off, seen along the normal: it is convex, and no other point lies in its triangle."""
     a, b, c = (loop[i] for i in _corner(left, k))
     area = float(np.cross(b - a, c - a) @ normal)
     if area <= 1e-9 * extent_m(loop) ** 2:
@@ -100,7 +102,7 @@ def _is_ear(loop: Array, left: list[int], k: int, normal: Array) -> bool:
 
 
 def _hidden_m(loop: Array, left: list[int], k: int, normal: Array) -> float:
-    """How far the rest of the loop would stand out over the cut: less is more convex."""
+    """How far the rest of the loop would protrude beyond the cut: less means more convex."""
     a, b, c = (loop[i] for i in _corner(left, k))
     outwards = np.cross(b - a, c - a)
     return float(((loop[left] - a) @ outwards).max() / np.linalg.norm(outwards))

@@ -14,7 +14,7 @@ from gripmon.model.gripper.model import GripperError, GripperModel
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """Takes times, as in a provenance, for the text that they are."""
+    """Keeps times, as in a provenance, as text."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -24,7 +24,7 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def gripper_from_dict(value: Any) -> Gripper:
-    """A parsed YAML document -> :class:`Gripper`.  ValidationError of msgspec where a key or a type is wrong."""
+    """A parsed YAML document -> :class:`Gripper`.  msgspec's ValidationError for a wrong key or type."""
     return Gripper(msgspec.convert(value, GripperModel))
 
 

@@ -1,4 +1,4 @@
-"""A gripper file as it is written."""
+"""The schema of a gripper file."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Metres of finger motion in the gripper frame for each metre of opening beyond nominal."""
+    """Finger motion in the gripper frame, in metres per metre of opening beyond the nominal one."""
 
     axis: Vector
 
 
 class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Rows ``opening_m, dx_m, dy_m, dz_m``, openings ascending; linear between rows."""
+    """Rows ``opening_m, dx_m, dy_m, dz_m`` with ascending openings; linear between rows."""
 
     table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
 
@@ -41,10 +41,11 @@ class FingerModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class RoundModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a point of an outline lies on: a surface that is round about ``axis`` through ``centre_m``.
+    """The round surface that a point of an outline lies on: a surface of revolution around ``axis`` through
+    ``centre_m``.
 
-    The outline of a cylinder or ball isn't a line on it: it is where the surface turns away from the eye, and wanders
-    as the view changes.  Coordinates as the point's own, at the nominal opening.
+    The outline of a cylinder or ball isn't a fixed line on it: it lies where the surface turns away from the eye, and
+    moves as the view changes.  Coordinates are given like the point's own, at the nominal opening.
     """
 
     centre_m: Vector
@@ -55,7 +56,7 @@ class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     finger: str
     xyz_m: Vector
     corner: bool = False
-    round: RoundModel | msgspec.UnsetType = msgspec.UNSET  # not None: digests of files without it stay as they were
+    round: RoundModel | msgspec.UnsetType = msgspec.UNSET  # not None: keeps the digests of files without it
 
 
 class EdgeModel(
@@ -77,7 +78,7 @@ class FaceModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A gripper file as it is written; see ``configs/grippers`` for commented ones."""
+    """A gripper file; see ``configs/grippers`` for commented ones."""
 
     name: str
     fingers: dict[str, FingerModel]
@@ -89,9 +90,9 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 def contents_of(model: GripperModel) -> dict[str, Any]:
-    """What a gripper file says of the gripper, for digests: all but where the file comes from."""
+    """The contents of a gripper file that describe the gripper, for digests: all but its provenance."""
     contents = {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
     for edge in contents["edges"].values():
-        if not edge["via"]:  # digests of grippers without curves are older than curves
+        if not edge["via"]:  # digests of grippers without curves date from before curves
             del edge["via"]
     return contents

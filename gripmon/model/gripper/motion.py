@@ -1,4 +1,4 @@
-"""How a finger moves with the jaws: a table over the opening."""
+"""Finger motion with the jaws, as a table over the opening."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _T = TypeVar("_T")
 
 
 def motion_table(name: str, motion: dict[str, Any] | None, jaw: JawModel | None) -> Array:
-    """Table (rows, 4) of opening and offset; an axis becomes the table of its two ends."""
+    """Table (rows, 4) of opening and offset; an axis becomes a table with its two ends."""
     if motion is None:
         return np.zeros((1, 4))
     key = f"fingers.{name}.motion"
@@ -41,7 +41,7 @@ def motion_table(name: str, motion: dict[str, Any] | None, jaw: JawModel | None)
 
 
 def offset_m(table: Array, opening_m: float) -> Array:
-    """Of a finger (3,) in the gripper frame at an opening."""
+    """Offset (3,) of a finger in the gripper frame at an opening."""
     if len(table) == 1:
         return table[0, 1:]
     k = int(table[:, 0].searchsorted(opening_m, "right")) - 1

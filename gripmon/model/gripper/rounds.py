@@ -1,4 +1,4 @@
-"""Outlines of what is round: they wander over the surface as the view changes."""
+"""Outlines of round surfaces: they move over the surface as the view changes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LARGEST_RADIUS_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Rounds:
-    """The points (r,) that lie on something round: ``which``, its ``centres_m`` and unit ``axes`` (r, 3), ``radius_m``
-    (r,) and the directions ``outwards`` (r, 3) from the axis to the points.
+    """The points (r,) on round surfaces: ``which``, the ``centres_m`` and unit ``axes`` (r, 3), ``radius_m`` (r,), and
+    the directions ``outwards`` (r, 3) from the axis to the points.
     """
 
     which: NDArray[np.intp]
@@ -28,7 +28,7 @@ class Rounds:
 
     @classmethod
     def of(cls, points: Mapping[str, PointModel], points_m: Array) -> Rounds:
-        """From a gripper's points; :class:`GripperError` for a rounding that is none."""
+        """From a gripper's points; :class:`GripperError` for an impossible rounding."""
         names = list(points)
         rounds = [point.round for point in points.values()]
         which = [k for k, each in enumerate(rounds) if isinstance(each, RoundModel)]
@@ -42,7 +42,7 @@ class Rounds:
                 raise GripperError(f"{key}: holds no centre or no direction; ordinary numbers, an axis that isn't zero")
         axes = axes / length[:, None]
         away = points_m[which] - centres
-        # Along the axis the centre may be anywhere: it is put beside the point.
+        # The centre may be anywhere along the axis: move it to the point's height.
         along = np.einsum("ri,ri->r", away, axes)[:, None] * axes
         away = away - along
         radius = np.linalg.norm(away, axis=1)
@@ -54,11 +54,11 @@ class Rounds:
         return cls(np.array(which, dtype=np.intp), centres + along, axes, radius, away / radius[:, None])
 
     def seen_from(self, eye_grip_m: Array | None, points_grip_m: Array, offsets_m: Array) -> Array:
-        """The points (p, 3), those on what is round moved to where the eye (3,) sees its outline.
+        """The points (p, 3), with those on round surfaces moved to where the eye (3,) sees the outline.
 
-        Across the axis that is the point of a circle whose tangent passes through the eye, of the two the one on the
-        point's side.  ``offsets_m`` (p or 1, 3): how far the fingers have moved.  An eye inside of the rounding sees no
-        outline: such points stay.
+        In the plane across the axis that is the tangent point of a line from the eye to the circle; of the two, the one
+        on the point's side.  ``offsets_m`` (p or 1, 3): how far the fingers have moved.  An eye inside the rounding
+        sees no outline: such points stay.
         """
         if eye_grip_m is None or not len(self.which):
             return points_grip_m

@@ -1,13 +1,13 @@
-"""The records that travel between rooms, and what of them goes over the wire.
+"""The records passed between rooms, and the messages that go over the wire.
 
-Everything here is a value: frozen, without behaviour beyond packing.  The structs are encoded by ``msgspec``; the field
+Everything here is a value: frozen, with no behaviour beyond packing.  The structs are encoded by ``msgspec``; the field
 names of :class:`FrameRecord` are the contract of one JSON line a frame (``gripmon replay``) and of the ``transform``
 key.
 
 Conventions: ``a_T_b`` maps coordinates in frame b to frame a; quaternions are ``x, y, z, w``; SI units; ``*_ns`` are
 Unix nanoseconds for capture time.  A covariance is 6x6, row by row: first the error of the TCP's position in camera
-axes (m²), then the rotation error vector in camera axes (rad²), that is ``t_true = t + rho`` and ``R_true =
-exp(omega) R``.
+axes (m²), then the rotation error vector in camera axes (rad²), that is ``t_true = t + rho`` and ``R_true = exp(omega)
+R``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Alerts: what they are about, what may have caused it, and their life from raised to cleared."""
+"""Alerts: their subject, possible causes, and life cycle from raised to cleared."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gripmon.model.records.values import OpenEnum
 
 
 class Severity(enum.StrEnum):
-    """How bad it is."""
+    """How severe an alert is."""
 
     INFO = "info"
     WARNING = "warning"
@@ -21,7 +21,7 @@ class Severity(enum.StrEnum):
 
 
 class Cause(OpenEnum):
-    """What an alert believes to have happened."""
+    """What has probably happened."""
 
     CAMERA_MOUNT = "camera_mount_moved"
     FINGER_BENT = "finger_bent"
@@ -40,7 +40,7 @@ class Cause(OpenEnum):
 
 
 class AlertKind(OpenEnum):
-    """What an alert is about."""
+    """The subject of an alert."""
 
     STEP = "step"
     CREEP = "creep"
@@ -65,7 +65,7 @@ class AlertKind(OpenEnum):
 
 
 class AlertEvent(enum.StrEnum):
-    """Where an alert is in its life; ``noted`` is an event that neither lasts nor is cleared."""
+    """The step in an alert's life cycle; ``noted`` is a single event that neither lasts nor is cleared."""
 
     RAISED = "raised"
     UPDATED = "updated"
@@ -74,7 +74,7 @@ class AlertEvent(enum.StrEnum):
 
 
 class CauseWeight(msgspec.Struct, frozen=True):
-    """How probable a cause is."""
+    """The probability of a cause."""
 
     cause: Cause
     probability: Annotated[float, Meta(description="0 to 1; those of one alert add up to 1")]

@@ -1,4 +1,4 @@
-"""What an operator may tell a running monitor, and what it answers."""
+"""The commands to a running monitor, and its answers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gripmon.model.records.values import OpenEnum
 
 
 class CommandName(enum.StrEnum):
-    """What an operator may tell a running monitor."""
+    """A command that an operator may send to a running monitor."""
 
     RECALIBRATE = "recalibrate"
     ACCEPT = "accept"
@@ -27,8 +27,8 @@ class CommandName(enum.StrEnum):
 
 
 class Command(msgspec.Struct, frozen=True):
-    """``argument``: for ``undo`` the reference to go back to (empty: the one before), for ``accept`` and ``reject`` the
-    proposal that is meant (empty: the one there is), for ``acknowledge`` the alert (empty: all that are open).
+    """``argument``: for ``undo`` the reference to go back to (empty: the previous one), for ``accept`` and ``reject``
+    the proposal (empty: the current one), for ``acknowledge`` the alert (empty: all open ones).
     """
 
     name: CommandName
@@ -36,7 +36,7 @@ class Command(msgspec.Struct, frozen=True):
 
 
 def accepting(reference_id: str, robot: str, camera: str) -> str:
-    """What an operator types to let a proposed reference in."""
+    """The command that an operator types to accept a proposed reference."""
     return f"gripmon send accept {reference_id} --robot {robot} --camera {camera}"
 
 
@@ -46,10 +46,10 @@ _PRINTED = r"^[^\x00-\x1f\x7f]*(?![\s\S])"  # it appears in logs and on terminal
 class CommandRequest(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schema", tag="gripmon.command/1"
 ):
-    """The payload of a command; none at all is an empty argument.
+    """The payload of a command; no payload means an empty argument.
 
-    The command's name is the last part of the key.  A field that the monitor doesn't know is refused: what it can't
-    honour it must not carry out.
+    The command's name is the last part of the key.  The monitor refuses a field that it doesn't know: it must not carry
+    out what it can't honour.
     """
 
     argument: Annotated[
@@ -89,11 +89,11 @@ class SnapshotImage(msgspec.Struct, frozen=True):
 
 
 Outlines = tuple[tuple[tuple[float, float], ...], ...]
-"""Lines in an image, each through its points (u, v), px."""
+"""Lines in an image, each given by its points (u, v), px."""
 
 
 class Snapshot(msgspec.Struct, frozen=True):
-    """The newest frame: what the monitor made of it, and its image."""
+    """The newest frame: the monitor's record of it, and its image."""
 
     record: Annotated[FrameRecord, Meta(description="the transform message of that frame")]
     age_s: Annotated[float, Meta(description="from when it was judged to when it was asked for, s")]
@@ -135,7 +135,7 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
 
 
 class CommandFault(OpenEnum):
-    """Why a command did not reach the monitor, or nothing is known of what became of it."""
+    """Why a command did not reach the monitor, or why its outcome is unknown."""
 
     UNKNOWN = "unknown_command"
     MALFORMED = "malformed"
@@ -149,7 +149,7 @@ class CommandFault(OpenEnum):
 
 
 class CommandError(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.error/1"):
-    """In place of a reply: the command was not carried out, or perhaps was; the text says which."""
+    """In place of a reply: the command was not carried out, or may have been; the text says which."""
 
     error: CommandFault
     text: Annotated[str, Meta(description="what went wrong, in one line for a person")]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Verdict(enum.StrEnum):
-    """May a controller use the transform?"""
+    """Whether a controller may use the transform."""
 
     VALID = "valid"
     SUSPECT = "suspect"
@@ -39,7 +39,7 @@ class State(OpenEnum):
 
 
 class Origin(OpenEnum):
-    """How the transform of a frame came about (``source`` on the wire)."""
+    """How the transform of a frame was obtained (``source`` on the wire)."""
 
     UPDATE = "update"
     RECALIBRATION = "recalibration"
@@ -76,12 +76,13 @@ class CornerFault(OpenEnum):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One camera frame as a source hands it over.
+    """One camera frame as a source delivers it.
 
-    ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
-    (truncated file, failed read); ``fault`` then says why in a few words, ``refusal`` in one.  ``jaw_opening_m`` is
-    what the robot reported for this frame, None if no one did.  ``name`` is the file or stream that it came from.
-    ``arrived_ns``: when the capture was over or the frame came to this machine, by the monotonic clock (ns); None: now.
+    ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None if the source could not make one
+    (truncated file, failed read); ``fault`` then gives the reason in a few words, ``refusal`` as an enum.
+    ``jaw_opening_m`` is what the robot reported for this frame, None if nothing was reported.  ``name`` is the file or
+    stream that the frame came from.  ``arrived_ns``: when the capture was over or the frame reached this machine, by
+    the monotonic clock (ns); None: now.
     """
 
     seq: int
@@ -146,18 +147,18 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
 
     @property
     def measured(self) -> bool:
-        """Whether it has a transform that comes from this frame: one that isn't held."""
+        """Whether it has a transform measured in this frame, not a held one."""
         return self.source is not Origin.HELD and self.cam_T_grip is not None
 
 
 @dataclass(frozen=True, slots=True)
 class MeasurementTrace:
-    """Pixels behind the newest record, for people who look: all positions in the distorted image, px.
+    """The pixels behind the newest record, for display: all positions in the distorted image, px.
 
-    ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether the fit believed them,
-    ``edge_index`` (n,) the gripper edge each belongs to, ``edge_residual_px`` (n,) how far across it they lie from
-    where the fit has it; ``predicted_edges_uv_px`` one polyline (k, 2) a visible
-    edge; ``predicted_corners_uv_px`` (c, 2) in the order of the gripper model, NaN where a corner is not visible.
+    ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether they are inliers of the fit,
+    ``edge_index`` (n,) the gripper edge of each, ``edge_residual_px`` (n,) their distance across the edge from the
+    fitted one; ``predicted_edges_uv_px`` one polyline (k, 2) per visible edge; ``predicted_corners_uv_px`` (c, 2) in
+    the order of the gripper model, NaN where a corner is not visible.
     """
 
     edge_uv_px: Array
@@ -169,7 +170,7 @@ class MeasurementTrace:
 
 
 def withheld(record: FrameRecord, reason: str) -> FrameRecord:
-    """The record without what anybody could move by."""
+    """The record without anything that someone could move by."""
     return msgspec.structs.replace(
         record,
         verdict=Verdict.UNKNOWN,
@@ -192,7 +193,7 @@ def unmeasured_record(
     corners: tuple[CornerRecord, ...] = (),
     alerts: tuple[Alert, ...] = (),
 ) -> FrameRecord:
-    """The record of a frame that gave no measurement, without a transform: by default there is nothing to stand by."""
+    """The record of a frame that gave no measurement: without a transform and, by default, with verdict ``unknown``."""
     return FrameRecord(
         seq=frame.seq,
         stamp_ns=frame.stamp_ns,

@@ -21,10 +21,10 @@ _LATER_TEXT = "; later versions may have more names"
 
 
 def json_schema(names: Sequence[str] = tuple(MESSAGES)) -> dict[str, Any]:
-    """The schema of one message, or of any of several, by their names in :data:`gripmon.model.records.MESSAGES`.
+    """The JSON Schema of one message, or of any of several, by their names in :data:`gripmon.model.records.MESSAGES`.
 
-    It holds for this version and for later ones of the same major version: fields and names that aren't known pass.
-    KeyError for a name that is none.
+    It holds for this version and for later ones of the same major version: unknown fields and names are accepted.
+    KeyError for an unknown message name.
     """
     types = [MESSAGES[name] for name in names]
     references, definitions = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
@@ -46,13 +46,13 @@ def summary(name: str) -> str:
 
 
 def _plain(docstring: str) -> str:
-    """Its paragraphs, a line each, without marks."""
+    """A docstring's paragraphs, one line each, without markup."""
     paragraphs = inspect.cleandoc(docstring).replace("``", "").split("\n\n")
     return "\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
 def _open(definition: dict[str, Any], kind: type[OpenEnum]) -> None:
-    """Any other name passes, too."""
+    """Accept any other name, too."""
     known = {"enum": [member.value for member in kind]}
     definition.pop("enum")
     definition["anyOf"] = [known, {"type": "string"}]
@@ -61,5 +61,5 @@ def _open(definition: dict[str, Any], kind: type[OpenEnum]) -> None:
 
 def _say_schema(definition: dict[str, Any], message: type[msgspec.Struct]) -> None:
     definition["properties"]["schema"]["description"] = _SCHEMA_TEXT
-    if message in _FROM_OTHERS:  # who writes these by hand may leave it out
+    if message in _FROM_OTHERS:  # hand-written messages may omit it
         definition["required"] = [field for field in definition.get("required", ()) if field != "schema"]

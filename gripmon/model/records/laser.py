@@ -1,4 +1,4 @@
-"""A second camera that is watched by a pulsed laser: what the robot tells, and what became of each pulse."""
+"""A second camera that a pulsed laser checks: the pulses that the robot reports, and the result of each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ArmPose(msgspec.Struct, frozen=True):
 
 
 class LaserPulse(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.pulse/1"):
-    """A pulse of the laser on the end-effector, which the robot's program tells."""
+    """A pulse of the laser on the end-effector, reported by the robot's program."""
 
     stamp_ns: Annotated[
         Stamp, Meta(description="from then on the laser was on and the hand stood still, Unix ns, the images' clock")
@@ -36,7 +36,7 @@ class LaserPulse(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", 
 
 
 class PulseFault(OpenEnum):
-    """Why a pulse was not judged, or its spot not believed."""
+    """Why a pulse was not judged, or its spot was rejected."""
 
     NO_FRAME = "no_frame"
     TOO_LATE = "too_late"
@@ -52,7 +52,7 @@ class PulseFault(OpenEnum):
 
 
 class SpotGap(msgspec.Struct, frozen=True):
-    """Two of the three ways to a spot, and how far apart they put it."""
+    """Two of the three ways to compute a spot, and how far apart they put it."""
 
     ways: Annotated[tuple[str, str], Meta(description="which two: beam and plane, ray and plane, beam and ray")]
     gap_m: Annotated[Vector, Meta(description="from one to the other, base frame, m")]
@@ -79,7 +79,7 @@ class CameraShift(msgspec.Struct, frozen=True):
 
 
 class SpotRecord(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.spot/1"):
-    """What became of one pulse of the laser."""
+    """The result of one laser pulse."""
 
     pulse: Annotated[int, Meta(description="counts the pulses that were told")]
     seq: Annotated[int, Meta(description="of its last frame that was used, else of the newest; -1: none yet")]

@@ -1,4 +1,4 @@
-"""What survives a restart of the gripper's learned look."""
+"""The part of the gripper's learned look that survives a restart."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gripmon.model.records.values import Covariance, Transform
 
 
 class LookVersion(msgspec.Struct, frozen=True):
-    """Which learnt look it is, and where it comes from."""
+    """Which learned look it is, and where it comes from."""
 
     number: Annotated[int, Meta(ge=1, description="1 for the first; grows when the look counts as a new one")]
     origin: Annotated[str, Meta(description="start, or what made it a new one")]
@@ -22,7 +22,7 @@ class LookVersion(msgspec.Struct, frozen=True):
 
 
 class LookNote(msgspec.Struct, frozen=True):
-    """What an alert about the look is of: a picture of it, without the image."""
+    """The look that an alert is about: a picture of it, without the image."""
 
     version: LookVersion
     views: Annotated[int, Meta(description="frames with another background that it was learnt from")]
@@ -32,7 +32,7 @@ class LookNote(msgspec.Struct, frozen=True):
 
 
 class LookPixels(msgspec.Struct, frozen=True):
-    """Blocks of pixels inside the fingers as learnt; bytes are little-endian and in JSON base64."""
+    """Blocks of pixels inside the fingers, as learned; bytes are little-endian and base64 in JSON."""
 
     cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when the blocks were chosen")]
     jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
@@ -46,7 +46,7 @@ class LookPixels(msgspec.Struct, frozen=True):
 
 
 class LookBias(msgspec.Struct, frozen=True):
-    """What the look has too much against the edges, and how certain that is."""
+    """The look's bias against the edges, and its uncertainty."""
 
     backgrounds: Annotated[int, Meta(ge=1, description="that it was averaged over")]
     bias: Annotated[tuple[float, float, float, float, float, float], Meta(description="m and rad, camera axes")]
@@ -72,7 +72,7 @@ class FinerLookRecord(msgspec.Struct, frozen=True):
 
 
 class LookRecord(msgspec.Struct, frozen=True):
-    """Learned texture of the fingers; bytes are little-endian and in JSON base64."""
+    """Learned texture of the fingers; bytes are little-endian and base64 in JSON."""
 
     camera: Annotated[str, Meta(description="digest of the camera model that it was learnt with")]
     gripper: Annotated[str, Meta(description="digest of the gripper file")]

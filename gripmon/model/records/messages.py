@@ -1,4 +1,4 @@
-"""What goes over the wire beside the frames' own records."""
+"""Messages on the wire other than the frames' own records."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gripmon.model.records.frames import State, Verdict
 
 
 class StandingAlert(msgspec.Struct, frozen=True):
-    """What a table needs of an alert that is raised and not cleared yet."""
+    """What a table shows of an alert that is raised and not cleared yet."""
 
     alert_id: Annotated[str, Meta(description="the same from raised to cleared")]
     kind: AlertKind
@@ -94,7 +94,7 @@ class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gri
 
 
 class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.clock/1"):
-    """What the monitor's steady clock shows: as a transform is sent, attached to it, or as it is asked for."""
+    """A reading of the monitor's monotonic clock: attached to a transform as it is sent, or in reply to a query."""
 
     clock: Annotated[str, Meta(max_length=64, description="which clock; another one after every start of the monitor")]
     now_ns: Annotated[
@@ -103,7 +103,7 @@ class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
 
 
 class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
-    """The opening of the jaws, which the robot writes."""
+    """The jaw opening, which the robot publishes."""
 
     stamp_ns: Annotated[int, Meta(description="when it was measured, Unix ns; 0 if that isn't known")]
     opening_m: Annotated[float, Meta(description="distance of the jaws as the gripper file counts it, m")]
@@ -121,7 +121,7 @@ class FrameNote(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", t
         ]
         | None
     ) = None
-    # A little below 0, too: an encoder says so of closed jaws, and the image beside it is sound.
+    # Slightly negative values are allowed: encoders report them for closed jaws, and the image is still good.
     jaw_opening_m: (
         Annotated[float, Meta(ge=-1e-3, le=1.0, description="opening of the jaws at that time, m; absent: not known")]
         | None

@@ -1,4 +1,4 @@
-"""What the frames so far add up to: has the camera moved, how, and why?"""
+"""The result of the drift test: has the camera moved, how, and why?"""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class Creep:
 
     @property
     def rate_m_per_min(self) -> float:
-        """Of the TCP."""
-        import numpy as np  # not at the top: who only reads messages needn't load it
+        """Speed of the TCP."""
+        import numpy as np  # not at the top: programs that only read messages needn't load it
 
         return 60.0 * float(np.linalg.norm(self.velocity[:3]))
 
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """Root mean square of the TCP's motion about its mean, m, and its strongest frequency, 1/s; that is seen in a frame
-    rate's light only: beyond half of it frequencies fold back.
+    """Root mean square of the TCP's motion about its mean, m, and its strongest frequency, 1/s.  The frame rate limits
+    it: frequencies above half of it are aliased.
     """
 
     rms_m: float
@@ -37,12 +37,12 @@ class Vibration:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What a frame adds up to.
+    """The drift test's result for a frame.
 
     ``present``: the camera isn't where the reference has it, by the mean ``shift`` (6,) of the last ``frames`` frames
-    with standard deviations ``sigma`` (6,); ``kind``: step, creep, or drift where neither is certain.  ``begun``: it
-    has just been found; ``stepped``: it has just moved at once, ``step_frames`` ago.  ``suspicious``: something speaks
-    for it.
+    with standard deviations ``sigma`` (6,); ``kind``: step, creep, or drift if neither is certain.  ``begun``: the
+    motion was detected in this frame; ``stepped``: it was a step, ``step_frames`` ago.  ``suspicious``: there is some
+    evidence for a motion.
     """
 
     present: bool
@@ -59,13 +59,15 @@ class Motion:
 
     @property
     def quiet(self) -> bool:
-        """Nothing moves and nothing speaks for it."""
+        """Nothing moves, and there is no evidence for a motion."""
         return not (self.present or self.suspicious or self.vibration is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What may have caused what is seen: all that were weighed, the ``probable`` one, and a sentence about it."""
+    """What may have caused an observation: all causes that were weighed, the ``probable`` one, and a sentence about
+    it.
+    """
 
     causes: tuple[CauseWeight, ...] = ()
     probable: CauseWeight = UNEXPLAINED

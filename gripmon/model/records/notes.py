@@ -1,4 +1,4 @@
-"""What a frame was judged by, beside what was decided: for recordings and for people who look."""
+"""What a frame was judged by, beside the decision itself: for recordings and for display."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ SixNumbers = tuple[float, float, float, float, float, float]
 
 
 class Limits(msgspec.Struct, frozen=True, array_like=True):
-    """Where it becomes worth telling, and what the stream has shown of its noise; changes slowly.
+    """The limits in force, and the noise that the stream has shown; changes slowly.
 
-    ``warn_m``, ``warn_rad``, ``limit_m`` and ``limit_rad`` are the policy's, ``tolerated`` what the drift test never
-    minds.  ``noticed``: shifts that would be noticed, each alone on its axis, if all frames that the test now rests on
-    had them, reckoned from ``offset``, the part of the shift that the reference's own error explains.  ``scatter``:
-    standard deviations of frames about their mean, as learnt.  ``average_share``: share of the frames' variance that
-    the smoothed transform has seen to scatter, ``average_walk`` how far it takes the mount to wander in a second.
-    ``alert_limit_m``, ``alert_limit_rad``: what bounds on a transform's error are held against.  None is what isn't
-    known.
+    ``warn_m``, ``warn_rad``, ``limit_m`` and ``limit_rad`` are the policy's, ``tolerated`` the shift that the drift
+    test always ignores.  ``noticed``: shifts that would be detected, each alone on its axis, if all frames that the
+    test now rests on had them, counted from ``offset``, the part of the shift that the reference's own error explains.
+    ``scatter``: learned standard deviations of frames about their mean.  ``average_share``: share of the frames'
+    variance that the smoothed transform has seen as scatter, ``average_walk`` how far it assumes the mount to wander in
+    a second.  ``alert_limit_m``, ``alert_limit_rad``: what the bounds on a transform's error are compared with.  None
+    means unknown.
     """
 
     warn_m: float
@@ -35,7 +35,7 @@ class Limits(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorNotes(msgspec.Struct, frozen=True, array_like=True):
-    """Of one frame: the drift test's largest statistic over its threshold, 1 where it alarms (None: the frame wasn't
+    """For one frame: the drift test's largest statistic over its threshold, 1 where it alarms (None: the frame wasn't
     tested), and the limits that were in force.
     """
 

@@ -1,4 +1,4 @@
-"""What a recording holds beside the frames' own records: of itself, of what it ran with, and of what it was told.
+"""What a recording holds beside the frames' own records: about itself, its configuration, and the commands received.
 
 Each is written as one JSON text: ``meta`` and ``configuration`` once in every file, ``command`` whenever one was
 carried out.
@@ -16,7 +16,7 @@ from gripmon.model.records.references import MonitorState
 
 
 class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recording/1"):
-    """What a file is: the files of one run have one ``recording_id``."""
+    """Identifies a file: the files of one run share a ``recording_id``."""
 
     name: Annotated[str, msgspec.Meta(description="the files' name before their number")]
     recording_id: Annotated[str, msgspec.Meta(description="the same in all files of a run, and in no other's")]
@@ -34,7 +34,7 @@ class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recordi
 
 
 class RecordedFile(msgspec.Struct, frozen=True):
-    """A file as it was read: text, or base64 of what is none."""
+    """A file as it was read: text, or base64 if it isn't text."""
 
     content: str
     base64: bool = False
@@ -49,12 +49,14 @@ class RecordedFile(msgspec.Struct, frozen=True):
 
     @property
     def data(self) -> bytes:
-        """Its bytes again; ValueError for base64 that is none."""
+        """Its original bytes; ValueError for invalid base64."""
         return base64.b64decode(self.content, validate=True) if self.base64 else self.content.encode("utf-8")
 
 
 class RecordedConfiguration(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.configuration/1"):
-    """All that the monitor's decisions rest on beside the frames: the same on the same frames decides the same."""
+    """Everything besides the frames that the monitor's decisions depend on: with the same frames it decides the
+    same.
+    """
 
     main: Annotated[str, msgspec.Meta(description="the configuration's name among the files")]
     files: Annotated[
@@ -67,7 +69,7 @@ class RecordedConfiguration(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 
 class RecordedCommand(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recorded_command/1"):
-    """A command that the monitor got, and what became of it."""
+    """A command that the monitor received, and its outcome."""
 
     stamp_ns: Annotated[int, msgspec.Meta(description="when it was carried out, Unix ns")]
     seq: Annotated[int, msgspec.Meta(description="of the last frame before it; -1: none yet")]

@@ -1,4 +1,4 @@
-"""The calibration that drift is measured against, where it came from, and what of it all survives a restart."""
+"""The calibration that drift is measured against, where it came from, and the state that survives a restart."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gripmon.model.records.values import Covariance, Transform
 
 
 class ReferenceInputs(msgspec.Struct, frozen=True):
-    """What a reference was made of."""
+    """What a reference was made from."""
 
     first_seq: Annotated[int, Meta(description="the first frame that was averaged")]
     last_seq: Annotated[int, Meta(description="the last one")]
@@ -48,7 +48,7 @@ class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="grip
 
 
 class MonitorState(msgspec.Struct, frozen=True):
-    """What survives a restart."""
+    """The state that survives a restart."""
 
     references: Annotated[
         tuple[ReferenceRecord, ...], Meta(description="the configured one and the newest 999, the last one in force")

@@ -1,7 +1,7 @@
-"""The messages by name, and reading one that may come from anybody.
+"""The messages by name, and reading a message from an untrusted sender.
 
-A message says its schema and that one's major version, ``"schema": "gripmon.transform/1"``.  Within a major version
-fields and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader ignores what it doesn't know.
+A message names its schema and its major version, ``"schema": "gripmon.transform/1"``.  Within a major version fields
+and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader ignores what it doesn't know.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "reply": CommandReply,
     "error": CommandError,
 }
-"""Everything that goes over the wire."""
+"""All messages that go over the wire."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
@@ -43,11 +43,11 @@ LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     CommandRequest: 4096,
     CommandReply: 64 << 20,
 }
-_LARGEST_BYTES = 1 << 20  # of any other
+_LARGEST_BYTES = 1 << 20  # of any other message
 
 
 class MessageRefused(ValueError):
-    """A payload is not the message that it should be; the text says why, in one line."""
+    """A payload is not the expected message; the text gives the reason in one line."""
 
 
 class _Tag(msgspec.Struct, frozen=True):
@@ -55,10 +55,10 @@ class _Tag(msgspec.Struct, frozen=True):
 
 
 def from_json(payload: bytes, message: type[_T]) -> _T:
-    """The message in a payload from the network, of the type that is expected there.
+    """Decode a payload from the network as the type that is expected there.
 
-    Raises :class:`MessageRefused` for anything else, in particular for a major version that isn't known here.  Without
-    ``schema`` it counts as the version that is.
+    Raises :class:`MessageRefused` for anything else, in particular for an unknown major version.  Without ``schema``
+    the payload counts as the version that is known here.
     """
     if len(payload) > largest_bytes(message):
         raise MessageRefused(f"{len(payload)} bytes; at most {largest_bytes(message)}")
@@ -69,7 +69,7 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
 
 
 def largest_bytes(message: type[msgspec.Struct]) -> int:
-    """No message of this type is larger, in bytes of JSON."""
+    """Size limit for messages of this type, in bytes of JSON."""
     return LARGEST_BYTES.get(message, _LARGEST_BYTES)
 
 

@@ -1,4 +1,4 @@
-"""Arrays, poses, names that may become more, and JSON."""
+"""Arrays, poses, open enums, and JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.floating[Any]]
     Image = NDArray[np.integer[Any] | np.floating[Any]]
-else:  # these are for annotations alone: who only reads messages needn't load NumPy
+else:  # for annotations only: programs that only read messages needn't load NumPy
     Array = Image = Any
 
 NS_PER_S = 1_000_000_000
@@ -35,7 +35,7 @@ Covariance = Annotated[
 
 
 class OpenEnum(enum.StrEnum):
-    """Names that later versions may have more of: one that isn't known here is kept as it came."""
+    """An enum that later versions may extend: an unknown name is kept as it came."""
 
     @classmethod
     def _missing_(cls, value: object) -> Self | None:
@@ -74,11 +74,11 @@ class Smoothed(msgspec.Struct, frozen=True, gc=False):
 
 
 NOTHING_WRONG = "nothing is wrong"
-"""``hypothesis`` of a bound that owes most to what is seen itself."""
+"""The ``hypothesis`` of a bound whose largest term is the fault-free one."""
 
 
 class Protection(msgspec.Struct, frozen=True, gc=False):
-    """Bounds on the error of a transform: it lies beyond either with at most the stated probability."""
+    """Bounds on the error of a transform: it exceeds either with at most the stated probability."""
 
     position_m: Annotated[float, Meta(description="protection level: bound on the TCP's position error, m")]
     rotation_rad: Annotated[float, Meta(description="bound on the angle of the rotation error, rad")]
@@ -90,5 +90,5 @@ _encoder = msgspec.json.Encoder()
 
 
 def to_json(record: msgspec.Struct) -> bytes:
-    """One line of UTF-8 JSON without a line feed; NaN can't occur in records and would become null."""
+    """One line of UTF-8 JSON without a line feed; NaN doesn't occur in records and would become null."""
     return _encoder.encode(record)
