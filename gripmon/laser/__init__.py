@@ -1,4 +1,4 @@
-"""A fixed camera and a laser pointer on the arm: calibration, the camera's watch, and the pulses that it judges.
+"""A fixed camera and a laser pointer on the arm: calibration, a monitor of that calibration, and its laser pulses.
 
-What programs call stands in :mod:`gripmon.laser.api`.
+The functions for programs are in :mod:`gripmon.laser.api`.
 """

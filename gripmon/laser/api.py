@@ -1,7 +1,8 @@
 """Laser-pointer calibration and its check, for programs and notebooks; the command line calls the same functions.
 
-What is wrong with the input is an :class:`~gripmon.model.errors.InputError`, samples from which nothing can be
-calibrated a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text."""
+Wrong input raises an :class:`~gripmon.model.errors.InputError`; samples from which nothing can be calibrated raise a
+:class:`~gripmon.calibrate.sighting.CalibrationError`.  The text of both is one line.
+"""
 
 from __future__ import annotations
 
@@ -48,8 +49,8 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class CalibratedLaser:
-    """``fit`` of the ``samples`` that have a spot; ``files``: images that were looked at; ``unseen``: samples without a
-    spot, and why; ``notes``: what else is to be said.
+    """A laser calibration: ``fit`` of the ``samples`` that have a spot; ``files``: the images that were read;
+    ``unseen``: samples without a spot, each with the reason; ``notes``: further remarks.
     """
 
     fit: LaserResult
@@ -64,11 +65,11 @@ class CalibratedLaser:
         return invert(self.fit.refined.setup.cam_T_base)
 
     def plan(self, reach_m: float, poses: int = 10) -> Plan:
-        """The poses that would help the most next, for an arm that reaches as far."""
+        """The next poses that improve the calibration the most, for an arm with this reach."""
         return plan(self.fit.refined, reach_m, poses)
 
     def document(self, provenance: Provenance) -> LaserCalibration:
-        """What a file holds of it."""
+        """The contents of the calibration's file."""
         names = self.samples.names
         other = [name for name, k in zip(names, self.fit.candidate, strict=True) if k > 0]
         notes = [*self.unseen, *self.notes]
@@ -78,7 +79,7 @@ class CalibratedLaser:
         return document(self.fit.refined, names, orientations, (*notes, *self.fit.warnings), provenance)
 
     def picture(self) -> Image:
-        """Spots with their residuals, and the scene from the side; BGR."""
+        """Picture of the spots with their residuals, and the scene from the side; BGR."""
         return draw(self.fit, self.samples.base_T_ee)
 
 
@@ -90,11 +91,11 @@ def calibrate_laser(
     arm_noise: PoseNoise | None = None,
     progress: Progress = quiet,
 ) -> CalibratedLaser:
-    """A fixed camera, a plane that it sees and a laser pointer on an arm, from spots on the plane and the arm's poses
-    (``samples``, or tables with them).
+    """Calibrate a fixed camera, a plane in its view and a laser pointer on an arm, from spots on the plane and the
+    arm's poses (``samples``, or tables with them).
 
-    ``refine_lens``: the lens is estimated, too, within its calibration's covariance; else it stays as it is, and what
-    its covariance leaves open comes into the result's.  ``arm_noise``: errors of the poses that the arm reports.
+    ``refine_lens``: also estimate the lens, within its calibration's covariance; otherwise the lens is kept, and its
+    covariance is added to the result's.  ``arm_noise``: standard deviations of the poses that the arm reports.
     """
     samples = samples if isinstance(samples, Samples) else read_samples(samples)
     calibrated = camera.camera if isinstance(camera, CameraCalibration) else camera
@@ -129,7 +130,9 @@ def calibrate_laser(
 
 
 def _spots(found: Sequence[Sequence[Spot]], *, looked: bool) -> Spots:
-    """``looked``: some were found in images, which tell how exact they are; others count as exact to a pixel then."""
+    """Spots with their covariances.  ``looked``: some were found in images and have their own covariance; the others
+    then count with a standard deviation of one pixel.
+    """
     uv_px = np.array([spots[0].uv_px for spots in found])
     if not looked:
         return Spots(uv_px)
@@ -139,7 +142,7 @@ def _spots(found: Sequence[Sequence[Spot]], *, looked: bool) -> Spots:
 
 
 def _prior(calibration: CameraCalibration) -> GivenCamera | None:
-    """What a camera's calibration knows of its lens; None where it says nothing of its errors."""
+    """The prior that a camera's calibration gives for its lens; None if it has no covariance."""
     count = len(calibration.parameters)
     given = GivenCamera(
         calibration.camera, calibration.parameters, np.reshape(np.array(calibration.covariance), (count, count))
@@ -152,8 +155,8 @@ def _prior(calibration: CameraCalibration) -> GivenCamera | None:
 
 @dataclass(frozen=True, slots=True)
 class LaserCheck:
-    """Whether a laser calibration still holds: ``verdict`` "same", "moved", or "unclear" where half of the spots or
-    fewer could be believed; ``text`` says so for a person.  ``judged``: each sample's name and judgement.
+    """Whether a laser calibration still holds: ``verdict`` is "same", "moved", or "unclear" if at most half of the
+    spots are inliers; ``text`` gives the result in words.  ``judged``: each sample's name and judgement.
     """
 
     verdict: str
@@ -163,7 +166,7 @@ class LaserCheck:
 
     @property
     def last(self) -> SpotJudgement:
-        """What is known after all spots."""
+        """The judgement after all spots."""
         return self.judged[-1][1]
 
 
@@ -173,7 +176,7 @@ def check_laser(
     settings: SpotWatchSettings | None = None,
     progress: Progress = quiet,
 ) -> LaserCheck:
-    """Judge fresh spots one after the other, as the second camera's watch does."""
+    """Judge new spots one after the other, as the second camera's monitor does."""
     samples = samples if isinstance(samples, Samples) else read_samples(samples)
     watch = SpotWatch(calibration, settings or SpotWatchSettings())
     found = spots_of(samples, (calibration.camera.width_px, calibration.camera.height_px), progress)
@@ -181,7 +184,7 @@ def check_laser(
         (name, watch.judge(SpotSeen(k, pose, spots)))
         for k, (name, pose, spots) in enumerate(zip(samples.names, samples.base_T_ee, found, strict=True))
     )
-    alert = watch.motion_alert  # of all spots: the one that was raised knew the first few only
+    alert = watch.motion_alert  # from all spots: the alert that was raised knew only the first few
     believed, count = sum(one.used for _, one in judged), len(judged)
     if alert is not None:
         return LaserCheck("moved", alert.text, alert, judged)
@@ -198,7 +201,7 @@ _SUBPIXEL_BITS = 4
 
 
 def draw(result: LaserResult, base_T_ee: Array) -> Image:
-    """Residuals on the left (arrows many times as long), the scene on the right; BGR."""
+    """Residuals on the left (as enlarged arrows), the scene on the right; BGR."""
     return np.concatenate([_residuals(result), _scene(result, base_T_ee)], axis=1)
 
 
@@ -237,7 +240,7 @@ def _residuals(result: LaserResult) -> Image:
 
 
 def _scene(result: LaserResult, base_T_ee: Array) -> Image:
-    """Base frame, seen from a corner, without perspective."""
+    """The base frame from a corner, in parallel projection."""
     setup = result.refined.setup
     base_T_cam = invert(setup.cam_T_base)
     to_base = base_T_cam[:3, :3]
@@ -269,7 +272,9 @@ def _scene(result: LaserResult, base_T_ee: Array) -> Image:
 
 
 def _sheet(result: LaserResult, to_base: Array, centre: Array) -> Array:
-    """Corners (4, 3) of the image on the plane, base frame; those that don't reach it are left out."""
+    """Corners (up to 4, 3) of the image projected onto the plane, base frame, without those whose rays miss the
+    plane.
+    """
     camera, setup = result.refined.camera, result.refined.setup
     width, height = camera.width_px, camera.height_px
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])

@@ -1,18 +1,18 @@
-"""Has anything moved?  Shiryaev and Roberts's procedure over normal beliefs, with a stated rate of false alarms.
+"""Motion test: Shiryaev-Roberts procedure over normal beliefs, with a stated false-alarm rate.
 
-A belief is about a set-up: how it was calibrated, by how much it has moved since, and by how much the arm and the lens
-are off at the poses where pulses come from.  What the calibration is off by is the same for all pulses; what the arm
-and the lens are off by is the same for pulses from one pose.  Both are unknowns with a known covariance here, so that
-no number of pulses is mistaken for as many independent witnesses.
+A belief describes a set-up: the error of its calibration, its motion since then, and the errors of arm and lens at the
+poses where pulses come from.  The calibration's error is common to all pulses; the errors of arm and lens are common to
+pulses from one pose.  Both are unknowns with a known covariance here, so that repeated pulses don't count as
+independent measurements.
 
-With every pulse a new alternative begins: "something moved just now", for each thing that may have and for small and
-large motions.  Each belief predicts where the next spot will be, and how surely; the product of how much better an
-alternative's prediction was than the reigning belief's is its likelihood ratio.  Under the reigning belief the sum R of
-the ratios less the number of pulses is a martingale, so that R exceeds K once in K pulses at most, on average, whatever
-alternatives there are and however few of them are kept (Pollak, Ann. Statist. 13, 1985).
+Each pulse starts new alternatives: "something moved just now", for each part that can move and for small and large
+motions.  Each belief predicts the next spot with a covariance; the likelihood ratio of an alternative is the product of
+its predictions' likelihoods over those of the reigning belief.  Under the reigning belief the sum R of the ratios less
+the number of pulses is a martingale, so that R exceeds K at most once in K pulses on average, whatever the alternatives
+are and however few of them are kept (Pollak, Ann. Statist. 13, 1985).
 
-A spot may be wrong: a reflection, or speckle beside it.  Half of the wrong ones lie anywhere in the image, the others
-near the right one as readily as far off: uniformly in the logarithm of the distance.
+A spot may be wrong: a reflection, or speckle beside it.  Half of the wrong spots are assumed uniform over the image,
+the other half centred on the right spot and uniform in the logarithm of the distance.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from gripmon.model.geometry import rotation_angle
 from gripmon.model.records import Array, Cause
 
 PLACES = 12
-"""Poses whose own offset is remembered; the one that was least recently visited is forgotten for a new one."""
+"""Number of poses with an offset of their own; a new pose replaces the least recently visited one."""
 MOVED = slice(COUNT, 2 * COUNT)
 SIZE = 2 * COUNT + 2 * PLACES
 _FAR = 0.2
-"""Curvature, in standard deviations of a spot, up to which the calibration's own derivatives serve."""
+"""Error of linearisation, in standard deviations of a spot, up to which the Jacobian at the calibration is used."""
 _ITERATIONS = 4
 SAME_M, SAME_RAD = 5e-3, 0.02
-"""How far apart poses of one place are at most: less than what an arm's error changes over."""
+"""Largest distance between poses of one place (m, rad): the arm's error doesn't change noticeably over it."""
 
 
 @dataclass(slots=True)
 class Beliefs:
-    """n of them: ``mean`` (n, 50) of the calibration's error (13), the motion since (13), and the places' offsets (12
-    times 2, px), with ``covariance`` (n, 50, 50); ``weight`` (n,) logarithm of how much better than the reigning belief
-    it has predicted the pulses; ``kind`` and ``scale`` (n,) what moved in it at last and by what order, ``pulses`` (n,)
-    which of them were believed since, ``born`` (n,) how many there were before, ``prior`` (n, 13, 13) what was assumed
-    of that motion and ``motions`` (n,) how many there were.
+    """A set of n beliefs: ``mean`` (n, 50) of the calibration's error (13), the motion since (13), and the places'
+    offsets (12 times 2, px), with ``covariance`` (n, 50, 50); ``weight`` (n,): logarithm of the likelihood ratio
+    against the reigning belief; ``kind`` and ``scale`` (n,): what moved last and the order of magnitude; ``pulses``
+    (n,): inlier pulses since then; ``born`` (n,): number of pulses before; ``prior`` (n, 13, 13): assumed covariance of
+    that motion; ``motions`` (n,): number of motions.
     """
 
     mean: Array
@@ -62,17 +62,17 @@ class Beliefs:
         return len(self.weight)
 
     def picked(self, which: NDArray[np.intp] | NDArray[np.bool_]) -> Beliefs:
-        """Those only, as a copy."""
+        """Copy of a subset."""
         return Beliefs(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def joined(self, others: Beliefs) -> Beliefs:
-        """All of both."""
+        """All of both sets."""
         return Beliefs(
             *(np.concatenate([getattr(self, field.name), getattr(others, field.name)]) for field in fields(self))
         )
 
     def at_new_place(self, place: int, covariance_px: Array) -> None:
-        """A place (its index) is another pose now."""
+        """Reset a place's offset (by its index): it stands for another pose now."""
         rows = slice(2 * COUNT + 2 * place, 2 * COUNT + 2 * place + 2)
         self.mean[:, rows] = 0.0
         self.covariance[:, rows, :] = 0.0
@@ -81,7 +81,7 @@ class Beliefs:
 
 
 def as_calibrated(calibrated: Calibrated) -> Beliefs:
-    """One belief: nothing has moved."""
+    """A single belief: nothing has moved."""
     covariance = np.zeros((1, SIZE, SIZE))
     covariance[0, :COUNT, :COUNT] = calibrated.covariance
     none = np.zeros(1, dtype=np.intp)
@@ -93,8 +93,8 @@ def as_calibrated(calibrated: Calibrated) -> Beliefs:
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """``uv_px`` (k, 2) of the candidates with ``covariance_px`` (k, 2, 2), seen at a pose (4, 4) of a ``place``; the
-    calibration predicts ``predicted_px`` (2,) with derivatives ``rows`` (2, 13).
+    """A pulse: ``uv_px`` (k, 2) of the candidate spots with ``covariance_px`` (k, 2, 2), seen at a pose (4, 4) of a
+    ``place``; the calibration predicts ``predicted_px`` (2,) with derivatives ``rows`` (2, 13).
     """
 
     base_T_ee: Array
@@ -106,14 +106,16 @@ class Pulse:
 
 
 class Bank:
-    """Predicts pulses by beliefs and lets these learn from them."""
+    """Predicts pulses from beliefs and updates the beliefs."""
 
     def __init__(self, calibrated: Calibrated):
         self._calibrated = calibrated
         self._focal_px = 0.5 * (calibrated.camera.fx_px + calibrated.camera.fy_px)
 
     def predicted(self, beliefs: Beliefs, pulse: Pulse) -> tuple[Array, Array]:
-        """Pixels (n, 2), NaN where a belief predicts none, and derivatives (n, 2, 50) by the beliefs' means."""
+        """Predicted pixels (n, 2), NaN where a belief predicts none, and derivatives (n, 2, 50) by the beliefs'
+        means.
+        """
         change = beliefs.mean[:, :COUNT] + beliefs.mean[:, MOVED]
         shifts = change[:, None, :] * pulse.rows
         uv_px = pulse.predicted_px + shifts.sum(axis=2)
@@ -121,7 +123,7 @@ class Bank:
         reach = np.sqrt(_FAR * self._calibrated.sigma_px * self._focal_px)
         left = np.flatnonzero(np.abs(shifts).sum(axis=2).max(axis=1) > reach)
         while len(left):
-            # Derivatives where one of them is serve all that are near it.
+            # Reuse the derivatives at one of them for all beliefs near it.
             found = predict_moved(self._calibrated, change[left[0]], pulse.base_T_ee)
             shifts = (change[left] - change[left[0]])[:, None, :] * found.rows
             near = np.abs(shifts).sum(axis=2).max(axis=1) <= reach
@@ -142,11 +144,11 @@ class Bank:
     def weigh(
         self, beliefs: Beliefs, pulse: Pulse, wrong: Array, share: float
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
-        """What a pulse says of each belief, which then learns from it.
+        """Likelihood of a pulse under each belief; also updates the beliefs with it.
 
-        ``wrong`` (k,): density of a wrong spot where each candidate is (1/px²), ``share`` how often a pulse has none
-        but wrong ones.  Returns logarithms (n,) of how probable the candidates are, over all of them being wrong; which
-        candidate (n,) is the spot; and whether any is (n,).
+        ``wrong`` (k,): density of a wrong spot at each candidate (1/px²), ``share``: probability that a pulse has only
+        wrong candidates.  Returns the log likelihoods (n,) of the candidates, relative to all of them being wrong; the
+        candidate (n,) taken for the spot; and whether any is accepted (n,).
         """
         uv_px, rows = self.predicted(beliefs, pulse)
         spread = beliefs.covariance @ rows.transpose(0, 2, 1)
@@ -165,8 +167,8 @@ class Bank:
         return np.log(share + right), best, believed
 
     def _bent(self, own: Array) -> Array:
-        """Covariance (n, 2, 2) of what derivatives miss of an image that is predicted so roughly: a central projection
-        bends by the square of a shift over the focal length.
+        """Covariance (n, 2, 2) of the linearisation error for an uncertain prediction: a central projection is
+        non-linear by the square of a shift over the focal length.
         """
         bent: Array = np.square(0.5 * np.trace(own, axis1=1, axis2=2) / self._focal_px)[:, None, None] * np.eye(2)
         return bent
@@ -198,7 +200,7 @@ class Bank:
     def _iterate(
         self, beliefs: Beliefs, k: int, before: Array, spread: Array, rows: Array, pulse: Pulse, best: int, taken: Array
     ) -> None:
-        """The step was large: derivatives where it led to, Gauss-Newton (the iterated extended Kalman filter)."""
+        """After a large step: relinearise at the new mean, Gauss-Newton (the iterated extended Kalman filter)."""
         one = np.array([k])
         prior = beliefs.covariance[k] + taken
         for _ in range(_ITERATIONS):
@@ -226,18 +228,18 @@ def _squares(off: Array, covariance: Array) -> tuple[Array, Array]:
 
 
 class Places:
-    """The last places, each with the first pose (4, 4) that was seen there."""
+    """The most recent places, each with the first pose (4, 4) that was seen there."""
 
     def __init__(self) -> None:
         self._poses: dict[int, Array] = {}  # least recently visited first
 
     @property
     def poses(self) -> tuple[Array, ...]:
-        """Of all places, the last visited one last."""
+        """Poses of all places, the last visited one last."""
         return tuple(self._poses.values())
 
     def find(self, base_T_ee: Array) -> int | None:
-        """The index of a pose's place; it is the last visited one from now on."""
+        """The index of a pose's place, which becomes the last visited one; None if there is none."""
         for place, pose in reversed(self._poses.items()):
             near = float(np.linalg.norm(pose[:3, 3] - base_T_ee[:3, 3])) <= SAME_M
             if near and rotation_angle(pose[:3, :3].T @ base_T_ee[:3, :3]) <= SAME_RAD:
@@ -246,7 +248,7 @@ class Places:
         return None
 
     def take(self, base_T_ee: Array) -> int:
-        """A place for a pose that has none, an older one's if there is none left."""
+        """A place for a new pose; if none is free, the least recently visited one is reused."""
         place = len(self._poses) if len(self._poses) < PLACES else next(iter(self._poses))
         self._poses.pop(place, None)
         self._poses[place] = base_T_ee.copy()
@@ -259,21 +261,21 @@ KINDS: tuple[tuple[Cause, slice, float], ...] = (
     (Cause.LASER_MOVED, LASER, 0.3),
     (Cause.UNKNOWN, slice(0, COUNT), 0.1),
 )
-"""Cause, what of the parameters moves, and its share beforehand; the last one is several of them at once, which is how
-an arm that was moved or has lost its zero looks as well.
+"""Cause, which parameters move, and prior probability; the last is a motion of several at once, which is also what an
+arm looks like that was moved or has lost its zero.
 """
 
 BACK = len(KINDS)
-"""Kind of a belief that everything is where it was calibrated again."""
+"""Kind of a belief that everything is back where it was calibrated."""
 
 SCALES = ((1e-3, 1.5e-3), (1e-2, 1.5e-2), (1e-1, 1.5e-1))
-"""Standard deviations (m, rad) of motions that are looked for: a mount that gives way, a knock, a fall."""
+"""Standard deviations (m, rad) of the tested motions: a loosening mount, a knock, a fall."""
 
 _RAD = np.array([False] * 3 + [True] * 3 + [True, True, False] + [True, True, False, False])
 
 
 def assumed(kind: int, scale: int) -> Array:
-    """(13, 13): covariance of a motion."""
+    """(13, 13): prior covariance of a motion."""
     metres, radians = SCALES[scale]
     variance = np.zeros(COUNT)
     moves = KINDS[kind][1]
@@ -282,7 +284,7 @@ def assumed(kind: int, scale: int) -> Array:
 
 
 def newborn() -> tuple[Array, Array, Array, Array]:
-    """Of all kinds and scales: kind (m,), scale (m,), logarithm of the share (m,), covariance (m, 13, 13)."""
+    """For all kinds and scales: kind (m,), scale (m,), logarithm of the prior share (m,), covariance (m, 13, 13)."""
     pairs = [(kind, scale) for kind in range(len(KINDS)) for scale in range(len(SCALES))]
     shares = np.array([KINDS[kind][2] / len(SCALES) for kind, _ in pairs])
     return (
@@ -294,23 +296,24 @@ def newborn() -> tuple[Array, Array, Array, Array]:
 
 
 LEAST_PULSES = 3
-"""That speak for a motion before it is reported: two wrong spots may look like one."""
+"""Minimum number of inlier pulses since a motion before it is reported: two wrong spots may look like a motion."""
 BACK_AGAIN = 100.0
-"""Odds from which what had moved is where it was."""
+"""Odds above which moved parts count as back in place."""
 _KEPT = 32
 _REMEMBERED = 64
-"""Pulses for which it is remembered what was believed before them."""
+"""Number of past pulses whose prior belief is remembered."""
 _REIGNING = 12
 _HOPELESS = math.log(1e-6)
-"""Weight below which an alternative is dropped: those that begin now overtake it."""
+"""Log weight below which an alternative is dropped: new ones overtake it."""
 _NEGLIGIBLE = math.log(1e-5)
-"""Of the best belief's weight: those below are dropped."""
+"""Log weight relative to the best belief's, below which a reigning belief is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """``odds``: R over the limit that it must reach for an alarm; ``alarm``: it has, just now; ``back``: everything is
-    where it was again, just now.  ``candidate`` that the best belief takes for the spot, ``believed`` whether it does.
+    """The test's result for a pulse.  ``odds``: R over the limit for an alarm; ``alarm``: it was reached with this
+    pulse; ``back``: with this pulse everything counts as back in place.  ``candidate``: the one that the best belief
+    takes for the spot, ``believed``: whether it accepts it.
     """
 
     odds: float
@@ -321,8 +324,8 @@ class Finding:
 
 
 class MotionTest:
-    """``reigning``: the beliefs that hold, logarithms of their weights add up to one; one of them until something
-    moves.
+    """The motion test.  ``reigning``: the accepted beliefs; their weights are logarithms of probabilities that add up
+    to one.  Until something moves there is only one.
     """
 
     def __init__(self, calibrated: Calibrated, false_alarms_per_1000: float, wrong_spots: float):
@@ -334,7 +337,7 @@ class MotionTest:
         self.reset()
 
     def reset(self) -> None:
-        """Everything is as calibrated."""
+        """Start again: everything is as calibrated."""
         self.reigning = as_calibrated(self._calibrated)
         self._others = self.reigning.picked(np.array([], dtype=np.intp))
         self._pulses = 0
@@ -348,12 +351,12 @@ class MotionTest:
         return int(self.reigning.weight.argmax())
 
     def at_new_place(self, place: int, covariance_px: Array) -> None:
-        """Pulses come from another pose, in a place's stead."""
+        """A place (by its index) now stands for another pose."""
         for beliefs in (self.reigning, self._others, self._before, *self._history):
             beliefs.at_new_place(place, covariance_px)
 
     def add(self, pulse: Pulse) -> Finding:
-        """One pulse with a candidate at least."""
+        """Process one pulse, which has at least one candidate."""
         wrong = self._wrong(pulse)
         others = self._others.joined(self._begun())
         if not self.moved:
@@ -379,7 +382,7 @@ class MotionTest:
         return Finding(max(odds, 0.0), changes and self.moved, changes and not self.moved, candidate, is_believed)
 
     def _wrong(self, pulse: Pulse) -> Array:
-        """(k,) density of wrong spots, around where the best belief has the right one; 1/px²."""
+        """(k,) density of wrong spots around the best belief's prediction; 1/px²."""
         best = self.reigning.picked(np.array([self.best]))
         uv_px, rows = self._bank.predicted(best, pulse)
         camera = self._calibrated.camera
@@ -395,7 +398,7 @@ class MotionTest:
         return out
 
     def _begun(self) -> Beliefs:
-        """Something has moved just now, against the best reigning belief; or it is back, if it had moved."""
+        """New alternatives to the best reigning belief: something moved just now, or, after a motion, it is back."""
         count = len(self._kinds)
         out = self.reigning.picked(np.full(count, self.best))
         out.covariance[:, MOVED, MOVED] += self._assumed
@@ -411,19 +414,19 @@ class MotionTest:
         return out.joined(back)
 
     def _remember(self, born: int) -> None:
-        """What was believed before the motion, which what came after it had no part in yet."""
+        """Keep the belief from before the motion, without the influence of later pulses."""
         ago = min(self._pulses - born, len(self._history))
         self._before = self._history[-ago]
         self._history.clear()
 
     def _prune(self) -> None:
-        """What has become negligible among those that reign."""
+        """Drop reigning beliefs that have become negligible."""
         keep = self.reigning.weight > self.reigning.weight.max() + _NEGLIGIBLE
         if not keep.all():
             self.reigning = self.reigning.picked(keep)
 
     def _odds(self) -> tuple[float, float]:
-        """Of a motion, and of everything being back, over what each must reach."""
+        """Odds of a motion and of everything being back, each over its limit."""
         others = self._others
         enough = others.pulses >= LEAST_PULSES
         back = others.kind == BACK
@@ -431,7 +434,7 @@ class MotionTest:
         return sums[0] / self._limit, sums[1] / BACK_AGAIN
 
     def _crowned(self, *, back: bool) -> tuple[Beliefs, Beliefs]:
-        """No others, and those that reign from now on."""
+        """An empty set of alternatives, and the beliefs that reign from now on."""
         others = self._others
         right = (others.pulses >= LEAST_PULSES) & ((others.kind == BACK) == back)
         chosen = _kept(others.picked(right), 1 if back else _REIGNING)
@@ -441,13 +444,13 @@ class MotionTest:
         return others.picked(np.array([], dtype=np.intp)), chosen
 
     def _chosen(self, pulse: Pulse) -> tuple[int, bool]:
-        """Candidate that the best belief takes, having learnt from it."""
+        """The candidate that the best belief takes, and whether it accepts it, after an update with it."""
         best = self.reigning.picked(np.array([self.best]))
         _, candidates, believed = self._bank.weigh(best, pulse, self._wrong(pulse), self._share)
         return int(candidates[0]), bool(believed[0])
 
 
 def _kept(beliefs: Beliefs, most: int, least: float = -math.inf) -> Beliefs:
-    """The weightiest, of those above a weight."""
+    """The beliefs with the largest weights, at most ``most``, of those with weight above ``least``."""
     heavy = np.argsort(-beliefs.weight, kind="stable")[:most]
     return beliefs.picked(np.sort(heavy[beliefs.weight[heavy] > least]))

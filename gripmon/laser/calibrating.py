@@ -1,4 +1,4 @@
-"""From spots and poses to a refined set-up: start, refinement, other candidates, and why it can't be."""
+"""From spots and poses to a refined set-up: start, refinement, other candidates, and reasons for failure."""
 
 from __future__ import annotations
 
@@ -33,25 +33,27 @@ from gripmon.model.records import Array
 FARTHEST_PLANE_M = 50.0
 NEAREST_PLANE_M = 0.01
 FARTHEST_LASER_M = 1.0
-"""Of the beam's line from the end-effector's origin: no hand holds it farther off."""
+"""Largest distance of the beam's line from the end-effector's origin (m): no tool holds a laser farther away."""
 LEAST_AGREEING = 0.5
-"""Part of the spots that has to agree: with fewer, another set-up might explain as many."""
+"""Minimum inlier ratio of the spots: with fewer, another set-up might explain as many."""
 MOST_TURN_RAD = 0.02
-"""Of samples that share an orientation by their labels: more than an arm's noise."""
+"""Largest rotation between samples that are labelled with one orientation (rad): above an arm's noise."""
 LARGEST_NOISE_SHARE = 0.01
-"""The spots' noise over the image's width beyond which they aren't explained at all."""
+"""Largest noise of the spots, over the image's width, for which they count as explained."""
 LEAST_OF_ORIENTATION = 0.5
-"""Part of an orientation's spots that has to agree: scattered wrong spots leave more, so that the orientation itself
+"""Minimum inlier ratio of one orientation: scattered wrong spots leave more, so that below it the orientation itself
 contradicts the others.
 """
 MOST_CONTRADICTING = 1.0 / 3.0
-"""Part of the orientations that may contradict the rest: beyond it no one knows which are right."""
+"""Largest share of orientations that may contradict the rest: above it there is no telling which are right."""
 _NOISE_ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """``uv_px`` (n, 2) and ``covariance_px`` (n, 2, 2) or None; ``others`` one (k, 2) a sample, further candidates."""
+    """Measured spots: ``uv_px`` (n, 2) and ``covariance_px`` (n, 2, 2) or None; ``others``: further candidates, one (k,
+    2) per sample.
+    """
 
     uv_px: Array
     covariance_px: Array | None = None
@@ -60,8 +62,8 @@ class Spots:
 
 @dataclass(frozen=True, slots=True)
 class LaserResult:
-    """The closed form's ``start``, what it was ``refined`` to, and which ``candidate`` was taken of each sample
-    (n,): 0 is the brightest.  ``warnings`` name orientations that contradict the rest.
+    """A laser calibration: the closed form's ``start``, the ``refined`` result, and the ``candidate`` taken for each
+    sample (n,): 0 is the brightest.  ``warnings`` name orientations that contradict the rest.
     """
 
     start: LaserSetup
@@ -72,8 +74,8 @@ class LaserResult:
 
 
 def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
-    """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` where a label's samples are
-    turned against each other.
+    """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` if samples with one label
+    have different orientations.
     """
     if labels is None:
         return orientation_groups(base_T_ee)
@@ -99,8 +101,8 @@ def calibrate(
     refine_lens: bool = True,
     pose_noise: PoseNoise | None = None,
 ) -> LaserResult:
-    """Everything at once.  What isn't known of the ``lens`` comes into the covariance; without ``refine_lens`` the lens
-    itself stays as it is.  Raises :class:`CalibrationError` with what is wrong with the data.
+    """Calibrate camera pose, plane and laser line together.  The ``lens`` covariance is added to the result's; without
+    ``refine_lens`` the lens itself is kept.  Raises :class:`CalibrationError` with what is wrong with the data.
     """
     xy = camera.undistort(spots.uv_px)
     if not np.isfinite(xy).all():
@@ -142,8 +144,8 @@ def _check_agreement(refined: Refined, width_px: int) -> None:
 
 
 def contradictions(used: NDArray[np.bool_], groups: Sequence[NDArray[np.intp]]) -> tuple[str, ...]:
-    """A line for each orientation most of whose spots aren't ``used`` (n,), where ``groups`` are the orientations'
-    members.  Raises :class:`CalibrationError` where too few are left for anybody to know which are right.
+    """A line for each orientation most of whose spots aren't ``used`` (n,); ``groups`` holds each orientation's
+    members.  Raises :class:`CalibrationError` if too few orientations agree to tell which are right.
     """
     counted = [members for members in groups if len(members) >= FEWEST_SHIFTS]
     against = [members for members in counted if used[members].mean() < LEAST_OF_ORIENTATION]
@@ -182,7 +184,7 @@ def _refined(
         return _separated(problem, uv_px, refine(SpotProblem(camera, base_T_ee, uv_px, lens=lens), setup))
 
     def _separated(problem: SpotProblem, uv_px: Array, found: Refined) -> Refined:
-        # The arm's noise is given in metres: the spots' own is what is left of the residuals.
+        # The arm's noise is given in metres: the rest of the residuals is the spots' own noise.
         sigma_px = found.scale
         for _ in range(_NOISE_ROUNDS):
             noise = np.tile(sigma_px**2 * np.eye(2), (len(uv_px), 1, 1))
@@ -196,7 +198,7 @@ def _refined(
     uv_px, choice = spots.uv_px, np.zeros(len(spots.uv_px), dtype=np.intp)
     found = solved(uv_px, start)
     for _ in range(3 if spots.others else 0):
-        # A reflection may be brighter than the spot: the candidate that the rest predicts takes its place.
+        # A reflection may be brighter than the spot: then use the candidate nearest to the prediction.
         predicted = uv_px - found.residuals_px
         new, new_choice = spots.uv_px.copy(), np.zeros_like(choice)
         for k in np.flatnonzero(~found.used):
@@ -213,8 +215,8 @@ def _refined(
 
 
 def _check_sizes(found: Refined) -> None:
-    """Positions in another unit fit as well: camera, plane and laser then are as many times too far, and the image says
-    nothing of it.  Only sizes that no cell has do.
+    """Reject implausible sizes.  Positions in another unit fit as well: they scale the distances of camera, plane and
+    laser, and the image doesn't change.  Only implausible sizes reveal it.
     """
     setup = found.setup
     if setup.distance_m > FARTHEST_PLANE_M:
@@ -236,14 +238,14 @@ def _check_sizes(found: Refined) -> None:
 
 
 SUSPECT_PX = 3.0
-"""Noise of spots from which it is asked whether the poses are what they are taken for."""
+"""Noise of the spots (px) above which other readings of the poses are tried."""
 LEAST_FITTING = 0.7
-"""Part of the spots that has to fit another reading before it is named."""
+"""Minimum inlier ratio of another reading before it is reported."""
 
 
 def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: CalibrationError | None) -> None:
-    """Raise :class:`CalibrationError` with the reading of poses (n, 4, 4) that spots (n, 2) fit, if there is one;
-    ``fault`` is what was wrong with the reading that was taken.
+    """Raise :class:`CalibrationError` if the spots (n, 2) fit another reading of the poses (n, 4, 4); ``fault`` is the
+    failure under the given reading.
     """
     xy = camera.undistort(uv_px)
     for poses, part, said in _readings(base_T_ee):
@@ -257,7 +259,7 @@ def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: Calibra
 
 
 def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
-    """Poses, the spots that belong to them, and what there is to say with how well they fit."""
+    """Other readings: poses, the spots that belong to them, and a message to be completed with how well they fit."""
     everything = slice(None)
     inverted = np.stack([invert(pose) for pose in base_T_ee])
     yield inverted, everything, "the poses are ee_T_base: inverted, the spots fit ({agree}); base_T_ee"
@@ -292,7 +294,7 @@ def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
 
 
 def base_covariance(refined: Refined) -> Array:
-    """(13, 13) of :data:`NAMES`."""
+    """Covariance (13, 13) of :data:`NAMES`."""
     change = np.eye(len(NAMES))
     change[:6, :6] = pose_jacobian(refined.setup.cam_T_base)
     out: Array = change @ refined.covariance @ change.T
@@ -302,7 +304,7 @@ def base_covariance(refined: Refined) -> Array:
 def document(
     refined: Refined, names: tuple[str, ...], orientations: int, warnings: tuple[str, ...], provenance: Provenance
 ) -> LaserCalibration:
-    """What is written of a result."""
+    """The contents of a result's file."""
     setup, covariance = refined.setup, base_covariance(refined)
     base_T_cam = invert(setup.cam_T_base)
     normal_base = base_T_cam[:3, :3] @ setup.normal_cam

@@ -1,19 +1,20 @@
-"""Eye, hand and workspace from laser spots in closed form: one plane for all orientations, so one scale, and no sign to
-guess.
+"""Camera pose, laser line and plane from laser spots in closed form: one plane for all orientations, and so a single
+scale and no ambiguous sign.
 
-At each of M orientations the end-effector is shifted without turning; the spot then moves on the plane by
+At each of M orientations the end-effector is shifted without rotation; the spot then moves on the plane by
 
     p = T_m + G_m C_R_B w,    G_m = I - u_m nᵀ / (u_mᵀ n)
 
-(w the shift in the base's axes, u_m the beam, n the plane's normal, camera axes).
-:mod:`~gripmon.laser.planar_start` gives n and, with spots ``s = ray / (nᵀ ray)`` that have the same scale 1 / distance
-everywhere, one matrix an orientation whose part in the plane is
+(w the shift in base axes, u_m the beam, n the plane's normal, camera axes).
+:mod:`~gripmon.laser.planar_start` gives n and, from spots ``s = ray / (nᵀ ray)`` with the same scale 1 / distance
+everywhere, one matrix per orientation whose part in the plane is
 
     A_m = P G_m R / distance = (P R - (P v_m) (nᵀ R)) / distance,    R = C_R_B,  u_m ~ n + v_m,
 
-P the two axes of the plane.  So differences between orientations have rank one with nᵀ R, the plane's normal in base
-axes, as their row; what is left of all A_m across it is P R / distance.  Steps 4 and 5 of the print become linear, over
-all orientations at once; there they have an unknown scale and an unknown sign each."""
+P being the two axes of the plane.  Differences between orientations therefore have rank one, with the row nᵀ R, the
+plane's normal in base axes; the component of all A_m orthogonal to it is P R / distance.  Steps 4 and 5 of the paper
+thus become linear, over all orientations at once; there they have an unknown scale and an unknown sign each.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +33,20 @@ from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 
 FEWEST_SHIFTS = 6
-"""Spots of an orientation: twelve equations for the eleven unknowns of its matrix."""
+"""Minimum number of spots per orientation: twelve equations for the eleven unknowns of its matrix."""
 FEWEST_ORIENTATIONS = 3
-"""Two differ by a turn about one axis."""
+"""Two orientations differ by a rotation about a single axis."""
 ON_A_LINE = 3e-3
-"""Second singular value over the first below which image points count as lying on a line."""
+"""Ratio of second to first singular value below which image points count as collinear."""
 FLAT = 1e-3
-"""Third singular value over the first below which shifts count as lying in a plane."""
+"""Ratio of third to first singular value below which shifts count as coplanar."""
 SAME_ORIENTATION_RAD = 4e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """Samples of one orientation: ``members`` (k,) index them; ``matrix`` (3, 4) of step 2 for shifts from ``centre_m``
-    (3,), base axes.
+    """Samples of one orientation: ``members`` (k,) are their indices; ``matrix`` (3, 4) is that of step 2, for shifts
+    from ``centre_m`` (3,), base axes.
     """
 
     members: NDArray[np.intp]
@@ -55,7 +56,7 @@ class Orientation:
 
 
 def orientation_groups(base_T_ee: Array, tolerance_rad: float = SAME_ORIENTATION_RAD) -> list[NDArray[np.intp]]:
-    """Indices of samples that share an orientation, in the order of their first ones."""
+    """Indices of samples that share an orientation, ordered by first sample."""
     groups: list[list[int]] = []
     firsts: list[Array] = []
     for index, rotation in enumerate(base_T_ee[:, :3, :3]):
@@ -71,7 +72,7 @@ def orientation_groups(base_T_ee: Array, tolerance_rad: float = SAME_ORIENTATION
 
 
 def check_spots(xy: Array) -> None:
-    """Refuse ideal image points (n, 2) that lie on one line."""
+    """Reject ideal image points (n, 2) that are collinear."""
     if len(xy) < 3:
         raise CalibrationError(f"{len(xy)} spot(s); at least {2 * FEWEST_SHIFTS}, better 50")
     spread = np.linalg.svd(xy - np.median(xy, axis=0), compute_uv=False)
@@ -87,7 +88,7 @@ def usable_orientations(
 ) -> list[Orientation]:
     """Orientations with enough shifts that span space; their matrices are still empty.
 
-    Raises :class:`CalibrationError` for too few of them, and for ones turned about a single axis.
+    Raises :class:`CalibrationError` if there are too few of them, or if they differ by rotations about a single axis.
     """
     groups = orientation_groups(base_T_ee) if groups is None else groups
     large = [members for members in groups if len(members) >= fewest]
@@ -113,8 +114,8 @@ def usable_orientations(
 
 
 def _check_turns(base_R_ee: Array) -> None:
-    """Rotations (M, 3, 3) that leave a direction of the end-effector where it is can't tell how far along it the laser
-    sits: a shift of the base does the same.
+    """Reject rotations (M, 3, 3) that leave a direction of the end-effector fixed: the laser's position along it is
+    then unobservable, because a shift of the base has the same effect.
     """
     turns = (base_R_ee - base_R_ee.mean(axis=0)).reshape(-1, 3)
     moved = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(base_R_ee))
@@ -126,8 +127,8 @@ def _check_turns(base_R_ee: Array) -> None:
 
 
 def mean_rotation(rotations: Sequence[Array]) -> Array:
-    """Step 5, equations (26) to (29): the rotation nearest to several ones, by the largest eigenvector of their
-    quaternions' products (the print seeks the smallest one of the negative).
+    """Step 5, equations (26) to (29): the mean rotation, from the eigenvector with the largest eigenvalue of the summed
+    products of the quaternions (the paper seeks the smallest eigenvalue of the negative).
     """
     quaternions = Rotation.from_matrix(np.stack(rotations)).as_quat()
     axes = np.linalg.eigh(quaternions.T @ quaternions)[1]
@@ -150,14 +151,14 @@ def positions(
     *,
     one_plane: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Step 7, equations (32) and (33): the laser's point (3,) in the end-effector, the base's place (3,) in the camera
-    frame, and each orientation's scale (M,), all together:
+    """Step 7, equations (32) and (33): the laser's point (3,) in the end-effector, the base's position (3,) in the
+    camera frame, and each orientation's scale (M,), solved jointly:
 
         u_m x (C_R_B (B_R_E p + t) + C_t_B - s_m H_m [w 1]) = 0
 
-    for every pose of each orientation, t its position and w its shift from the central one.  With ``one_plane`` all
-    matrices have the same scale.  What the matrices say of a spot takes the spot's place, so that wrong spots that had
-    no part in them have none here.
+    for every pose of each orientation, with its position t and its shift w from the central one.  With ``one_plane``
+    all matrices share one scale.  Spots are predicted by the matrices instead of measured, so that wrong spots, which
+    had no part in the matrices, have none here.
     """
     axes = list(origin_axes(direction_ee))
     count = 1 if one_plane else len(orientations)
@@ -194,7 +195,9 @@ def _shifts_of(orientations: Sequence[Orientation], base_T_ee: Array) -> list[Ar
 def solve(
     xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, robust: bool = True
 ) -> LaserSetup:
-    """As :func:`gripmon.laser.closed_form.solve`; ``robust``: wrong spots are sought and left out."""
+    """The closed-form set-up from ideal image points ``xy`` (n, 2) and poses (n, 4, 4); ``robust``: detect wrong spots
+    and leave them out.  :class:`CalibrationError` if the data don't determine it.
+    """
     check_spots(xy)
     usable = usable_orientations(base_T_ee, groups, SUBSET + 1)
     shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
@@ -214,8 +217,8 @@ def solve(
 
 def turn_from_motions(motions: Sequence[Array], normal: Array) -> tuple[Array, Array, float]:
     """Steps 4 and 5 together, from the matrices (3, 3) by which shifts in base axes move the spots of the plane
-    ``normalᵀ s = 1`` (camera axes): ``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, towards the plane's
-    far side or back: no sign), and the plane's distance (m).
+    ``normalᵀ s = 1`` (camera axes): ``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, oriented along the
+    normal whichever way the laser points), and the plane's distance (m).
     """
     plane = np.stack(basis(normal))
     flat = np.stack([plane @ m for m in motions])
@@ -227,7 +230,7 @@ def turn_from_motions(motions: Sequence[Array], normal: Array) -> tuple[Array, A
         )
     across = rows[0]
     mean = flat.mean(axis=0) @ (np.eye(3) - np.outer(across, across))
-    # P R / distance has two rows of equal length that stand on each other: the nearest such matrix.
+    # P R / distance has two orthogonal rows of equal length: take the nearest such matrix.
     left, sizes, right = np.linalg.svd(mean, full_matrices=False)
     if sizes[1] < FLAT * sizes[0]:
         raise CalibrationError("the spots move along one line only; a beam that doesn't run along the plane")

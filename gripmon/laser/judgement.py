@@ -1,4 +1,4 @@
-"""The watch's settings, what it makes of a pulse, and what has moved: how far, and the alert about it."""
+"""The monitor's settings, its judgement of a pulse, and what has moved: how far, and the alert about it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gripmon.model.records.values import OpenEnum
 
 
 class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The test's contract, what is known of the arm and of wrong spots, and what a motion is worth."""
+    """The test's false-alarm rate, the noise of the arm and rate of wrong spots, and the severity of motions."""
 
     false_alarms_per_1000_pulses: Annotated[
         float, Meta(gt=0.0, le=10.0, description="motions that an unmoved set-up may be said to have made (1/1000)")
@@ -52,7 +52,7 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         ]
         | None
     ) = None
-    """Absent: as many as wrong spots make rarer than false alarms may be."""
+    """Absent: enough that wrong spots alone reach it less often than the false-alarm rate."""
     confirm_pulses: Annotated[
         int, Meta(ge=1, le=1000, description="good pulses after a start, or after lost ones, until it counts as valid")
     ] = 2
@@ -62,19 +62,19 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     @property
     def pulses_until_lost(self) -> int:
-        """Pulses in a row."""
+        """Number of successive pulses."""
         if self.lost_pulses is not None:
             return self.lost_pulses
         return max(math.ceil(math.log(1e-3 * self.false_alarms_per_1000_pulses) / math.log(self.wrong_spots)), 2)
 
     @property
     def arm_covariance(self) -> Array:
-        """(6, 6) of a pose that the arm reports, position then rotation."""
+        """Covariance (6, 6) of a pose that the arm reports, position then rotation."""
         return np.diag(np.square([self.arm_noise_m] * 3 + [self.arm_noise_rad] * 3))
 
 
 class SpotFault(OpenEnum):
-    """Why a pulse tells nothing, or was not believed."""
+    """Why a pulse has no usable spot, or its spot was rejected."""
 
     NO_SPOT = "no_spot"
     OUTLIER = "outlier"
@@ -84,8 +84,8 @@ class SpotFault(OpenEnum):
 
 @dataclass(frozen=True, slots=True)
 class SpotSeen:
-    """A pulse: when (Unix ns), where the arm says that its hand was (4, 4), and the candidates for the spot, as
-    :func:`~gripmon.laser.spots.find_spots` gives them.
+    """A pulse: its time (Unix ns), the reported pose of the end-effector (4, 4), and the candidates for the spot, as
+    :func:`~gripmon.laser.spots.find_spots` returns them.
     """
 
     stamp_ns: int
@@ -95,11 +95,11 @@ class SpotSeen:
 
 @dataclass(frozen=True, slots=True)
 class CameraMotion:
-    """``shift`` (6,): motion of ``base_T_cam`` since the calibration, position (m) then rotation vector (rad), base
-    axes, with ``covariance`` (6, 6): ``base_T_cam' = perturb(base_T_cam, shift)``.  Along directions that the pulses
-    don't show it is what the rest suggests, and the covariance is wide; ``observed`` (k, 6) are those known better than
-    before by far, rows of unit length in ``shift`` divided by the 10 mm and 10 mrad that make metres and radians alike.
-    ``complete``: all six are.  ``text`` says so in words.
+    """The camera's motion.  ``shift`` (6,): motion of ``base_T_cam`` since the calibration, position (m) then rotation
+    vector (rad), base axes, with ``covariance`` (6, 6): ``base_T_cam' = perturb(base_T_cam, shift)``.  Along directions
+    that the pulses don't observe, the shift follows from correlations, and the covariance is wide.  ``observed`` (k,
+    6): the directions that are much better known than before, unit rows in ``shift`` divided by :data:`UNIT`.
+    ``complete``: all six are observed.  ``text`` describes the motion in words.
     """
 
     shift: Array
@@ -111,15 +111,15 @@ class CameraMotion:
 
 @dataclass(frozen=True, slots=True)
 class SpotJudgement:
-    """What was made of one pulse.
+    """The judgement of one pulse.
 
-    ``chosen``: index of the candidate that was taken for the spot, at ``uv_px`` (2,); ``predicted_px`` (2,) by the
-    calibration; ``off_px`` (2,) seen less predicted, whose ``covariance_px`` (2, 2) counts the calibration, the spot
-    and the arm; ``square``: normalised, two degrees of freedom.  ``spots_base_m`` (3, 3): the spot in the base frame by
-    beam and plane, by ray and plane, by beam and ray; ``disagreements`` of these.  ``used``: the pulse was believed,
-    else ``fault`` and ``reason`` say why not.  ``probability_moved``: that anything has moved; ``causes``: what, each
-    with its probability.  ``motion`` of the camera, where it is the camera that moved or may be.  None is what isn't
-    known.
+    ``chosen``: index of the candidate taken for the spot, at ``uv_px`` (2,); ``predicted_px`` (2,) by the calibration;
+    ``off_px`` (2,): innovation, measured less predicted, whose ``covariance_px`` (2, 2) covers the calibration, the
+    spot and the arm; ``square``: normalised innovation squared, two degrees of freedom.  ``spots_base_m`` (3, 3): the
+    spot in the base frame by beam and plane, by ray and plane, by beam and ray; ``disagreements`` of these.  ``used``:
+    the spot was accepted; otherwise ``fault`` and ``reason`` say why not.  ``probability_moved``: that anything has
+    moved; ``causes``: what, each with its probability.  ``motion`` of the camera, if the camera moved or may have.
+    None means unknown.
     """
 
     stamp_ns: int
@@ -143,21 +143,21 @@ class SpotJudgement:
 
 
 MAYBE = 0.05
-"""Probability from which a motion of the camera is reported."""
+"""Probability above which a motion of the camera is reported."""
 RELIEF = 0.8
-"""Part of a limit below which what was said to be past it no longer is."""
+"""Hysteresis: fraction of a limit that the shift must fall below before the severity is lowered."""
 UNIT = np.array([0.01] * 3 + [0.01] * 3)
-"""Metres and radians that count alike: half a metre off, 10 mrad move a point by 5 mm."""
+"""Metres and radians that are weighted alike: at half a metre, 10 mrad move a point by 5 mm."""
 OBSERVED = 0.3
-"""Standard deviation, in units, below which a direction is observed."""
+"""Standard deviation, in :data:`UNIT`, below which a direction counts as observed."""
 _NAMES = ("along x", "along y", "along z", "about x", "about y", "about z")
 _TOLD = 0.4
-"""Part of a direction from which an axis is named."""
+"""Component of a direction above which its axis is named."""
 
 
 def camera_motion(beliefs: Beliefs, k: int) -> CameraMotion:
-    """Of belief ``k``.  What was assumed of a motion's size when it was looked for is taken back as far as it goes: it
-    would pass for knowledge.
+    """The camera's motion under belief ``k``.  For a single motion, the prior on its size is removed as far as
+    possible: it would pass for knowledge.
     """
     shift = beliefs.mean[k, MOVED][CAMERA].copy()
     covariance = beliefs.covariance[k, MOVED, MOVED][CAMERA, CAMERA].copy()
@@ -170,13 +170,13 @@ def camera_motion(beliefs: Beliefs, k: int) -> CameraMotion:
 
 
 def _widened(shift: Array, covariance: Array, assumed: Array) -> tuple[Array, Array]:
-    """With the largest motions' prior in the assumed one's stead: its information is additive."""
+    """The estimate with the prior of the largest motions in place of the assumed one: information is additive."""
     metres, radians = SCALES[-1]
     wide = np.diag(np.square([metres] * 3 + [radians] * 3))
     information = np.linalg.inv(covariance)
     new = information - np.linalg.inv(assumed) + np.linalg.inv(wide)
     new = 0.5 * (new + new.T)
-    if float(np.linalg.eigvalsh(new * np.outer(UNIT, UNIT))[0]) <= 0.0:  # rounding: it was next to nothing
+    if float(np.linalg.eigvalsh(new * np.outer(UNIT, UNIT))[0]) <= 0.0:  # rounding: there was next to no information
         return shift, covariance
     out = np.linalg.inv(new)
     return out @ information @ shift, out
@@ -201,10 +201,10 @@ def _text(shift: Array, covariance: Array, unknown: Array) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """``shift_m``: how far the calibration now puts a spot from where it is, the largest over the last poses (infinite
-    where the camera sees none of them any more), and that shift in camera axes (3,); ``change`` (13,) the best guess
-    of the motion; ``plane_m`` how far the plane then is behind where it was, seen from the camera, at the last pose's
-    spot; ``causes`` the most probable first; ``motion`` of the camera, if it may be that.
+    """What has moved.  ``shift_m``: how far the calibration now misplaces a spot, the largest over the last poses
+    (infinite if the camera sees none of them any more), and that shift in camera axes (3,); ``change`` (13,): best
+    estimate of the motion; ``plane_m``: how far the plane has moved away from the camera, at the last pose's spot;
+    ``causes``, the most probable first; ``motion`` of the camera, if it may have moved.
     """
 
     shift_m: float
@@ -216,7 +216,7 @@ class Moved:
 
 
 def how(test: MotionTest, calibrated: Calibrated, poses: Sequence[Array]) -> Moved:
-    """What the reigning beliefs say."""
+    """What has moved, according to the reigning beliefs."""
     beliefs, best = test.reigning, test.best
     weights = np.exp(beliefs.weight)
     shares = [float(weights[beliefs.kind == kind].sum()) for kind in range(len(KINDS))]
@@ -232,7 +232,7 @@ def how(test: MotionTest, calibrated: Calibrated, poses: Sequence[Array]) -> Mov
 
 
 def _shift(calibrated: Calibrated, change: Array, poses: Sequence[Array]) -> tuple[float, Array | None]:
-    """Camera ray and plane, as calibrated, of where spots are now and of where they were."""
+    """The shift between the spots now and before, both from camera ray and plane as calibrated."""
     world, largest, found = calibrated.world, 0.0, None
     missed = 0
     for pose in poses:
@@ -257,7 +257,7 @@ def _plane(calibrated: Calibrated, change: Array, pose: Array) -> float:
 
 
 def on_plane(world: World, calibrated: Calibrated, uv_px: Array) -> Array:
-    """Where the camera takes a spot (2,) to be, base frame (3,); NaN where its ray misses the plane."""
+    """Where the calibration places a spot (2,), base frame (3,); NaN where its ray misses the plane."""
     ray = world.base_T_cam[:3, :3] @ np.array([*calibrated.camera.undistort(uv_px[None])[0], 1.0])
     normal = world.lit.normal_cam
     steep = float(normal @ ray)
@@ -266,7 +266,7 @@ def on_plane(world: World, calibrated: Calibrated, uv_px: Array) -> Array:
 
 
 def alert_of(moved: Moved, settings: SpotWatchSettings, before: Alert | None) -> Alert:
-    """``before``: what is open about it."""
+    """The alert about a motion; ``before``: the open alert about it."""
     likely = moved.causes[0] if moved.causes else CauseWeight(Cause.UNKNOWN, 1.0)
     cause = likely.cause if likely.probability >= settings.probable else Cause.UNKNOWN
     shift = moved.shift_cam_m
@@ -285,7 +285,7 @@ def alert_of(moved: Moved, settings: SpotWatchSettings, before: Alert | None) ->
 
 
 def _severity(shift_m: float, settings: SpotWatchSettings, said: Severity | None) -> Severity:
-    """What is open stays as severe until it is clearly less."""
+    """Severity with hysteresis: an open alert keeps its severity until the shift is clearly smaller."""
     if shift_m >= settings.limit_m * (RELIEF if said is Severity.ERROR else 1.0):
         return Severity.ERROR
     eased = RELIEF if said in (Severity.WARNING, Severity.ERROR) else 1.0
@@ -329,7 +329,7 @@ def _moved_text(
 
 
 def lost_alert(faults: Sequence[SpotFault]) -> Alert:
-    """No pulse could be believed for so long."""
+    """The alert after too many successive pulses without an accepted spot."""
     return Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, _lost(len(faults), faults))
 
 
@@ -352,7 +352,7 @@ def _lost(pulses: int, faults: Sequence[SpotFault]) -> str:
 
 
 def outlier_text(off_px: Array, square: float) -> str:
-    """Why a spot isn't believed."""
+    """Why a spot was rejected."""
     return (
         f"{float(np.linalg.norm(off_px)):.1f} px from where it should be ({math.sqrt(square):.1f} sigma): "
         "a reflection, or something has moved"

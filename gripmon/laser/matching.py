@@ -1,4 +1,4 @@
-"""Pulses of the laser as they are reported, and which frames show which of them: by their stamps alone, no clock."""
+"""Laser pulses as reported, and which frames show which of them: by their stamps alone, without a clock."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ _MOST_WAITING = 64
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """The laser was on, and the hand stood still at ``base_T_ee`` (4, 4), between two stamps (ns, the frames' clock).
+    """The laser was on, and the end-effector stood still at ``base_T_ee`` (4, 4), between two stamps (ns, the frames'
+    clock).
 
-    ``number`` counts the pulses as they were reported.
+    ``number`` counts the pulses in the order of their reports.
     """
 
     number: int
@@ -40,15 +41,15 @@ class Pulse:
         return self.stamp_ns <= other.until_ns and other.stamp_ns <= self.until_ns
 
     def repeats(self, other: Pulse) -> bool:
-        """The same reported again, as whoever got no answer may do."""
+        """Whether it is the same pulse reported again, for example by a client that got no answer."""
         same = (self.stamp_ns, self.until_ns) == (other.stamp_ns, other.until_ns)
         return same and bool(np.array_equal(self.base_T_ee, other.base_T_ee))
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A pulse with its frames, in the order of their stamps: ``lit`` those with the laser on, ``dark`` the last one
-    before it, None if there is none.  With a ``fault`` it is not to be judged; ``reason`` says why, in one line.
+    """A pulse with its frames, in the order of their stamps: ``lit`` are those with the laser on, ``dark`` the last one
+    before it, None if there is none.  A pulse with a ``fault`` must not be judged; ``reason`` says why, in one line.
     """
 
     pulse: Pulse
@@ -60,7 +61,7 @@ class Shown:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Not complete yet; ``until_s`` it is waited for, by the caller's clock (of a table for ever)."""
+    """An incomplete pulse; ``until_s`` is its deadline, by the caller's clock (infinite for pulses of a table)."""
 
     pulse: Pulse
     until_s: float
@@ -70,7 +71,7 @@ class _Waiting:
 
 @dataclass(slots=True)
 class _Kept:
-    """The newest frames, bounded in time and in bytes; ``forgotten_ns`` is the newest stamp that is gone."""
+    """The newest frames, bounded in time and in bytes; ``forgotten_ns`` is the newest stamp that was dropped."""
 
     frames: deque[Frame] = field(default_factory=deque)
     size_bytes: int = 0
@@ -87,11 +88,11 @@ class _Kept:
 
 
 class Matcher:
-    """Takes pulses and frames as they come, each in its own time; gives every pulse back once, with its frames.
+    """Takes pulses and frames as they arrive; returns every pulse once, with its frames.
 
-    A pulse is complete with the first frame after its end, or when :meth:`finish` says that no more will come.  Two
-    pulses that overlap can't both be right, so neither is used; nor is one that was reported out of order, before one
-    that has been judged.  The same pulse reported twice counts once.
+    A pulse is complete with the first frame after its end, or when :meth:`finish` says that no more will come.  If two
+    pulses overlap, they can't both be right, and neither is used; nor is a pulse that is reported out of order, before
+    one that has been judged.  A pulse that is reported twice counts once.
     """
 
     def __init__(self, settings: PulseSettings) -> None:
@@ -106,12 +107,12 @@ class Matcher:
 
     @property
     def waiting(self) -> int:
-        """Pulses whose last frame hasn't come."""
+        """Number of pulses whose last frame hasn't arrived."""
         return len(self._waiting)
 
     def pulse(self, reported: ReportedPulse, now_s: float) -> list[Shown]:
-        """A pulse was reported; those that are complete now, oldest first.  ``now_s``: by any clock, the one that
-        :meth:`tick` goes by.
+        """Take a reported pulse; return the pulses that are complete now, oldest first.  ``now_s``: as for
+        :meth:`tick`, by any clock.
         """
         pulse = Pulse(self._count, *reported)
         if any(pulse.repeats(known) for known in (*self._done, *(each.pulse for each in self._waiting))):
@@ -128,16 +129,16 @@ class Matcher:
         return self._complete()
 
     def load(self, table: Sequence[ReportedPulse]) -> None:
-        """All pulses of recorded frames at once, by their stamps, none of them overlapping; before any frame."""
+        """Load all pulses of recorded frames at once, by their stamps, none of them overlapping; before any frame."""
         self._waiting = [_Waiting(Pulse(k, *reported), math.inf) for k, reported in enumerate(table)]
         self._count = len(table)
 
     def frame(self, frame: Frame) -> list[Shown]:
-        """A frame came, its image None if it is no use; the pulses that are complete with it."""
+        """Take a frame, without image if it can't be used; return the pulses that are complete with it."""
         back_ns = self._newest_ns - frame.stamp_ns
         if 0 <= back_ns <= self._history_ns:
-            return []  # a stamp that doesn't rise tells of nothing new
-        if back_ns > self._history_ns:  # a clock that was set back: all that is known is of another time
+            return []  # its stamp doesn't increase: nothing new
+        if back_ns > self._history_ns:  # a clock was set back: what is stored is of another time
             self._kept = _Kept()
             self._done.clear()
         self._newest_ns = frame.stamp_ns
@@ -147,18 +148,18 @@ class Matcher:
         return shown
 
     def tick(self, now_s: float) -> list[Shown]:
-        """The pulses that have waited for their frames for too long."""
+        """The pulses whose deadline has passed."""
         over = [each for each in self._waiting if each.until_s < now_s]
         self._waiting = [each for each in self._waiting if each.until_s >= now_s]
         return [self._shown(entry) for entry in over]
 
     def finish(self) -> list[Shown]:
-        """No more frames will come: the pulses that still wait, with what there is of them."""
+        """No more frames will come: return the pulses that still wait, with the frames that there are."""
         entries, self._waiting = self._waiting, []
         return [self._shown(entry) for entry in entries]
 
     def _check(self, entry: _Waiting) -> None:
-        """What speaks against a new pulse, and against those that it contradicts."""
+        """Mark a new pulse, and those that contradict it, with a fault."""
         pulse = entry.pulse
         for other in self._waiting:
             if pulse.overlaps(other.pulse):
@@ -175,7 +176,7 @@ class Matcher:
             )
 
     def _complete(self) -> list[Shown]:
-        # By their beginnings: of a long table only the first few are looked at.
+        # Sorted by their start: only the first few of a long table are examined.
         begun = bisect_left(self._waiting, self._newest_ns, key=lambda each: each.pulse.stamp_ns)
         over = [each for each in self._waiting[:begun] if each.pulse.until_ns < self._newest_ns]
         if over:
@@ -197,7 +198,7 @@ class Matcher:
         return Shown(pulse, tuple(lit[-self._settings.most_frames :]), self._dark(pulse))
 
     def _dark(self, pulse: Pulse) -> Frame | None:
-        """The last frame before the pulse that shows no other one."""
+        """The last frame before the pulse that shows no other pulse."""
         before_ns = pulse.stamp_ns - self._margin_ns
         for frame in reversed(self._kept.frames):
             if pulse.stamp_ns - frame.stamp_ns > self._history_ns:
@@ -207,14 +208,14 @@ class Matcher:
         return None
 
     def _lit(self, frame: Frame) -> bool:
-        """Was the laser on then, for another pulse?"""
+        """Whether the laser was on then, for another pulse."""
         margin_ns = self._margin_ns
         begun = bisect_right(self._waiting, frame.stamp_ns + margin_ns, key=lambda each: each.pulse.stamp_ns)
         pulses = (*self._done, *(each.pulse for each in self._waiting[:begun]))
         return any(p.stamp_ns - margin_ns <= frame.stamp_ns <= p.until_ns + margin_ns for p in pulses)
 
     def _not_shown(self, pulse: Pulse, within: list[Frame]) -> tuple[PulseFault, str]:
-        """Why no frame shows it."""
+        """Why no frame shows the pulse."""
         if within:
             return PulseFault.IMAGE, f"none of its {len(within)} frames can be used: {within[-1].fault}"
         length_s, margin_s = 1e-9 * (pulse.until_ns - pulse.stamp_ns), self._settings.margin_s
@@ -245,7 +246,7 @@ class Matcher:
         )
 
     def _forget(self) -> None:
-        """Frames that no pulse that may still come could need."""
+        """Drop frames that no future pulse can need."""
         kept = self._kept
         oldest_ns = self._newest_ns - self._history_ns
         if self._waiting:
@@ -256,7 +257,7 @@ class Matcher:
 
 
 def mean_image(frames: tuple[Frame, ...]) -> Image:
-    """Of at least one frame, all with images of one shape and type; rounded back to that type."""
+    """Mean of at least one frame; all images have one shape and type, and the mean is rounded to that type."""
     images = [frame.image for frame in frames if frame.image is not None]
     if len(images) == 1:
         return images[0]
@@ -306,13 +307,13 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 LONGEST_S = 60.0
-"""An arm isn't held still for longer to show a spot: such stamps are of two clocks, or of another unit."""
+"""Longest pulse (s): no arm stands still longer to show a spot; longer ones mix two clocks or use another unit."""
 
 _LAST_NS = 2**63 - 1
 
 
 class ReportedPulse(NamedTuple):
-    """The laser was on, and the hand stood still at ``base_T_ee`` (4, 4), between two stamps (ns)."""
+    """The laser was on, and the end-effector stood still at ``base_T_ee`` (4, 4), between two stamps (ns)."""
 
     stamp_ns: int
     until_ns: int
@@ -320,7 +321,7 @@ class ReportedPulse(NamedTuple):
 
 
 def of_message(pulse: LaserPulse) -> ReportedPulse:
-    """ValueError: "what is wrong; what would be right"."""
+    """The pulse in a message.  ValueError: "what is wrong; what would be right"."""
     pose = pulse.base_T_ee
     row = {
         "base_T_ee": {"translation_m": list(pose.translation_m), "rotation_xyzw": list(pose.rotation_xyzw)},
@@ -329,7 +330,7 @@ def of_message(pulse: LaserPulse) -> ReportedPulse:
 
 
 def read_pulses(path: Path) -> list[ReportedPulse]:
-    """The pulses of a table, by their stamps; poses as in the tables of ``calibrate laser``.
+    """The pulses of a table, in the order of their stamps; poses as in the tables of ``calibrate laser``.
 
     Raises :class:`~gripmon.model.errors.InputError`: "file: line: what is wrong; what would be right".
     """
@@ -341,7 +342,7 @@ def read_pulses(path: Path) -> list[ReportedPulse]:
 
 
 def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[ReportedPulse]:
-    """A table's, by their stamps.  ValueError: "place: what is wrong; what would be right"."""
+    """A table's pulses, in the order of their stamps.  ValueError: "place: what is wrong; what would be right"."""
     if not rows:
         raise ValueError("holds no pulse; a header line, then a line for each pulse")
     found = [

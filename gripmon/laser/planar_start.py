@@ -16,26 +16,26 @@ from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)
 SPACING_RAD = np.radians(15.0)
-"""Between normals that are tried at first; it is halved around the best."""
+"""Spacing of the normals that are tried first; it is halved around the best ones."""
 HALVINGS = 2
 MOST_BEST = 4
-"""Normals around which it is sought more finely."""
+"""Number of best normals around which the search is refined."""
 LEAST_DEPTH = 0.02
-"""``nᵀ ray`` from which a spot lies before the camera."""
+"""Minimum ``nᵀ ray`` for a spot in front of the camera."""
 SUBSET = 5
-"""Spots that determine an orientation's fit, with one to spare: four do."""
+"""Number of spots in a subset that determines an orientation's fit: four would do, one is redundant."""
 MOST_SUBSETS = 60
 BELIEVED = 0.6
-"""Part of an orientation's spots that are believed at first."""
+"""Share of an orientation's spots that count as inliers at first."""
 OUTLIER = 4.0
-"""Residual, in robust standard deviations, beyond which a spot has no part in its orientation's fit."""
+"""Residual, in robust standard deviations, above which a spot is left out of its orientation's fit."""
 SEED = 0
-"""Of the subsets that are drawn where there are too many."""
+"""Seed for drawing subsets where there are too many."""
 _STEPS = 20
 
 
 class _Group:
-    """Spots of one orientation with what doesn't depend on the plane."""
+    """Spots of one orientation, with everything that doesn't depend on the plane."""
 
     def __init__(self, rays: Array, shifts_m: Array, rng: np.random.Generator):
         self.rays = rays
@@ -45,24 +45,24 @@ class _Group:
 
     @functools.cached_property
     def subsets(self) -> NDArray[np.intp]:
-        """(b, SUBSET)."""
+        """Index subsets (b, SUBSET)."""
         return _subsets(self.design, self._rng)
 
     @functools.cached_property
     def _predictors(self) -> NDArray[np.float32]:
-        """(b, k, SUBSET): what each subset predicts for all spots.  Rounded: only which is best comes of it."""
+        """(b, k, SUBSET): each subset's prediction of all spots.  Single precision: only the ranking depends on it."""
         return (self.design @ np.linalg.pinv(self.design[self.subsets])).astype(np.float32)
 
     def trimmed(self, normals: Array) -> tuple[Array, NDArray[np.intp]]:
-        """For each normal (m, 3) the least sum (m,) of the believed part of squared residuals, and whose subset."""
+        """For each normal (m, 3) the least trimmed sum (m,) of squared residuals, and the subset that gives it."""
         depth = normals @ self.rays.T
         before = depth > LEAST_DEPTH
         depth = np.where(before, depth, 1.0)
-        # All spots are as far along the normal: two coordinates tell them apart.
+        # All spots have the same coordinate along the normal: two coordinates suffice.
         flat = np.stack([t @ self.rays.T / depth for t in _across(normals)], axis=2)  # (m, k, 2)
         columns = flat.transpose(1, 0, 2).reshape(len(self.rays), -1).astype(np.float32)
         misses = (self._predictors @ columns[self.subsets] - columns).reshape(-1, *columns.shape[:1], len(normals), 2)
-        # As angles, so that far spots count no more than near ones.
+        # As angles, so that far spots have the same weight as near ones.
         size = np.square(depth / np.linalg.norm(self.rays, axis=1))
         squares = np.where(before, np.einsum("bkmi,bkmi,mk->bmk", misses, misses, size.astype(np.float32)), np.inf)
         kept = max(int(np.ceil(BELIEVED * len(self.rays))), SUBSET + 1)
@@ -73,8 +73,8 @@ class _Group:
 
 
 class _Fits:
-    """All orientations' fits for any normal, from the spots (n,) that are believed; orientations are padded to one
-    length, so that they are reckoned at once.
+    """Fits of all orientations for any normal, from the inlier spots (n,); orientations are padded to one length, so
+    that they are computed at once.
     """
 
     def __init__(self, groups: Sequence[_Group], good: Sequence[NDArray[np.bool_]]):
@@ -89,24 +89,24 @@ class _Fits:
         self._ends = np.cumsum([len(group.rays) for group in groups])[:-1]
 
     def matrices(self, normal: Array) -> Array:
-        """(M, 4, 3)."""
+        """Matrices (M, 4, 3)."""
         out: Array = self._inverse @ self._spots(normal)
         return out
 
     def carries(self, normal: Array) -> bool:
-        """Whether all believed spots lie before the camera."""
+        """Whether all inlier spots lie in front of the camera."""
         return bool((self._rays[self._good] @ normal > 0.0).all())
 
     def residuals(self, normal: Array) -> list[Array]:
-        """(k, 3) an orientation, of all its spots, as angles; infinite behind the camera."""
+        """Residuals (k, 3) of all spots per orientation, as angles; infinite behind the camera."""
         spots = self._spots(normal)
         values = (spots - self._design @ (self._inverse @ spots)) / np.linalg.norm(spots, axis=2)[:, :, None]
         values[self._rays @ normal <= 0.0] = np.inf
         return np.split(values[self._there], self._ends)
 
     def slopes(self, normal: Array, tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Residuals (r,) of the believed spots and their derivatives (r, 2) along two tangents of the normal; the fits
-        follow it (Golub and Pereyra, 1973).
+        """Residuals (r,) of the inlier spots and their derivatives (r, 2) along two tangents of the normal, with the
+        linear fits eliminated (variable projection; Golub and Pereyra, 1973).
         """
         spots = self._spots(normal)
         length = np.linalg.norm(spots, axis=2)[:, :, None]
@@ -129,9 +129,9 @@ def planar_start(
 ) -> tuple[Array, list[Array]]:
     """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3): the plane's
     normal (3,), unit, away from the camera, and a matrix (3, 4) for each orientation with ``s = matrix [w 1]``.
-    Without ``robust`` all spots are believed.
+    Without ``robust`` all spots count as inliers.
 
-    Raises :class:`CalibrationError` where no plane before the camera explains the spots.
+    Raises :class:`CalibrationError` if no plane in front of the camera explains the spots.
     """
     rng = np.random.default_rng(seed)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
@@ -156,12 +156,12 @@ def planar_start(
 
 
 def _sums(fits: _Fits, normals: Array) -> Array:
-    """Squared residuals (m,) for each normal (m, 3)."""
+    """Sums of squared residuals (m,) for each normal (m, 3)."""
     return np.array([sum(np.square(r).sum() for r in fits.residuals(n)) for n in normals])
 
 
 def _sought(costs_of: Callable[[Array], Array]) -> Array:
-    """The normal (3,) of the least cost: over the half sphere, then around the best at half the spacing."""
+    """The normal (3,) with the least cost: over the half sphere, then around the best at half the spacing."""
     normals, spacing = _half_sphere(), SPACING_RAD
     costs = costs_of(normals)
     for _ in range(HALVINGS):
@@ -178,14 +178,14 @@ def _sought(costs_of: Callable[[Array], Array]) -> Array:
 
 
 def _believed(groups: Sequence[_Group], normal: Array) -> list[NDArray[np.bool_]]:
-    """Spots near what the best subset predicts, by one robust scale over all orientations."""
+    """Inliers near the best subset's prediction, by one robust scale over all orientations."""
     sizes = []
     for group in groups:
         _, best = group.trimmed(normal[None])
         subset = np.zeros(len(group.rays), dtype=bool)
         subset[group.subsets[int(best[0])]] = True
         sizes.append(np.linalg.norm(_Fits([group], [subset]).residuals(normal)[0], axis=1))
-    # Subsets fit themselves too well: the scale comes from the upper middle of what is believed.
+    # Subsets fit themselves too well: take the scale from the largest residual of the inlier share.
     scale = float(np.quantile(np.concatenate(sizes), BELIEVED)) + 1e-12
     out = []
     for size in sizes:
@@ -197,18 +197,18 @@ def _believed(groups: Sequence[_Group], normal: Array) -> list[NDArray[np.bool_]
 
 
 def _consistent(groups: Sequence[_Group], normal: Array, good: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
-    """Spots near what the fits of the good ones predict, by their median residual over all orientations."""
+    """Inliers near the prediction of the inliers' fits, by their median residual over all orientations."""
     sizes = [np.linalg.norm(values, axis=1) for values in _Fits(groups, good).residuals(normal)]
     believed = np.concatenate([size[part] for size, part in zip(sizes, good, strict=True)])
     unknowns = 8 * len(groups) + 2
-    # A fit takes its unknowns' share of the noise away.
+    # A fit reduces its residuals by the share of its unknowns.
     left = np.sqrt(max(1.0 - unknowns / (2.0 * len(believed)), 0.1))
     limit = OUTLIER * float(np.median(believed)) / 1.1774 / left + 1e-12
     return [size <= limit if (size <= limit).sum() >= SUBSET else part for size, part in zip(sizes, good, strict=True)]
 
 
 def _descend(fits: _Fits, normal: Array) -> Array:
-    """The best normal near one: least squares in its two angles."""
+    """The best normal near a start: least squares in its two angles."""
 
     def cost(at: Array) -> float:
         here, _ = fits.slopes(at, basis(at))
@@ -246,14 +246,14 @@ def _around(normals: Array, angle_rad: float) -> Array:
 
 
 def _across(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors (m, 3) each that stand on each of the normals (m, 3) and on each other."""
+    """Two unit vectors (m, 3) each that are orthogonal to the normals (m, 3) and to each other."""
     a = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     a /= np.linalg.norm(a, axis=1)[:, None]
     return a, np.cross(normals, a)
 
 
 def _subsets(design: Array, rng: np.random.Generator) -> NDArray[np.intp]:
-    """(b, SUBSET) spots whose shifts span space; drawn at random where there are too many."""
+    """(b, SUBSET) spots whose shifts span space; drawn at random if there are too many."""
     count = len(design)
     total = list(itertools.combinations(range(count), SUBSET)) if count <= 10 else []
     drawn = np.array(total, dtype=np.intp) if total else rng.random((4 * MOST_SUBSETS, count)).argsort()[:, :SUBSET]

@@ -1,4 +1,4 @@
-"""Ahead of the pulses: which poses a calibration needs next, and which motions of the camera the watch detects."""
+"""Planning: which poses a calibration needs next, and which motions of the camera the monitor can detect."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from gripmon.model.records import Array
 
 CANDIDATES = 4000
 STEEPEST_TILT_RAD = np.radians(55.0)
-"""Of the beam against the plane's normal: flatter ones smear the spot."""
+"""Largest tilt of the beam against the plane's normal: beyond it the spot is smeared."""
 NEAREST_M = 0.08
-"""Of the laser to the plane."""
+"""Minimum distance from the laser to the plane (m)."""
 BORDER = 0.05
-"""Part of the image, at each side, that planned spots keep clear of: the plan's own errors move them."""
+"""Margin of planned spots at each side of the image, as a fraction of its size: the plan has errors of its own."""
 SEED = 0
 
 
 LEAST_REACH_M = 0.15
-"""Nearer to the base's origin an arm's own body is in the way."""
+"""Minimum distance from the base's origin (m): nearer, the arm's own body is in the way."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``base_T_ee`` (k, 4, 4) in the order in which they help; ``uv_px`` (k, 2) where their spots are expected;
-    ``sigmas`` (k + 1, 2): standard deviation of the camera's position (m) and rotation (rad), root of the sum over the
-    axes, now and after each of them.
+    """Planned poses: ``base_T_ee`` (k, 4, 4), the most useful first; ``uv_px`` (k, 2): expected spots; ``sigmas`` (k +
+    1, 2): standard deviation of the camera's position (m) and rotation (rad), root of the sum over the axes, now and
+    after each pose.
     """
 
     base_T_ee: Array
@@ -46,10 +46,10 @@ class Plan:
 
 
 def plan(refined: Refined, reach_m: float, count: int, *, seed: int = SEED) -> Plan:
-    """Greedy, for an arm that reaches as far from the base's origin: each time the pose after which a point on the
-    plane, seen by the camera, is known best in the base.
+    """Greedy plan for an arm that reaches ``reach_m`` from the base's origin: each step adds the pose that reduces the
+    most the error, in the base, of a point at the plane's distance that the camera sees.
 
-    Raises :class:`CalibrationError` where the arm reaches no pose whose spot the camera sees.
+    Raises :class:`CalibrationError` if the arm reaches no pose whose spot the camera sees.
     """
     setup, camera = refined.setup, make_camera(refined.camera)
     poses = candidates(setup, refined, reach_m, np.random.default_rng(seed))
@@ -73,7 +73,7 @@ def plan(refined: Refined, reach_m: float, count: int, *, seed: int = SEED) -> P
 
 
 def candidates(setup: LaserSetup, refined: Refined, reach_m: float, rng: np.random.Generator) -> Array:
-    """Poses (m, 4, 4) within reach, on the camera's side of the plane, whose spot the camera sees."""
+    """Random poses (m, 4, 4) within reach, on the camera's side of the plane, whose spot the camera sees."""
     camera = make_camera(refined.camera)
     size = np.array([camera.width_px, camera.height_px])
     xy = camera.undistort(rng.uniform(BORDER, 1.0 - BORDER, (CANDIDATES, 2)) * size)
@@ -109,7 +109,9 @@ def candidates(setup: LaserSetup, refined: Refined, reach_m: float, rng: np.rand
 
 
 def _weights(setup: LaserSetup) -> Array:
-    """(13, 13): mean square error (m²) of a point at the plane's distance, from a covariance of :data:`PARAMETERS`."""
+    """(13, 13) that weights a covariance of :data:`PARAMETERS`: mean square error (m²) of a point at the plane's
+    distance.
+    """
     out = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     change = pose_jacobian(setup.cam_T_base)
     size = np.diag([1.0] * 3 + [setup.distance_m**2] * 3)
@@ -125,18 +127,18 @@ def _sigmas(setup: LaserSetup, covariance: Array) -> tuple[float, float]:
 
 PULSES = (LEAST_PULSES, 10, 30, 100)
 POSES, ASSUMED_TILT_RAD, ASSUMED_DISTANCE_M = 9, math.radians(30.0), 0.3
-"""Where no poses are given: spots on a grid over the image, the beam tilted so to the plane's normal, each time in
-another direction, the laser so far from its spot.
+"""Assumption where no poses are given: number of spots, on a grid over the image; tilt of the beam against the plane's
+normal, each time in another direction; distance of the laser from its spot.
 """
 _BORDER = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """``sigma_px`` and ``sigma_m`` (k,): standard deviation of each pose's predicted spot in its worst direction, in
-    the image and on the plane. ``sizes`` (n, 6): motions of ``base_T_cam`` along its position's and rotation's axes
-    (base; m, rad) that are detected on average ``pulses`` (n,) after they happened. ``weakest`` (6,): the direction
-    that is detected the least, its size after the most pulses, m and rad.
+    """Expected detectability.  ``sigma_px`` and ``sigma_m`` (k,): standard deviation of each pose's predicted spot in
+    its worst direction, in the image and on the plane.  ``sizes`` (n, 6): motions of ``base_T_cam`` along its
+    position's and rotation's axes (base; m, rad) that are detected on average ``pulses`` (n,) after they happened.
+    ``weakest`` (6,): the least detectable direction, with its size after the most pulses, m and rad.
     """
 
     sigma_px: Array
@@ -147,7 +149,7 @@ class Forecast:
 
 
 def forecast(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequence[Array]) -> Forecast:
-    """With pulses from these poses (4, 4) in turn, those only from which a spot is seen.  Raises
+    """Forecast for pulses from these poses (4, 4) in turn, using only those from which a spot is seen.  Raises
     :class:`CalibrationError` if there is none.
     """
     arm = settings.arm_covariance
@@ -167,7 +169,7 @@ def forecast(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequenc
 
 
 def assumed_poses(calibrated: Calibrated) -> tuple[Array, ...]:
-    """(:data:`POSES`) ``base_T_ee``, whose spots lie on a grid over the image."""
+    """Poses ``base_T_ee``, up to :data:`POSES`, whose spots lie on a grid over the image."""
     camera, world = calibrated.camera, calibrated.world
     grid = np.linspace(_BORDER, 1.0 - _BORDER, 3)
     towards = world.lit.normal_cam if world.lit.normal_cam @ world.base_T_cam[:3, 2] > 0.0 else -world.lit.normal_cam
@@ -201,11 +203,11 @@ def _metres(calibrated: Calibrated, found: Prediction, spread: Array) -> float:
 
 
 class _Gain:
-    """How far a number of pulses moves the logarithm of a motion's likelihood ratio, on average.
+    """The average growth of a motion's log likelihood ratio over a number of pulses.
 
-    Off-sets r of all pulses are normal with covariance V (noise, calibration, what is off at each pose) if nothing
-    moved, and with V + M if a motion of the assumed size did: the ratio's logarithm is (rᵀ (V⁻¹ - (V+M)⁻¹) r - ln|V+M|
-    + ln|V|) / 2.
+    The innovations r of all pulses are normal with covariance V (noise, calibration, offsets of each pose) if nothing
+    moved, and with V + M after a motion of the assumed size: the log likelihood ratio is (rᵀ (V⁻¹ - (V+M)⁻¹) r -
+    ln|V+M| + ln|V|) / 2.
     """
 
     def __init__(self, calibrated: Calibrated, settings: SpotWatchSettings, seen: Sequence[Prediction], pulses: int):
@@ -231,5 +233,5 @@ class _Gain:
         self.information = moved.T @ still @ moved
 
     def size(self, direction: Array) -> float:
-        """Times a direction (6,) that a motion must have to be detected."""
+        """The factor by which a direction (6,) must be scaled for the motion to be detected."""
         return min(math.sqrt(needed / max(float(direction @ w @ direction), 1e-300)) for needed, w in self._terms)

@@ -1,9 +1,8 @@
-"""All parameters of a laser set-up at once: the least distance between measured and predicted spots in the image.
+"""All parameters of a laser set-up together: minimise the distance between measured and predicted spots in the image.
 
-Equation (35) of the laser-pointer method, with an analytic Jacobian.  Wrong spots (speckle, reflections) get no weight
-where they contradict the rest: Tukey's biweight on a robust scale that shrinks with the residuals; at the end those
-beyond what noise explains are left out, and the rest counts in full.  (The print keeps the 50 nearest of 90, however
-many are wrong.)
+Equation (35) of the laser-pointer method, with an analytic Jacobian.  Wrong spots (speckle, reflections) lose their
+weight by Tukey's biweight, on a robust scale that shrinks with the residuals; at the end outliers are left out, and the
+inliers get full weight.  (The paper keeps the 50 nearest of 90, however many are wrong.)
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ from gripmon.model.least_squares import (
 from gripmon.model.records import Array
 
 FALSE_OUTLIERS = 0.02
-"""How many good spots of a whole data set may be left out, on average.  At 0.1 the smaller scale of what is left takes
-up to 3 % of the coverage of the 95 % region away; wrong spots are farther off than either limit.
+"""Expected number of good spots in a whole data set that are left out.  At 0.1 the smaller scale of the rest reduces
+the coverage of the 95 % region by up to 3 %; wrong spots are farther off than either limit.
 """
 _ITERATIONS = 100
 _ITERATIONS_A_ROUND = 6
@@ -44,10 +43,10 @@ _LEAST_TESTED = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """``covariance`` (13, 13) of :data:`~gripmon.laser.setup.PARAMETERS` at ``setup``; ``residuals_px``
-    (n, 2) measured less predicted; ``used`` (n,); ``scale`` the residuals' standard deviation over what the spots'
-    covariances say (pixels where these are the unit); ``lens`` (p,) changes of the lens's free parameters and
-    ``lens_covariance`` (p, p), empty where it was held.
+    """Result of the refinement: ``covariance`` (13, 13) of :data:`~gripmon.laser.setup.PARAMETERS` at ``setup``;
+    ``residuals_px`` (n, 2) measured less predicted; ``used`` (n,); ``scale``: the residuals' standard deviation over
+    the one by the spots' covariances (in pixels if these are unit matrices); ``lens`` (p,): changes of the lens's free
+    parameters, and ``lens_covariance`` (p, p), empty if the lens was held.
     """
 
     setup: LaserSetup
@@ -67,15 +66,15 @@ class Refined:
 
     @property
     def scale_px(self) -> float:
-        """The spots' noise, each axis, as the residuals show it."""
+        """Noise of the spots per axis, from the residuals and their degrees of freedom."""
         freedom = max(self.degrees_of_freedom, 1)
         return self.rms_px * float(np.sqrt(2 * int(self.used.sum()) / freedom))
 
 
 @dataclass(frozen=True, slots=True)
 class _Tukey:
-    """What whitened residuals cost, and their weights; ``scale`` is one coordinate's standard deviation, by which prior
-    knowledge is weighed against the spots.
+    """Cost and weights of whitened residuals; ``scale`` is one coordinate's standard deviation, by which priors are
+    weighted against the spots.
     """
 
     scale: float
@@ -89,7 +88,7 @@ class _Tukey:
 
 @dataclass(frozen=True, slots=True)
 class _Squares:
-    """As :class:`_Tukey`: the ``used`` spots (n,) count in full, the others not at all."""
+    """Like :class:`_Tukey`, but with weight one for the ``used`` spots (n,) and zero for the others."""
 
     scale: float
     used: NDArray[np.bool_]
@@ -102,7 +101,7 @@ class _Squares:
 
 
 def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
-    """The best set-up near a start.  Raises :class:`CalibrationError` when it is not determined."""
+    """The best set-up near a start.  Raises :class:`CalibrationError` if it is not determined."""
     state = problem.start(start)
     scale = _scale(problem, state)
     for _ in range(_ROUNDS):
@@ -124,7 +123,7 @@ def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
         if (again == used).all():
             break
         used = again
-    else:  # two sets that ask for each other: what the last fit rests on
+    else:  # two alternating sets: keep the last fit's
         _check_enough(problem, used)
         state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
     return _conclude(problem, state, used)
@@ -134,12 +133,12 @@ _LEAST = 1e-9
 
 
 def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], scale: float) -> NDArray[np.bool_]:
-    """Spots (n,) that the fit to all others explains.
+    """Spots (n,) that are consistent with the fit to all others.
 
     A used spot pulls the fit towards itself, one that is left out doesn't: by its leverage G its residual r has the
-    covariance s² (I - G) or s² (I + G).  With the scale of the others, rᵀ (I ∓ G)⁻¹ r / 2 s² follows F (Cook and
-    Weisberg, 1982), and is the same whether the spot is in the fit or not.  One size and one scale for all would leave
-    out twice as many good ones as it says, and make the rest look better than it is.
+    covariance s² (I - G) or s² (I + G).  With the scale of the others, rᵀ (I ∓ G)⁻¹ r / 2 s² has an F distribution
+    (Cook and Weisberg, 1982), and is the same whether or not the spot is in the fit.  A single threshold and scale for
+    all would leave out twice as many good spots as it states, and make the rest look better than it is.
     """
     rows, values = problem.linearised(state)
     normal, _ = _equations(problem, state, _Squares(scale, used))
@@ -147,7 +146,7 @@ def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], sca
     leverage = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
     pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
     spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
-    # A spot that determines a parameter alone fits, however wrong it is: nothing speaks against it.
+    # A spot that alone determines a parameter fits however wrong it is, so it can't be tested.
     tested = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TESTED
     spread[~tested] = np.eye(2)
     sizes = np.where(tested, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
@@ -185,7 +184,7 @@ def _minimise(problem: SpotProblem, state: State, loss: _Tukey | _Squares, itera
 
 
 def _equations(problem: SpotProblem, state: State, loss: _Tukey | _Squares) -> Equations:
-    """Of spots and of what is known beforehand, in the spots' unit."""
+    """Normal equations of the spots and of the prior, in the spots' unit."""
     rows, values = problem.linearised(state)
     spots = normal_equations(rows, values, loss.weights(np.linalg.norm(values, axis=1)))
     prior = normal_equations(*problem.prior(state))
@@ -210,7 +209,7 @@ def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Re
 
 
 def _scale(problem: SpotProblem, state: State) -> float:
-    """Standard deviation of one coordinate, less what the parameters take of the noise."""
+    """Robust standard deviation of one coordinate, corrected for the number of parameters."""
     scale = robust_scale(problem.sizes(state), 2)
     if not np.isfinite(scale):
         raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
@@ -219,22 +218,23 @@ def _scale(problem: SpotProblem, state: State) -> float:
 
 
 def with_held_lens(refined: Refined, problem: SpotProblem, lens: GivenCamera) -> Refined:
-    """``refined``, which held the lens that is its ``problem``'s prior: its ``covariance`` grows by what an error of
-    the lens does to the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up stays as it is.
+    """``refined``, computed with the lens held that is its ``problem``'s prior: its ``covariance`` grows by the effect
+    of the lens's error on the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up is
+    unchanged.
     """
     state = problem.start(refined.setup)
     rows, _ = problem.with_pose_noise(state).linearised(state)
     rows = rows[refined.used].reshape(-1, problem.unknowns)
     own = rows[:, : len(PARAMETERS)]
     size = np.linalg.norm(own, axis=0)
-    # Least squares' answer (13, p) to a change of the lens's free parameters.
+    # Least-squares response (13, p) to a change of the lens's free parameters.
     by_lens = np.linalg.lstsq(own / size, rows[:, len(PARAMETERS) :], rcond=None)[0] / size[:, None]
     return replace(refined, covariance=refined.covariance + by_lens @ np.asarray(lens.covariance) @ by_lens.T)
 
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Standard deviations of each pose that the arm reports: position, each axis, and rotation about each axis."""
+    """Standard deviations of each pose that the arm reports: position along each axis, rotation about each axis."""
 
     position_m: float
     rotation_rad: float
@@ -246,7 +246,7 @@ class PoseNoise:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What is estimated: the set-up, and changes (p,) of the lens's free parameters (none where it is held)."""
+    """The unknowns: the set-up, and changes (p,) of the lens's free parameters (none if it is held)."""
 
     setup: LaserSetup
     lens: Array
@@ -257,8 +257,8 @@ class State:
 
 
 class SpotProblem:
-    """Spots ``uv_px`` (n, 2) with ``covariance_px`` (n, 2, 2), the unit's one pixel if None, at ``base_T_ee``
-    (n, 4, 4).  Covariances are believed up to a common scale, with what the arm's noise adds to them.
+    """Spots ``uv_px`` (n, 2) with ``covariance_px`` (n, 2, 2), one pixel per axis if None, at ``base_T_ee`` (n, 4, 4).
+    Covariances, including what the arm's noise adds, count up to a common scale.
     """
 
     def __init__(
@@ -282,11 +282,11 @@ class SpotProblem:
 
     @property
     def unknowns(self) -> int:
-        """How many parameters are estimated."""
+        """Number of estimated parameters."""
         return len(PARAMETERS) + len(self._root)
 
     def start(self, setup: LaserSetup) -> State:
-        """A state with the lens as it was calibrated."""
+        """A state with the lens as calibrated."""
         return State(setup, np.zeros(len(self._root)))
 
     def camera(self, state: State) -> Camera:
@@ -294,7 +294,7 @@ class SpotProblem:
         return self._camera if self._lens is None else self._lens.model.camera(self._parameters(self._lens, state))
 
     def with_pose_noise(self, state: State) -> SpotProblem:
-        """With what the arm's noise adds to the spots' covariances at a state."""
+        """The problem with the arm's noise added to the spots' covariances at a state."""
         if self._pose_noise is None:
             return self
         spots, _ = spots_on_plane(state.setup, self.base_T_ee)
@@ -307,12 +307,12 @@ class SpotProblem:
         return out
 
     def residuals_px(self, state: State) -> Array:
-        """(n, 2), measured less predicted; NaN where the set-up puts no spot before the camera."""
+        """(n, 2), measured less predicted; NaN where the set-up puts no spot in front of the camera."""
         spots, _ = spots_on_plane(state.setup, self.base_T_ee)
         return self.uv_px - self.camera(state).project(spots)
 
     def sizes(self, state: State) -> Array:
-        """(n,) lengths of the whitened residuals; infinite where there is none."""
+        """Norms (n,) of the whitened residuals; infinite where there is none."""
         sizes = np.linalg.norm(np.einsum("nij,nj->ni", self._whiten, self.residuals_px(state)), axis=1)
         return np.where(np.isfinite(sizes), sizes, np.inf)
 
@@ -332,7 +332,7 @@ class SpotProblem:
         return rows, values
 
     def prior(self, state: State) -> tuple[Array, Array]:
-        """Whitened rows (p, unknowns) and residuals (p,) of what is known of the lens."""
+        """Whitened rows (p, unknowns) and residuals (p,) of the lens's prior."""
         rows = np.zeros((len(self._root), self.unknowns))
         rows[:, len(PARAMETERS) :] = self._root
         return rows, -self._root @ state.lens
@@ -344,7 +344,7 @@ class SpotProblem:
 
 
 def _root(lens: GivenCamera) -> Array:
-    """(p, p), makes changes of the lens's free parameters normal with unit variance.  :class:`CalibrationError`."""
+    """(p, p) matrix that whitens changes of the lens's free parameters.  Raises :class:`CalibrationError`."""
     try:
         return whitening(np.asarray(lens.covariance))
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""What a laser calibration lets expect, and what fresh spots say of it, as plain values for JSON."""
+"""The forecast of a laser calibration, and the result of checking it with new spots, as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gripmon.model.records import Array
 
 
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
-    """What fresh spots would tell: metres, radians, px."""
+    """What new spots would detect: metres, radians, px."""
     known = calibrated(calibration)
     try:
         found = forecast(known, settings, assumed_poses(known))
@@ -35,7 +35,7 @@ def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSet
 def check_values(
     name: str, calibration: LaserCalibration, settings: SpotWatchSettings, found: LaserCheck
 ) -> dict[str, Any]:
-    """What fresh spots do tell: metres, radians, px."""
+    """What new spots did detect: metres, radians, px."""
     last = found.last
     return {
         **_header(name, calibration, settings),
@@ -106,7 +106,7 @@ def _row(name: str, judged: SpotJudgement) -> dict[str, Any]:
 
 
 def _values(array: Array | None) -> Any:
-    """Lists with None for what isn't known."""
+    """Nested lists, with None for values that aren't finite."""
     if array is None:
         return None
     out = array.astype(object)

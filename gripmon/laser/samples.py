@@ -1,4 +1,4 @@
-"""Laser spots with the arm's poses that they were seen at: tables of them, read and looked for in images."""
+"""Laser spots with the arm's poses at which they were seen: tables of them, and finding spots in their images."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from gripmon.model.records import Array
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """``names`` of n samples, and the ``places`` where they stand; ``uv_px`` (n, 2), NaN where an image is to be looked
-    at; ``images`` and ``laser_off``, files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of orientations, or
-    None: the poses tell them.
+    """n samples: their ``names`` and the ``places`` where they are listed; ``uv_px`` (n, 2), NaN where the spot must be
+    found in an image; ``images`` and ``laser_off``, files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of
+    orientations, or None to derive them from the poses.
     """
 
     names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Samples:
 
     @classmethod
     def of_spots(cls, uv_px: Array, base_T_ee: Array, groups: Sequence[str] | None = None) -> Samples:
-        """Spots (n, 2) whose places are known, at poses (n, 4, 4)."""
+        """From known spots (n, 2) at poses (n, 4, 4)."""
         none = (None,) * len(uv_px)
         names = tuple(f"sample {k + 1}" for k in range(len(uv_px)))
         labels = None if groups is None else tuple(groups)
@@ -51,13 +51,13 @@ class Samples:
 
     @property
     def files(self) -> list[Path]:
-        """All images that are to be looked at."""
+        """All images in which spots must be found."""
         unseen = np.flatnonzero(np.isnan(self.uv_px).any(axis=1))
         files = [path for k in unseen for path in (self.images[k], self.laser_off[k])]
         return list(dict.fromkeys(path for path in files if path is not None))
 
     def picked(self, kept: Sequence[int]) -> Samples:
-        """Those samples only."""
+        """A subset of the samples."""
         return Samples(
             names=tuple(self.names[k] for k in kept),
             places=tuple(self.places[k] for k in kept),
@@ -70,9 +70,9 @@ class Samples:
 
 
 def read_samples(paths: Sequence[Path]) -> Samples:
-    """All samples of all tables; of several tables each sample's name says which.
+    """All samples of all tables; with several tables each sample's name includes its table.
 
-    :class:`~gripmon.model.errors.InputError` for what is wrong with a table, or with the tables together.
+    :class:`~gripmon.model.errors.InputError` for a faulty table, or tables that don't go together.
     """
     parts = []
     for path in paths:
@@ -105,7 +105,7 @@ def read_samples(paths: Sequence[Path]) -> Samples:
 
 
 def _from_rows(rows: Sequence[Row], places: Sequence[str], table: Path) -> Samples:
-    """``places`` say where each row stands.  ValueError: "place: what is wrong; what would be right"."""
+    """Samples of a table's rows; ``places`` name each row.  ValueError: "place: what is wrong; what would be right"."""
     if not rows:
         raise ValueError("holds no sample; a row for each spot, better 50 of them")
     named = [row.get("group") not in (None, "") for row in rows]
@@ -141,7 +141,7 @@ def _spot(row: Row, place: str) -> tuple[float, float]:
 
 
 def _check_different(samples: Samples, places: Sequence[str]) -> None:
-    """The same sample twice would make every uncertainty too small."""
+    """Reject duplicate samples, which would make every uncertainty too small."""
     seen: dict[tuple[Any, ...], str] = {}
     for uv, pose, image, place in zip(samples.uv_px, samples.base_T_ee, samples.images, places, strict=True):
         key = (image, *np.round(pose, 9).ravel().tolist(), *([] if np.isnan(uv).any() else uv.tolist()))
@@ -151,8 +151,9 @@ def _check_different(samples: Samples, places: Sequence[str]) -> None:
 
 
 def spots_of(samples: Samples, size_px: tuple[int, int], progress: Progress = quiet) -> list[list[Spot] | NotFound]:
-    """Of every sample: what may be its spot, the likeliest first, or why there is none.  Images are looked at where the
-    sample doesn't have its spot.  :class:`~gripmon.model.errors.InputError` for what isn't of a camera of this size.
+    """For every sample its candidate spots, the likeliest first, or why there is none.  Images are read only for
+    samples without a given spot.  :class:`~gripmon.model.errors.InputError` for images or spots that don't match the
+    camera's size.
     """
     out: list[list[Spot] | NotFound] = []
     with progress(len(samples), "spot") as step:

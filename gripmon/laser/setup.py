@@ -1,5 +1,5 @@
-"""A laser pointer on the end-effector, a plane that its spot falls on, a fixed camera that sees the spot; and the file
-of such a set-up's calibration.
+"""The set-up: a laser pointer on the end-effector, a plane that its spot falls on, and a fixed camera that sees the
+spot; also the file of its calibration.
 
 The spot is where the laser's line meets the plane, laser-pointer method, equations (7) to (9).
 """
@@ -23,7 +23,9 @@ PARAMETERS = (
     "plane.tilt_a_rad", "plane.tilt_b_rad", "plane.distance_m",
     "laser.turn_a_rad", "laser.turn_b_rad", "laser.shift_a_m", "laser.shift_b_m",
 )  # fmt: skip
-"""What :meth:`LaserSetup.moved` changes: a perturbation of the pose as everywhere else, then plane and laser line."""
+"""The parameters that :meth:`LaserSetup.moved` changes: a perturbation of the pose as elsewhere, then plane and laser
+line.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +41,8 @@ class LaserSetup:
     direction_ee: Array
 
     def moved(self, change: Array) -> LaserSetup:
-        """Changed by small amounts (13,), in the order of :data:`PARAMETERS`; the laser's point stays in its plane,
-        which is the one of the end-effector's axes that the beam pierces the most steeply.
+        """The set-up changed by small amounts (13,), in the order of :data:`PARAMETERS`.  The laser's point stays in
+        its plane: of the three planes spanned by end-effector axes, the one that the beam crosses most steeply.
         """
         a, b = basis(self.normal_cam)
         normal = self.normal_cam + change[6] * a + change[7] * b
@@ -58,17 +60,17 @@ class LaserSetup:
 
 
 def basis(direction: Array) -> tuple[Array, Array]:
-    """Two unit vectors (3,) that stand on a unit vector and on each other, right-handed with it; steady around it."""
+    """Two unit vectors (3,) orthogonal to a unit vector and to each other, right-handed with it; locally continuous."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    turn = skew(direction)  # by this, as np.cross of single vectors costs many times more
+    turn = skew(direction)  # because np.cross of single vectors is many times slower
     a = turn @ helper
     a /= np.linalg.norm(a)
     return a, turn @ a
 
 
 def origin_axes(direction_ee: Array) -> tuple[int, int]:
-    """The two axes of the end-effector that span the plane in which the laser's point is sought: the one that the beam
-    is farthest from lying in.
+    """The two axes of the end-effector that span the plane of the laser's point: of the three such planes, the one that
+    the beam crosses most steeply.
     """
     pierced = int(np.argmax(np.abs(direction_ee)))
     return ((1, 2), (0, 2), (0, 1))[pierced]
@@ -82,8 +84,8 @@ def laser_lines(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
 
 
 def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
-    """Laser line and plane, equations (7) to (9): spots (n, 3) in the camera frame, and their derivatives (n, 3, 13) by
-    :data:`PARAMETERS`; NaN where the beam runs along the plane.
+    """Intersections of laser line and plane, equations (7) to (9): spots (n, 3) in the camera frame, and their
+    derivatives (n, 3, 13) by :data:`PARAMETERS`; NaN where the beam runs along the plane.
     """
     origin, u = laser_lines(setup, base_T_ee)
     n = setup.normal_cam
@@ -91,11 +93,11 @@ def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
     steep = np.where(np.abs(steep) > 1e-9, steep, np.nan)
     along = (setup.distance_m - origin @ n) / steep
     spots = origin + along[:, None] * u
-    # A change of the line moves the spot along the plane: what leaves the plane comes back along the beam.
+    # A change of the line moves the spot within the plane: project the change onto it along the beam.
     project = np.eye(3) - u[:, :, None] * n / steep[:, None, None]
     slopes = np.zeros((len(spots), 3, len(PARAMETERS)))
     slopes[:, :, :3] = project
-    # Turning the base turns origin and direction: the spot's lever counts from the camera's end of cam_T_base.
+    # Rotating the base rotates the beam's origin and direction: the spot's lever arm starts at the origin of the base.
     slopes[:, :, 3:6] = -project @ skew(spots - setup.cam_T_base[:3, 3])
     a, b = basis(n)
     for column, tilt in ((6, a), (7, b)):
@@ -112,7 +114,7 @@ def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
 
 def pose_slopes(setup: LaserSetup, base_T_ee: Array) -> Array:
     """Derivatives (n, 3, 6) of :func:`spots_on_plane` by a perturbation (position, then rotation; base axes) of each
-    sample's own pose: what an arm's inaccuracy does to the spot, camera frame.
+    sample's own pose: the effect of the arm's errors on the spot, camera frame.
     """
     origin, u = laser_lines(setup, base_T_ee)
     steep = u @ setup.normal_cam
@@ -120,7 +122,7 @@ def pose_slopes(setup: LaserSetup, base_T_ee: Array) -> Array:
     along = (setup.distance_m - origin @ setup.normal_cam) / steep
     project = np.eye(3) - u[:, :, None] * setup.normal_cam / steep[:, None, None]
     cam_R_base = setup.cam_T_base[:3, :3]
-    # The spot's lever about the end-effector's origin, base axes: laser's point and beam together.
+    # The spot's lever arm about the end-effector's origin, base axes: laser's point and beam together.
     lever = base_T_ee[:, :3, :3] @ setup.point_ee_m + along[:, None] * (base_T_ee[:, :3, :3] @ setup.direction_ee)
     slopes = np.empty((len(base_T_ee), 3, 6))
     slopes[:, :, :3] = project @ cam_R_base
@@ -171,8 +173,8 @@ class LaserCalibration(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
     tag="gripmon.laser_calibration/1",
 ):  # fmt: skip
-    """``base_T_cam``, plane and laser line; ``covariance`` (n·n, row by row) of the n ``parameters``, ``sigmas`` the
-    roots of its diagonal.  ``camera`` is the refined one where the lens was refined.
+    """A laser calibration: ``base_T_cam``, plane and laser line; ``covariance`` (n·n, row by row) of the n
+    ``parameters``, ``sigmas`` the roots of its diagonal.  ``camera`` is the refined one if the lens was refined.
     """
 
     camera: LensSettings
@@ -188,7 +190,7 @@ class LaserCalibration(
 
 
 def pose_jacobian(cam_T_base: Array) -> Array:
-    """How a perturbation of ``cam_T_base`` (camera axes) perturbs ``base_T_cam`` (base axes), (6, 6)."""
+    """Jacobian (6, 6) of a perturbation of ``base_T_cam`` (base axes) by one of ``cam_T_base`` (camera axes)."""
     turn = cam_T_base[:3, :3].T
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = -turn

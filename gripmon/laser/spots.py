@@ -1,4 +1,4 @@
-"""A laser's spot in an image: candidates, with their centres and how exact these are."""
+"""A laser's spot in an image: candidates, with their centres and the covariances of these."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from gripmon.calibrate.sighting import NotFound
 from gripmon.model.records import Array, Image
 
 BACKGROUND_PX = 31
-"""Width of the window whose median is the background, where no image with the laser off is given: spots are smaller."""
+"""Width of the median window for the background, used without a laser-off image (px): larger than spots."""
 DETECTION = 8.0
-"""Smoothed signal over its noise from which a pixel belongs to a candidate."""
+"""Smoothed signal over its noise above which a pixel belongs to a candidate."""
 SHARE_OF_PEAK = 0.15
-"""Part of a blob's own peak above which its pixels count."""
+"""Fraction of a blob's own peak above which its pixels count."""
 MOST_CANDIDATES = 5
 MOST_OF_IMAGE = 0.05
 SATURATED = 0.98
 GRAIN_PX = 5
-"""Width of a fine speckle grain: gaps between grains of one spot are closed so far."""
+"""Width of a fine speckle grain: gaps up to this size between grains of one spot are closed."""
 GRAINS_PX = (5, 9, 13)
-"""Widths over which a spot's deviations may hang together; the one that says the most counts."""
+"""Widths over which a spot's deviations may be correlated; the one that gives the largest variance counts."""
 BESIDE = 12
-"""Places around a spot that tell what its surroundings do to the centre."""
+"""Number of places around a spot that show the effect of its surroundings on the centre."""
 _SMALLEST_SIGMA_PX = 0.02
 _LEAST_AREA_PX = 4
 _MOST_HIDDEN = 0.75
@@ -34,8 +34,8 @@ _MOST_CUT = 0.35
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """``uv_px`` (2,), ``covariance_px`` (2, 2) of its error, ``flux`` and ``peak`` above the background (grey levels),
-    ``area_px``, and which part of it is ``saturated``.
+    """A candidate: ``uv_px`` (2,), ``covariance_px`` (2, 2) of its error, ``flux`` and ``peak`` above the background
+    (grey levels), ``area_px``, and the fraction of it that is ``saturated``.
     """
 
     uv_px: Array
@@ -47,13 +47,13 @@ class Spot:
 
 
 def plain_spot(uv_px: Array) -> Spot:
-    """A spot that nothing but its place (2,) is known of: the calibration's own residuals tell how exact it is."""
+    """A spot of which only the position (2,) is known: its noise is estimated from the calibration's residuals."""
     return Spot(np.asarray(uv_px, dtype=float), np.zeros((2, 2)), 0.0, 0.0, 0, 0.0)
 
 
 def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | NotFound:
-    """Candidates, the brightest (by flux) first.  ``laser_off`` is the same view without the laser: ambient light and
-    reflections that don't come from it vanish.
+    """Candidates, the brightest (by flux) first.  ``laser_off`` is the same view without the laser, which removes
+    ambient light and its reflections.
     """
     grey = _grey(image)
     ceiling = _ceiling(image)
@@ -67,7 +67,7 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
         found = _candidates(change, grey, _grey(laser_off), ceiling)
         if not isinstance(found, NotFound):
             return found
-        # A shadow that moved in between changes a part of the image: against its own neighbourhood the spot stands out.
+        # A shadow that moved between the images changes a large area: compare with the local background instead.
         middle = 0.5 * (change + np.float32(ceiling))
         local = 2.0 * (middle - _background(middle, ceiling))
         again = _candidates(local, grey, _grey(laser_off), ceiling)
@@ -76,8 +76,10 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
 
 
 def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> list[Spot] | NotFound:
-    """From what stands out; ``ambient`` is the light without the laser as far as it is known, ``grey`` the image."""
-    # Quantisation is noise, too; the median is ambient light that changed between the images.
+    """Candidates in a background-free signal; ``ambient``: the light without the laser, if known; ``grey``: the
+    image.
+    """
+    # Quantisation counts as noise, too; the median is ambient light that changed between the images.
     signal = signal - np.median(signal)
     noise = max(1.4826 * float(np.median(np.abs(signal))), ceiling / 255.0 / np.sqrt(12.0))
     smooth: Array = np.asarray(cv2.GaussianBlur(signal, (0, 0), 1.0))
@@ -100,7 +102,7 @@ def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> l
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """What all candidates of an image share; ``bright`` where any of them lies."""
+    """What all candidates of an image share; ``bright`` is the mask of all candidates."""
 
     signal: Array
     grey: Array
@@ -112,7 +114,7 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class _Blob:
-    """A window of the image (rows, columns) that holds it with a grain's margin, and which of its pixels are its."""
+    """A window of the image (rows, columns) around a blob, with a margin of one grain, and the blob's mask in it."""
 
     window: tuple[slice, slice]
     inside: NDArray[np.bool_]
@@ -125,7 +127,7 @@ def _touches_border(blob: _Blob, shape: tuple[int, ...]) -> bool:
 
 
 def _measured(scene: _Scene, blob: _Blob) -> Spot | None:
-    """Centroid of what stands out; None for what is not a spot, or not seen whole."""
+    """Centroid of the signal in a blob; None if it isn't a spot, or not completely visible."""
     signal, noise = scene.signal, scene.noise
     window, inside = blob.window, blob.inside
     top, left = window[0].start, window[1].start
@@ -140,12 +142,12 @@ def _measured(scene: _Scene, blob: _Blob) -> Spot | None:
     places = np.stack([u + left, v + top], axis=1).astype(float)
     border = ((places == 0) | (places == np.array(signal.shape[::-1]) - 1)).any(axis=1)
     if weight[border].max(initial=0.0) > _MOST_CUT * peak:
-        return None  # where its middle is can't be told
+        return None  # its centre can't be determined
     centre = weight @ places / flux
     offset = places - centre
     shape = np.einsum("n,ni,nj->ij", weight, offset, offset) / flux
     covariance = _centre_covariance(part, mask, weight, offset, shape, noise)
-    # Of what the border cuts off, as much again as is seen at it.
+    # The border is assumed to cut off as much as is visible along it.
     missing = weight[border] @ offset[border] / flux
     covariance += np.outer(missing, missing)
     covariance += _surroundings(scene, np.stack([v + top, u + left], axis=1), weight, offset)
@@ -156,9 +158,9 @@ def _measured(scene: _Scene, blob: _Blob) -> Spot | None:
 def _centre_covariance(
     part: Array, mask: NDArray[np.bool_], weight: Array, offset: Array, shape: Array, noise: float
 ) -> Array:
-    """Of the centroid: each pixel's deviation from a smooth spot of the same moments moves it by its lever.  What is
-    the same on the other side of the centre (a saturated core) doesn't; speckle's deviations hang together over a
-    grain, so that neighbours count with each other.
+    """Covariance of the centroid: each pixel's deviation from a smooth spot with the same moments moves it by its lever
+    arm.  Deviations that are symmetric about the centre (a saturated core) cancel; speckle is correlated over a grain,
+    so that neighbours are summed.
     """
     flux = float(weight.sum())
     steady = shape + np.eye(2) / 12.0
@@ -170,27 +172,27 @@ def _centre_covariance(
     lever = np.zeros((*part.shape, 2))
     lever[mask] = (deviation[mask] - _mirrored(deviation, rows, columns, offset))[:, None] * offset
     # The centre follows the speckle that it is measured by, which hides about half of the variance on rendered grains;
-    # the difference of two pixels has twice that of each.
+    # the difference of two pixels has twice the variance of one.
     sensor = noise**2 * (offset.T @ offset) / flux**2
     speckle = 0.0
     for width in GRAINS_PX:
-        # The centre is where all levers cancel: a window as wide as the spot would see none of their variance.
+        # All levers cancel at the centre: a window as wide as the spot would see none of their variance.
         hidden = min(width**2 / len(offset), _MOST_HIDDEN)
         if width > GRAIN_PX and hidden == _MOST_HIDDEN:
             break
         together = np.asarray(cv2.blur(lever, (width, width), borderType=cv2.BORDER_CONSTANT)) * width**2
         wider = float((lever * together).sum()) / flux**2 - 2.0 * float(np.trace(sensor))
         speckle = max(speckle, wider / (1.0 - hidden))
-    # A few grains tell how much, not where to: that is the spot's form.
+    # A few grains show the size of the error, not its direction: take that from the spot's shape.
     levers = (offset.T * np.square(model)) @ offset
     out: Array = speckle * levers / np.trace(levers) + sensor + _SMALLEST_SIGMA_PX**2 * np.eye(2)
     return out
 
 
 def _surroundings(scene: _Scene, places: NDArray[np.intp], weight: Array, offset: Array) -> Array:
-    """(2, 2): what ambient light and a surface that isn't the same everywhere do to the centre, by the same sums at
-    places beside the spot: light that isn't the laser's adds to it, and where the surface is darker it sends less of
-    the laser back.  Places on both sides count together: what the spot's own rim does to them cancels.
+    """(2, 2): the effect of ambient light and uneven reflectance on the centre, from the same sums at places beside the
+    spot: other light adds to the spot, and a darker surface reflects less of the laser.  Opposite places are summed,
+    which cancels the effect of the spot's own rim.
     """
     flux = float(weight.sum())
     level = float(np.median(scene.ambient[tuple(places.T)]))
@@ -221,7 +223,7 @@ def _positive(matrix: Array) -> Array:
 
 
 def _mirrored(values: Array, rows: NDArray[np.intp], columns: NDArray[np.intp], offset: Array) -> Array:
-    """``values`` on the other side of the centre, between pixels bilinearly; zero outside."""
+    """``values`` mirrored at the centre, with bilinear interpolation; zero outside."""
     grid = np.indices(values.shape).astype(float)
     other_v = (2.0 * (rows[0] - offset[0, 1]) - grid[0]).astype(np.float32)
     other_u = (2.0 * (columns[0] - offset[0, 0]) - grid[1]).astype(np.float32)
@@ -230,8 +232,8 @@ def _mirrored(values: Array, rows: NDArray[np.intp], columns: NDArray[np.intp], 
 
 
 def _blobs(smooth: Array, limit: float) -> tuple[list[_Blob], NDArray[np.bool_]]:
-    """Connected blobs above a limit, the grains of one spot put together: those with the most light, for a spot is
-    small beside what an uneven plane shows without an image with the laser off; and where any of them lies.
+    """Connected blobs above a limit, with the grains of one spot merged, and the mask of all of them.  Those with the
+    most light are kept: without a laser-off image an uneven plane shows many blobs.
     """
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (GRAIN_PX, GRAIN_PX))
     closed = cv2.morphologyEx((smooth > limit).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
@@ -254,14 +256,14 @@ def _blobs(smooth: Array, limit: float) -> tuple[list[_Blob], NDArray[np.bool_]]
 
 
 def _background(grey: Array, ceiling: float) -> Array:
-    """Median over a window, in 8 bits: OpenCV has no other for large windows."""
+    """Median over a window, in 8 bits: OpenCV supports only those for large windows."""
     eight = np.clip(grey * (255.0 / ceiling), 0.0, 255.0).astype(np.uint8)
     width = min(BACKGROUND_PX, (min(grey.shape) - 1) // 2 * 2 - 1)
     return cv2.medianBlur(eight, width).astype(np.float32) * np.float32(ceiling / 255.0)
 
 
 def _brightest_change(image: Image, laser_off: Image) -> Array:
-    """The channel that the laser lights the most: a red laser is faint in grey."""
+    """Change in the channel that the laser lights the most: a red laser is faint in grey."""
     change = image.astype(np.float32) - laser_off.astype(np.float32)
     return _brightest(change)
 
@@ -271,7 +273,7 @@ def _grey(image: Image) -> Array:
 
 
 def _brightest(values: Array) -> Array:
-    """Of the channels, at each pixel; numpy takes ten times as long over so short an axis."""
+    """Maximum over the channels at each pixel; numpy takes ten times as long over such a short axis."""
     if values.ndim == 2:
         return values
     blue, green, red = cv2.split(values)
@@ -279,10 +281,10 @@ def _brightest(values: Array) -> Array:
 
 
 def _ceiling(image: Image) -> float:
-    """Full scale of the image's numbers."""
+    """Full scale of the image's values."""
     if image.dtype == np.uint8:
         return 255.0
     if image.dtype == np.uint16:
-        # Cameras of 10 to 14 bits deliver 16: the highest power of two that is needed.
+        # Cameras with 10 to 14 bits deliver 16: take the smallest power of two that holds the maximum.
         return float(2 ** max(int(image.max()).bit_length(), 8) - 1)
     return max(float(image.max()), 1e-6)

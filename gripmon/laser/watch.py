@@ -1,4 +1,4 @@
-"""Does a laser calibration still hold?  After every pulse a state, a verdict, and alerts."""
+"""Monitor of a laser calibration: after every pulse a state, a verdict, and alerts."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from gripmon.laser.world import Prediction, Single, alone, calibrated, larger, p
 from gripmon.model.records import Alert, State, Verdict
 
 MOTION, VIEW = "motion", "view"
-"""What alerts are about."""
+"""Topics of the alerts."""
 SUSPICIOUS = 0.03
-"""Odds of a motion, over those of an alarm, from which the calibration is suspect."""
+"""Odds of a motion, over those of an alarm, above which the calibration is suspect."""
 BETTER = 0.5
-"""Part of the standard deviation that an open alert says, below which it is updated."""
+"""An open alert is updated when the standard deviation falls below this fraction of the reported one."""
 _OCCLUDED = 2
-"""Pulses in a row that can't be believed, from which the view counts as blocked."""
+"""Successive rejected pulses from which the view counts as blocked."""
 
 
 class SpotWatch:
-    """A pure function of the pulses so far; time is theirs.
+    """A pure function of the pulses so far; time is that of the pulses.
 
-    ``state`` and ``verdict`` are those after the last pulse: acquiring until ``confirm_pulses`` are where they should
-    be; tracking; drifting while something has moved; occluded and lost while pulses show no spot that can be believed.
-    ``valid``: measure by the calibration; ``suspect``: finish a motion by it, don't begin one; ``unknown``: don't move
-    by it.  ``book`` holds the alerts.
+    ``state`` and ``verdict`` are those after the last pulse: acquiring until ``confirm_pulses`` spots are where they
+    should be; tracking; drifting while something has moved; occluded and lost while pulses show no acceptable spot.
+    ``valid``: measure with the calibration; ``suspect``: finish a motion with it, don't begin one; ``unknown``: don't
+    move by it.  ``book`` holds the alerts.
     """
 
     def __init__(self, calibration: LaserCalibration, settings: SpotWatchSettings | None = None):
         """Raises :class:`~gripmon.calibrate.sighting.CalibrationError` for a file whose numbers make no set-up,
-        ValueError for a camera that can't be meant.
+        ValueError for an implausible camera.
         """
         self.settings = settings or SpotWatchSettings()
         self._calibrated = calibrated(calibration)
@@ -67,10 +67,10 @@ class SpotWatch:
         self._good = 0
         self._odds = 0.0
         self._moved: Moved | None = None
-        self._said_sigma = math.inf  # of the camera's motion, in the alert as it was last said
+        self._said_sigma = math.inf  # of the camera's motion, as last reported in the alert
 
     def judge(self, seen: SpotSeen) -> SpotJudgement:
-        """What a pulse says.  Stamps that go back count as the last one's."""
+        """Judge a pulse.  A stamp that goes back counts as the previous one's."""
         self.pulses += 1
         self._stamp_ns = max(self._stamp_ns, seen.stamp_ns)
         if not np.isfinite(seen.base_T_ee).all():
@@ -115,7 +115,7 @@ class SpotWatch:
         return self._judged(seen, SpotFault.OUTLIER, reason, predicted, single, chosen)
 
     def _missing(self, seen: SpotSeen, predicted: Prediction, reason: str) -> SpotJudgement:
-        """No spot: that says something only where there should be one."""
+        """No spot was found: that counts as a fault only where one should be visible."""
         camera, spread = self._calibrated.camera, predicted.rows @ self._calibrated.covariance @ predicted.rows.T
         margin = 3.0 * np.sqrt(spread.diagonal() + self._calibrated.sigma_px**2)
         size = np.array([camera.width_px, camera.height_px])
@@ -157,7 +157,7 @@ class SpotWatch:
         return out if single is None else replace(out, chosen=chosen, **single._asdict())
 
     def _state(self) -> State:
-        # Wrong spots may be the beginning of a motion, which is better explained as one: they count half.
+        # Wrong spots may be the start of a motion, which the motion test explains better: they count half.
         astray = sum(fault is SpotFault.OUTLIER for fault in self._bad)
         if len(self._bad) - 0.5 * astray >= self.settings.pulses_until_lost:
             return State.LOST
@@ -194,27 +194,21 @@ class SpotWatch:
 
     @property
     def motion_alert(self) -> Alert | None:
-        """What the pulses so far say of a motion, whether or not the open alert has been updated since; None if
-        nothing has moved.
-        """
+        """The motion according to the pulses so far, even if the open alert is older; None if nothing has moved."""
         if self._moved is None:
             return None
         return alert_of(self._moved, self.settings, self.book.about(MOTION))
 
     @property
     def _sigma(self) -> float:
-        """How well the camera's motion is known: its largest standard deviation, in 10 mm and 10 mrad; infinite where
-        none is reported.
-        """
+        """Largest standard deviation of the camera's motion, in 10 mm and 10 mrad; infinite if none is reported."""
         motion = None if self._moved is None else self._moved.motion
         if motion is None:
             return math.inf
         return math.sqrt(float(np.linalg.eigvalsh(motion.covariance / np.outer(UNIT, UNIT))[-1]))
 
     def _known_better(self) -> bool:
-        """The first pulses hardly tell how a camera has moved: later ones are worth an update when they tell it much
-        better than what was said.
-        """
+        """Whether the motion is known much better than the alert reports: the first pulses hardly determine it."""
         return self._sigma < BETTER * self._said_sigma
 
     @property
@@ -222,11 +216,11 @@ class SpotWatch:
         return self._stamp_ns * 1e-9
 
     def acknowledge(self, alert_id: str = "") -> tuple[Alert, ...]:
-        """A person has taken note of an alert, or of all; empty if there is none that isn't acknowledged."""
+        """Acknowledge an alert, or all; empty if there is none that isn't acknowledged."""
         return self.book.acknowledge(alert_id)
 
     def reset(self) -> tuple[Alert, ...]:
-        """Begin again, as after a repair: the calibration is believed again, alerts are cleared."""
+        """Start again, as after a repair: the calibration is trusted again, alerts are cleared."""
         self._begin()
         text = "begun again"
         alerts: tuple[Alert, ...] = ()

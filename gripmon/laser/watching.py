@@ -1,4 +1,4 @@
-"""A second camera's frames and a laser's pulses in, what became of each pulse out."""
+"""From a second camera's frames and a laser's pulses to the result of each pulse."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ from gripmon.model.records import (
 _IMAGE = "image"
 _IMAGE_ALERT_AFTER_S = 1.0
 _STILL = 3.0
-"""Standard deviations of the way between a pulse's halves, each at most twice a spot's own, that noise explains."""
+"""Gate for the spot's motion between a pulse's halves, in standard deviations; a half has at most twice a spot's
+own.
+"""
 _NO_BACKGROUND = (
     "; no frame to subtract, none since the pulse before had the laser off: a longer pause, by more than "
     "laser.frames.margin_s after a pulse and before the next one"
@@ -51,15 +53,15 @@ _NO_BACKGROUND = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a pulse; ``image`` is what its spot was looked for in, None if there was none."""
+    """The result of a pulse; ``image`` is the one in which the spot was searched, None if there was none."""
 
     record: SpotRecord
     image: Image | None = None
 
 
 class Displacement(NamedTuple):
-    """Of the point of the plane that the camera's axis meets, along the camera's axes (m): where it lies less where the
-    calibration has it; and its largest standard deviation (m).
+    """Shift of the plane's point on the camera's axis, along the camera's axes (m): its position now less the
+    calibrated one; and the shift's largest standard deviation (m).
     """
 
     shift_m: tuple[float, float, float]
@@ -72,8 +74,8 @@ class PulsedWatch:
     def __init__(
         self, calibration: LaserCalibration, watch: SpotWatchSettings, pulses: PulseSettings, *, name: str = ""
     ) -> None:
-        """``name`` is the calibration's in messages; by default its contents make it.  Raises CalibrationError for a
-        calibration whose numbers make no set-up.
+        """``name`` is the calibration's name in messages, by default derived from its contents.  Raises
+        CalibrationError for a calibration whose numbers make no set-up.
         """
         camera = make_camera(calibration.camera)
         self.reference_id = name or f"laser-{hashlib.sha256(to_json(calibration)).hexdigest()[:8]}"
@@ -103,16 +105,16 @@ class PulsedWatch:
         return (*self._watch.book.open, *self._book.open)
 
     def acknowledge(self, alert_id: str = "") -> tuple[Alert, ...]:
-        """A person has taken note of an alert, or of all; empty if there is none that isn't acknowledged."""
+        """Acknowledge an alert, or all; empty if there is none that isn't acknowledged."""
         return (*self._watch.acknowledge(alert_id), *self._book.acknowledge(alert_id))
 
     def reset(self) -> tuple[Alert, ...]:
-        """The calibration is believed again, as after a repair."""
+        """Trust the calibration again, as after a repair."""
         self.displacement = None
         return self._watch.reset()
 
     def replayed(self, frames: Iterable[Frame], table: Sequence[ReportedPulse]) -> Iterator[SpotRecord]:
-        """The records of a table's pulses, judged on recorded frames; the same input gives the same ones."""
+        """The records of a table's pulses, judged on recorded frames; the same input gives the same records."""
         self.matcher.load(table)
         for frame in frames:
             for shown in self.frame(frame)[0]:
@@ -121,14 +123,14 @@ class PulsedWatch:
             yield self.judge(shown).record
 
     def frame(self, frame: Frame) -> tuple[list[Shown], tuple[Alert, ...], str]:
-        """A frame came: the pulses that are to be judged now, alerts about the image, and what is wrong with it."""
+        """Take a frame; return the pulses to be judged now, alerts about the image, and what is wrong with it."""
         fault = _fault(frame, self._size_px)
         self._seq = frame.seq
         alerts = self._image_alerts(frame, fault)
         return self.matcher.frame(replace(frame, image=None, fault=fault) if fault else frame), alerts, fault
 
     def judge(self, shown: Shown) -> Outcome:
-        """What a pulse says, in the order in which they are given back."""
+        """Judge a pulse; pulses come in the order in which :meth:`frame` returned them."""
         if shown.fault is not None:
             return self.unjudged(shown, shown.fault, shown.reason)
         image = mean_image(shown.lit)
@@ -146,7 +148,7 @@ class PulsedWatch:
         return Outcome(self._record(shown, judged, 0 if isinstance(found, NotFound) else len(found)), image)
 
     def _moving(self, shown: Shown, brightest: Spot) -> str:
-        """In one line, if the hand didn't stand still: the spot is then off by about its way between the halves."""
+        """One line if the end-effector moved: the spot is then off by about its motion between the halves."""
         way = way_px(shown.lit, shown.dark, brightest)
         if way is None or not np.linalg.norm(way) > 2.0 * _STILL * self._sigma_px:
             return ""
@@ -156,7 +158,7 @@ class PulsedWatch:
         )
 
     def unjudged(self, shown: Shown, fault: PulseFault, reason: str) -> Outcome:
-        """A pulse that can't be judged."""
+        """The result for a pulse that can't be judged."""
         nothing = SpotJudgement(shown.pulse.stamp_ns, False, self.state, self.verdict, reason=reason)
         return Outcome(self._record(shown, nothing, 0, fault))
 
@@ -224,7 +226,7 @@ class PulsedWatch:
 
 
 def _fault(frame: Frame, size_px: tuple[int, int]) -> str:
-    """Why no spot can be looked for in a frame; empty if one can.  A dark image is none: the spot makes it light."""
+    """Why no spot can be searched in a frame; empty if it can.  A dark image is fine: the spot brightens it."""
     image = frame.image
     if image is None or not isinstance(image, np.ndarray):
         return frame.fault or "there is no image"
@@ -249,15 +251,15 @@ def _numbers(values: Array | None) -> Any:
 
 
 _REACH = 3.0
-"""Half of the window's width, in radii of a disc of the spot's area."""
+"""Half of the window's width, in radii of a disc with the spot's area."""
 _LEAST_SHARE = 0.5
-"""Of the light of the brighter half of a pulse: with less in the other one there is nothing to compare."""
+"""Minimum light in the dimmer half of a pulse, over the brighter half's: below it there is nothing to compare."""
 
 
 def way_px(lit: tuple[Frame, ...], dark: Frame | None, spot: Spot) -> Array | None:
-    """(2,) by how much ``spot``, of the mean of ``lit``, moved from the first half of these frames to the second, px.
-    A hand at a steady speed moved about twice as far.  None where that can't be told: a single frame, or a laser that
-    wasn't on all the time.
+    """(2,) motion of ``spot``, found in the mean of ``lit``, from the first half of these frames to the second, px.  At
+    a steady speed the end-effector moved about twice as far.  None if it can't be determined: a single frame, or a
+    laser that wasn't on all the time.
     """
     if len(lit) < 2:
         return None
@@ -275,7 +277,7 @@ def way_px(lit: tuple[Frame, ...], dark: Frame | None, spot: Spot) -> Array | No
 
 
 def _centre(frames: tuple[Frame, ...], window: tuple[slice, slice], before: Array | None) -> tuple[Array, float]:
-    """Centroid (2,) in the window, column and row, and the light that it is of."""
+    """Centroid (2,) in the window, column and row, and the light it is computed from."""
     images = [_light(frame.image, window) for frame in frames if frame.image is not None]
     mean = np.mean(images, axis=0)
     signal = mean - (np.median(mean) if before is None else before)

@@ -1,10 +1,10 @@
-"""Camera, plane and laser line, each in the frame in which it stands still by itself; and three ways to a spot.
+"""Camera, plane and laser line, each in the frame in which it is fixed; and three ways to compute a spot.
 
-What moves alone changes its own parameters only.  A file's covariance has the plane in the camera's frame; here it is
-in the base's, so that a camera that moves leaves it where it is.
+What moves alone changes only its own parameters.  A file's covariance has the plane in the camera's frame; here it is
+in the base's, so that a motion of the camera doesn't change it.
 
 The three ways are equations (7) to (14) of the laser-pointer method: beam and plane (7)-(9), camera ray and plane
-(10)-(12), beam and ray (13)-(14).  Each leaves one of the three out: if the plane moved, beam and ray still meet.  All
+(10)-(12), beam and ray (13)-(14).  Each omits one of the three: if the plane moved, beam and ray still meet.  All are
 in the base frame, to first order in the calibration's 13 parameters, the spot's two coordinates and the arm's six.
 """
 
@@ -29,31 +29,31 @@ PARAMETERS = (
     "plane_base.tilt_a_rad", "plane_base.tilt_b_rad", "plane_base.distance_m",
     "laser.turn_a_rad", "laser.turn_b_rad", "laser.shift_a_m", "laser.shift_b_m",
 )  # fmt: skip
-"""What :meth:`World.moved` changes."""
+"""The parameters that :meth:`World.moved` changes."""
 
 COUNT = len(PARAMETERS)
 CAMERA, PLANE, LASER = slice(0, 6), slice(6, 9), slice(9, 13)
 LEAST_NOISE_PX = 0.02
-"""Of spots, however well a calibration's own fitted, and however much an arm's noise explains."""
+"""Minimum noise of spots (px), however well a calibration's own fitted, and however much the arm's noise explains."""
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """``base_T_cam`` (4, 4); ``lit`` the plane and the laser line as a set-up whose camera frame is the base."""
+    """``base_T_cam`` (4, 4); ``lit``: the plane and the laser line, as a set-up whose camera frame is the base."""
 
     base_T_cam: Array
     lit: LaserSetup
 
     def moved(self, change: Array) -> World:
-        """Changed by (13,), in the order of :data:`PARAMETERS`, large ones too."""
+        """The world changed by (13,), in the order of :data:`PARAMETERS`, also by large amounts."""
         rest = np.concatenate([np.zeros(6), change[6:]])
         return World(perturb(self.base_T_cam, change[CAMERA]), self.lit.moved(rest))
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A pulse's spot: ``spot_base_m`` (3,), ``uv_px`` (2,), derivatives ``rows`` (2, 13) of the latter by
-    :data:`PARAMETERS` and ``arm_rows`` (2, 6) by a perturbation of ``base_T_ee``, base axes.
+    """A pulse's predicted spot: ``spot_base_m`` (3,), ``uv_px`` (2,), derivatives of the latter: ``rows`` (2, 13) by
+    :data:`PARAMETERS`, and ``arm_rows`` (2, 6) by a perturbation of ``base_T_ee``, base axes.
     """
 
     spot_base_m: Array
@@ -63,14 +63,14 @@ class Prediction:
 
     @property
     def finite(self) -> bool:
-        """False where the beam runs along the plane, or the spot is behind the camera or outside of its lens."""
+        """False if the beam runs along the plane, or the spot is behind the camera or outside the lens's domain."""
         return bool(np.isfinite(self.uv_px).all() and np.isfinite(self.rows).all() and np.isfinite(self.arm_rows).all())
 
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What a file says: the ``world``, ``covariance`` (13, 13) of :data:`PARAMETERS`, and the standard deviation of a
-    spot's coordinate that its residuals show.
+    """The contents of a file: the ``world``, ``covariance`` (13, 13) of :data:`PARAMETERS`, and the standard deviation
+    of a spot's coordinate according to the residuals.
     """
 
     world: World
@@ -80,7 +80,7 @@ class Calibrated:
 
 
 def calibrated(calibration: LaserCalibration) -> Calibrated:
-    """Raises :class:`CalibrationError` for numbers that make no set-up."""
+    """From a file.  Raises :class:`CalibrationError` for numbers that make no set-up."""
     base_T_cam = from_record(calibration.base_T_cam)
     plane, laser = calibration.plane, calibration.laser
     normal, direction = np.array(plane.normal_base), np.array(laser.direction_ee)
@@ -103,10 +103,10 @@ def calibrated(calibration: LaserCalibration) -> Calibrated:
 
 
 def _to_base(base_T_cam: Array, normal_cam: Array, normal_base: Array) -> Array:
-    """(13, 13): derivatives of :data:`PARAMETERS` by a file's."""
+    """(13, 13): derivatives of :data:`PARAMETERS` by a file's parameters."""
     out = np.eye(COUNT)
     a, b = basis(normal_cam)
-    # Of the normal in the base: turned with the camera, tilted in it.
+    # Derivative of the normal in the base: it rotates with the camera, and tilts in the camera's frame.
     normal = np.zeros((3, COUNT))
     normal[:, 3:6] = -skew(normal_base)
     normal[:, 6], normal[:, 7] = base_T_cam[:3, :3] @ a, base_T_cam[:3, :3] @ b
@@ -118,7 +118,7 @@ def _to_base(base_T_cam: Array, normal_cam: Array, normal_base: Array) -> Array:
 
 
 def predict(world: World, camera: Camera, base_T_ee: Array) -> Prediction:
-    """The spot at a pose (4, 4) by beam and plane, equations (7) to (9); NaN where there is none."""
+    """The spot at a pose (4, 4) from beam and plane, equations (7) to (9); NaN if there is none."""
     pose = base_T_ee[None]
     spots, slopes = spots_on_plane(world.lit, pose)
     cam_R_base = world.base_T_cam[:3, :3].T
@@ -132,7 +132,7 @@ def predict(world: World, camera: Camera, base_T_ee: Array) -> Prediction:
 
 
 def predict_moved(calibrated: Calibrated, change: Array, base_T_ee: Array) -> Prediction:
-    """As :func:`predict` of the world moved by ``change`` (13,), ``rows`` the derivatives by ``change`` where it is."""
+    """Like :func:`predict` for the world moved by ``change`` (13,); ``rows`` are derivatives by ``change`` there."""
     world = calibrated.world.moved(change)
     found = predict(world, calibrated.camera, base_T_ee)
     return Prediction(
@@ -141,7 +141,7 @@ def predict_moved(calibrated: Calibrated, change: Array, base_T_ee: Array) -> Pr
 
 
 def _chart(origin: World, there: World, change: Array) -> Array:
-    """(13, 13): what a small change more of ``change`` is as one of :data:`PARAMETERS` at the moved world."""
+    """(13, 13): a small addition to ``change``, as a perturbation by :data:`PARAMETERS` of the moved world."""
     out = np.eye(COUNT)
     out[3:6, 3:6] = _left_jacobian(change[3:6])
     for first, before, after in (
@@ -153,13 +153,13 @@ def _chart(origin: World, there: World, change: Array) -> Array:
 
 
 def _with_axes(chart: Array, before: Array, after: Array) -> Array:
-    """The laser's point moves in the plane of two axes; after a large turn they may be others."""
+    """The laser's point moves in the plane of two axes, which may be different ones after a large rotation."""
     old, new = origin_axes(before), origin_axes(after)
     if old == new:
         return chart
     pierced = ({0, 1, 2} - set(new)).pop()
     for column, axis in zip((11, 12), old, strict=True):
-        # A point may slide along the beam: what leaves the new plane comes back to it.
+        # A point may slide along the beam: project what leaves the new plane back onto it.
         shift = np.eye(3)[axis] - after / after[pierced] * (axis == pierced)
         chart[11:13, column] = shift[list(new)]
     return chart
@@ -177,7 +177,7 @@ def _left_jacobian(omega: Array) -> Array:
 
 
 def larger(a: Array, b: Array) -> Array:
-    """The least covariance (k, k) that is nowhere below either of two; ``b`` positive definite."""
+    """The smallest covariance (k, k) that is nowhere below either of two; ``b`` positive definite."""
     root = np.linalg.cholesky(b)
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ a @ inverse.T)
@@ -187,8 +187,8 @@ def larger(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Two of the three ways to a spot, how far apart they put it (m), the standard deviation of that distance along the
-    gap (m), and its normalised square with ``freedom`` degrees of freedom.
+    """Two of the three ways to a spot: the gap between their results (m), the standard deviation of that distance along
+    the gap (m), and its normalised square with ``freedom`` degrees of freedom.
     """
 
     ways: tuple[str, str]
@@ -205,15 +205,15 @@ class Disagreement:
 BEAM_PLANE, RAY_PLANE, BEAM_RAY = "beam and plane", "ray and plane", "beam and ray"
 BEAM, RAY = "beam", "ray"
 INPUTS = COUNT + 2 + 6
-"""Parameters of the world, the spot's pixels, the arm's pose (base axes)."""
+"""Number of inputs: parameters of the world, the spot's pixels, the arm's pose (base axes)."""
 _PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Triangulation:
-    """``spots_base_m`` (3, 3) by beam and plane, by ray and plane, by beam and ray (the ray's point), with ``slopes``
-    (3, 3, 21); ``gap_m`` (3,) from the ray's nearest point to the beam's, ``gap_slopes`` (3, 21).  NaN where there is
-    none: beam or ray along the plane, both along each other.
+    """A spot computed in three ways: ``spots_base_m`` (3, 3) by beam and plane, by ray and plane, by beam and ray (the
+    ray's point), with ``slopes`` (3, 3, 21); ``gap_m`` (3,) from the ray's nearest point to the beam's, with
+    ``gap_slopes`` (3, 21).  NaN where undefined: beam or ray along the plane, or parallel to each other.
     """
 
     spots_base_m: Array
@@ -233,7 +233,7 @@ class _Line:
 
 
 def triangulate(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) -> Triangulation:
-    """Of a spot (2,) seen at a pose (4, 4)."""
+    """Triangulate a spot (2,) seen at a pose (4, 4)."""
     beam, ray = _beam(world, base_T_ee), _ray(world, camera, uv_px)
     first, first_slopes = _on_plane(world, beam)
     second, second_slopes = _on_plane(world, ray)
@@ -244,7 +244,7 @@ def triangulate(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) ->
 
 
 def disagreements(found: Triangulation, covariance: Array) -> tuple[Disagreement, ...]:
-    """Those of ways that exist; ``covariance`` (21, 21) of the inputs."""
+    """Disagreements of the ways that are defined; ``covariance`` (21, 21) of the inputs."""
     spots, slopes = found.spots_base_m, found.slopes
     names = (BEAM_PLANE, RAY_PLANE, BEAM_RAY)
     pairs = [
@@ -260,7 +260,7 @@ def disagreements(found: Triangulation, covariance: Array) -> tuple[Disagreement
 
 
 def _disagreement(names: tuple[str, str], gap: Array, covariance: Array, freedom: int) -> Disagreement:
-    """A gap lies in the plane, or on a line: the directions that it has are those it is the least known in."""
+    """A gap lies in a plane or on a line: its ``freedom`` directions are those with the largest variance."""
     values, axes = np.linalg.eigh(covariance)
     along = axes.T @ gap
     square = float((along[-freedom:] ** 2 / values[-freedom:]).sum())
@@ -295,7 +295,7 @@ def _ray(world: World, camera: Camera, uv_px: Array) -> _Line:
 
 
 def _on_plane(world: World, line: _Line) -> tuple[Array, Array]:
-    """Equations (7) to (12): the plane's normal n and distance d give n·(point + along direction) = d."""
+    """Equations (7) to (12): with the plane's normal n and distance d, n·(point + along direction) = d."""
     normal = world.lit.normal_cam
     steep = float(normal @ line.direction) / float(np.linalg.norm(line.direction))
     if not abs(steep) > _PARALLEL:
@@ -312,8 +312,8 @@ def _on_plane(world: World, line: _Line) -> tuple[Array, Array]:
 
 
 def _between(ray: _Line, beam: _Line) -> tuple[Array, Array, Array, Array]:
-    """Equations (13) and (14): the ray's point nearest to the beam, and the gap to the beam's; with derivatives, from
-    those of the two conditions that the gap stands on both.
+    """Equations (13) and (14): the ray's point nearest to the beam, and the gap to the beam's; derivatives follow from
+    the two conditions that the gap is orthogonal to both lines.
     """
     w, u = ray.direction, beam.direction
     normal = np.array([[w @ w, -(w @ u)], [w @ u, -(u @ u)]])
@@ -335,11 +335,11 @@ def _between(ray: _Line, beam: _Line) -> tuple[Array, Array, Array, Array]:
 
 
 MOST_UNCERTAIN = 0.1
-"""Of the image's diagonal: a predicted spot that is less certain is none."""
+"""Largest standard deviation of a predicted spot, over the image's diagonal; above it there is no prediction."""
 
 
 class Single(NamedTuple):
-    """See :class:`~gripmon.laser.judgement.SpotJudgement`."""
+    """A pulse judged by itself; fields as in :class:`~gripmon.laser.judgement.SpotJudgement`."""
 
     uv_px: Array
     off_px: Array
@@ -350,7 +350,7 @@ class Single(NamedTuple):
 
 
 def visible(calibrated: Calibrated, predicted: Prediction, arm: Array) -> str | None:
-    """Why there is no spot to be predicted at a pose; ``arm`` (6, 6) covariance of its poses.  None if there is one."""
+    """Why no spot can be predicted at a pose, None if one can; ``arm`` (6, 6): covariance of the arm's poses."""
     if not predicted.finite:
         if not np.isfinite(predicted.spot_base_m).all():
             return "the beam runs along the plane"
@@ -363,13 +363,13 @@ def visible(calibrated: Calibrated, predicted: Prediction, arm: Array) -> str | 
 
 
 def spread_px(calibrated: Calibrated, predicted: Prediction, arm: Array) -> Array:
-    """Covariance (2, 2) of a predicted spot: by the calibration and the arm."""
+    """Covariance (2, 2) of a predicted spot, due to the calibration and the arm."""
     return predicted.rows @ calibrated.covariance @ predicted.rows.T + predicted.arm_rows @ arm @ predicted.arm_rows.T
 
 
 def alone(calibrated: Calibrated, predicted: Prediction, base_T_ee: Array, spot: Spot, arm: Array) -> Single:
-    """The calibration's residuals have the arm in them: noise is what they show, or what spot and arm have,
-    whichever is more.
+    """Judge a spot by itself.  The calibration's residuals include the arm's noise, so the noise is the larger of the
+    residuals' and that of spot plus arm.
     """
     floor = calibrated.sigma_px**2 * np.eye(2)
     by_arm = predicted.arm_rows @ arm @ predicted.arm_rows.T
@@ -378,7 +378,7 @@ def alone(calibrated: Calibrated, predicted: Prediction, base_T_ee: Array, spot:
     off = spot.uv_px - predicted.uv_px
     inputs = np.zeros((INPUTS, INPUTS))
     inputs[:COUNT, :COUNT] = calibrated.covariance
-    inputs[COUNT : COUNT + 2, COUNT : COUNT + 2] = noise  # the arm is counted as pixels, once
+    inputs[COUNT : COUNT + 2, COUNT : COUNT + 2] = noise  # the arm's noise is included as pixels, and only once
     found = triangulate(calibrated.world, calibrated.camera, base_T_ee, spot.uv_px)
     return Single(
         spot.uv_px,

@@ -14,9 +14,7 @@ from gripmon.model.errors import InputError
 
 
 def writable_folder(path: Path, argument: str = "out") -> Path:
-    """Return the folder, created if it is missing.  Raises :class:`InputError` about ``argument`` if it isn't
-    writable.
-    """
+    """Return the folder, created if missing.  Raises :class:`InputError` about ``argument`` if it isn't writable."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -141,9 +141,7 @@ def whitening(covariance: Array) -> Array:
 
 
 def tukey_weights(sizes: Array, width: float) -> Array:
-    """Weights (n,) of residuals with these norms (n,): Tukey's biweight, 0 from ``width`` on (for infinite norms,
-    too).
-    """
+    """Weights (n,) for residuals with norms ``sizes`` (n,): Tukey's biweight, 0 from ``width`` to infinity."""
     out: Array = np.square(1.0 - np.square(np.minimum(sizes / width, 1.0)))
     return out
 

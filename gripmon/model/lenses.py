@@ -81,9 +81,7 @@ class PaperMap:
 
 
 class BrownMap:
-    """OpenCV's rational polynomial with tangential and thin-prism terms; inverted by Newton's method in two
-    dimensions.
-    """
+    """OpenCV's rational polynomial with tangential and thin-prism terms; inverted by Newton's method in 2D."""
 
     def __init__(self, coefficients: tuple[float, ...]) -> None:
         padded = (*coefficients, *([0.0] * (12 - len(coefficients))))

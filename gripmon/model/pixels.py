@@ -103,7 +103,5 @@ def _levels(image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
 
 
 def _filled(levels: NDArray[Any], bit_depth: int) -> NDArray[Any]:
-    """Grey levels of ``bit_depth`` bits as 16 bits: the high bits are repeated as the low ones, so that white is
-    65535.
-    """
+    """``bit_depth``-bit grey levels as 16 bits: the high bits are repeated as the low ones, so that white is 65535."""
     return np.asarray((levels << (16 - bit_depth)) | (levels >> (2 * bit_depth - 16)), dtype=np.uint16)

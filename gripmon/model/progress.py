@@ -6,9 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 Progress = Callable[[int | None, str], AbstractContextManager[Callable[[], None]]]
-"""Takes the number of steps (None: unknown) and their unit; returns a context that gives a function to call per
-step.
-"""
+"""From the number of steps (None: unknown) and their unit to a context, which gives a function to call per step."""
 
 
 def quiet(_total: int | None, _unit: str) -> AbstractContextManager[Callable[[], None]]:

@@ -1,6 +1,4 @@
-"""Stopping: SIGINT and SIGTERM, from the first import to the last file that is closed, and the end of a parent
-process.
-"""
+"""Stopping: SIGINT and SIGTERM, from the first import to the last file closed, and the end of a parent process."""
 
 from __future__ import annotations
 
@@ -76,9 +74,7 @@ def _take(stop: StopRequest, number: int) -> None:
 
 @contextlib.contextmanager
 def _handling(handler: _Handler) -> Iterator[None]:
-    """Install a signal handler temporarily.  Python allows that only in the main thread; elsewhere nothing is
-    changed.
-    """
+    """Install a signal handler temporarily; only the main thread may: elsewhere nothing is changed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

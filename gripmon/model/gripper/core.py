@@ -109,8 +109,8 @@ class Gripper:
         return self._rounds.seen_from(eye_grip_m, self._nominal_points_m + offsets_m, offsets_m)
 
     def point_motion(self, jaw_opening_m: float) -> Array:
-        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is piecewise
-        linear).
+        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm; piecewise
+        constant).
         """
         low, high = max(jaw_opening_m - 5e-5, self.jaw_min_m), min(jaw_opening_m + 5e-5, self.jaw_max_m)
         if not high > low:
@@ -138,9 +138,7 @@ class Gripper:
         return start, end
 
     def outlines_m(self, points_m: Array, edges: NDArray[np.intp], count: int, rotation: Array | None = None) -> Array:
-        """(k, count, 3) places along edges (k,), evenly spaced from end to end; ``points_m``, ``rotation`` as for
-        :meth:`tangents_m`.
-        """
+        """(k, count, 3) evenly spaced places along edges (k,); ``points_m``, ``rotation`` as for :meth:`tangents_m`."""
         edge, fraction = np.repeat(edges, count), np.tile(np.linspace(0.0, 1.0, count), len(edges))
         start, end = self.tangents_m(points_m, edge, fraction, rotation)
         return np.asarray(start + fraction[:, None] * (end - start)).reshape(len(edges), count, 3)
@@ -163,16 +161,12 @@ class Gripper:
         return self.points_visible(points_grip_m, eye_grip_m, self.corner_points)
 
     def points_visible(self, points_grip_m: Array, eye_grip_m: Array, points: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(k,) whether a face at each of the ``points`` (k,) is turned towards the camera; True for points without
-        faces.
-        """
+        """(k,) whether a face at each of the ``points`` (k,) is turned towards the camera; True without faces."""
         facing, touching = self._facing(points_grip_m, eye_grip_m), self._point_faces[points]
         return np.asarray(~touching.any(axis=1) | (touching & facing[:-1]).any(axis=1))
 
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
-        """Indices of the straight edges that end in a corner (index into ``corner_ids``): those that can be
-        intersected.
-        """
+        """Indices of the straight edges that end in a corner (index into ``corner_ids``) and can be intersected."""
         return self._edges_at_corner[corner]
 
     def innermost_corners(self, among: NDArray[np.bool_], count: int | None) -> NDArray[np.bool_]:

@@ -14,9 +14,7 @@ LARGEST_WARP_M = 5e-4
 """Deviation from its plane up to which a loop counts as planar, m: the accuracy of callipers."""
 
 LARGEST_SKEW = 0.1
-"""Deviation from its plane, as a fraction of its extent, above which a loop is not a face: one of its points is
-wrong.
-"""
+"""Deviation from its plane, over its extent, above which a loop is not a face: one of its points is wrong."""
 
 
 @dataclass(frozen=True, slots=True)

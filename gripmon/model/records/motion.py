@@ -65,9 +65,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What may have caused an observation: all causes that were weighed, the ``probable`` one, and a sentence about
-    it.
-    """
+    """Possible causes of an observation: all that were weighed, the ``probable`` one, and a sentence about it."""
 
     causes: tuple[CauseWeight, ...] = ()
     probable: CauseWeight = UNEXPLAINED

@@ -54,9 +54,7 @@ class RecordedFile(msgspec.Struct, frozen=True):
 
 
 class RecordedConfiguration(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.configuration/1"):
-    """Everything besides the frames that the monitor's decisions depend on: with the same frames it decides the
-    same.
-    """
+    """All that the monitor's decisions depend on besides the frames: on the same frames it decides the same."""
 
     main: Annotated[str, msgspec.Meta(description="the configuration's name among the files")]
     files: Annotated[

@@ -54,9 +54,7 @@ class Transform(msgspec.Struct, frozen=True, gc=False):
 
 
 class Drift(msgspec.Struct, frozen=True, gc=False):
-    """Motion against the reference: ``d`` and ``delta`` of equation (14) and the TCP's displacement in the camera
-    frame.
-    """
+    """Motion against the reference: ``d`` and ``delta`` of equation (14), and the TCP's shift in the camera frame."""
 
     translation_m: Annotated[float, Meta(description="d: length of the camera's displacement, m")]
     rotation_rad: Annotated[float, Meta(description="delta: the camera's turn, rad")]
