@@ -1,8 +1,9 @@
 """Calibrations from images and poses, for programs and notebooks; ``gripmon calibrate`` calls the same functions.
 
-Images are arrays (as OpenCV reads them) or paths.  What is wrong with the input is an
-:class:`~gripmon.model.errors.InputError`, input from which nothing can be calibrated a
-:class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text."""
+Images are arrays (as OpenCV reads them) or paths.  Wrong input raises an :class:`~gripmon.model.errors.InputError`;
+input from which nothing can be calibrated raises a :class:`~gripmon.calibrate.sighting.CalibrationError`.  The text of
+both is one line.
+"""
 
 from __future__ import annotations
 
@@ -56,18 +57,18 @@ class CameraFromViews:
 
     @property
     def sigmas(self) -> dict[str, float | None]:
-        """Standard deviations of all parameters by name; None of one that was held or is tied to another."""
+        """Standard deviations of all parameters by name; None for one that was held or is tied to another."""
         found = dict(zip(self.fit.parameters, self.fit.covariance.diagonal() ** 0.5, strict=True))
         return {name: float(found[name]) if name in found else None for name in self.fit.values}
 
     @property
     def points(self) -> int:
-        """In all views together."""
+        """Number of points in all views together."""
         return sum(len(sighting) for sighting in self.sightings)
 
     @property
     def outliers(self) -> int:
-        """Points that were left out."""
+        """Number of points that were left out."""
         return sum(int((~used).sum()) for used in self.fit.used)
 
     def values(self) -> dict[str, Any]:
@@ -89,7 +90,7 @@ class CameraFromViews:
         }
 
     def document(self, provenance: Provenance) -> CameraCalibration:
-        """What a file holds of it."""
+        """The contents of the calibration's file."""
         return CameraCalibration(
             camera=self.camera,
             parameters=self.fit.parameters,
@@ -115,11 +116,11 @@ def calibrate_intrinsics(
     fixed: Mapping[str, float | None] = MappingProxyType({}),
     progress: Progress = quiet,
 ) -> CameraFromViews:
-    """A camera from images of a flat ``target`` (or its description, "chequerboard:9x6:0.025"), each of which may show
-    a part of it.
+    """Calibrate a camera from images of a flat ``target`` (or its description, "chequerboard:9x6:0.025"); each image
+    may show only part of it.
 
-    ``model``: of the lens; "auto" is the one with the smallest information criterion, None brown_conrady, of a single
-    image paper.  ``fixed``: parameters to hold, at a value or (None) where they start, see
+    ``model``: the lens model; "auto" picks the one with the smallest information criterion, None means brown_conrady,
+    or paper for a single image.  ``fixed``: parameters to hold, at a value or (None) at their start, see
     :func:`gripmon.calibrate.intrinsics.calibrate`.
     """
     target = parse_target(target) if isinstance(target, str) else target
@@ -131,7 +132,7 @@ def calibrate_intrinsics(
 
 
 def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
-    """:class:`~gripmon.model.errors.InputError` for parameters that can't be held so."""
+    """:class:`~gripmon.model.errors.InputError` for parameters that can't be held like this."""
     models = [m for m in MODELS if model in (m, "auto") or (model is None and m != "fisheye")]
     known = list(dict.fromkeys(name for one in models for name in parameter_names(one)))
     for name, value in fixed.items():
@@ -153,7 +154,7 @@ def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
 def _views(
     images: Sequence[str | Path | Image], target: Target, progress: Progress
 ) -> tuple[list[Sighting], dict[str, str]]:
-    """The target in all images, and why it isn't found in others."""
+    """The target in all images, and the reason for each image in which it isn't found."""
     sightings: list[Sighting] = []
     not_found: dict[str, str] = {}
     larger: list[str] = []
@@ -170,11 +171,11 @@ def _views(
         (reason, times), *_ = Counter(not_found.values()).most_common(1)
         why = reason if times == len(images) else f"{times} of them: {reason}"
         count = "the image doesn't show" if len(images) == 1 else f"none of {len(images)} images shows"
-        # Of images that all have the same fault the one line says enough.
+        # If all images have the same fault, the one line says enough.
         details = [f"{name}: {why}" for name, why in not_found.items()] if len(set(not_found.values())) > 1 else []
         raise CalibrationError(f"{count} the target ({why})", details)
     if larger:
-        # Where the rest of it is hidden or out of view, the smaller one fits as well: those images prove nothing.
+        # If the rest is hidden or out of view, a smaller target fits as well: such images prove nothing.
         raise TargetError(f"{len(larger)} of {len(images)} images show a larger one ({larger[0]}); its full size")
     return sightings, not_found
 
@@ -200,7 +201,7 @@ def _fitted(
 
 
 def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
-    """Whether it may have been described as larger than it is: on a lattice without marks nothing else tells."""
+    """A warning if the target may be smaller than it was described: without markers nothing else reveals that."""
     if isinstance(target, Charuco):
         return []
     step_m = getattr(target, "square_m", None) or getattr(target, "spacing_m", 1.0)
@@ -221,11 +222,11 @@ def calibrate_robot_world(
     eye_in_hand: bool = False,
 ) -> RobotWorld:
     """Both unknown transforms of ``cam_T_target = cam_T_base base_T_ee ee_T_target`` from poses (n, 4, 4) each, with
-    the ``covariance`` (n, 6, 6) of the targets' poses if it is known, and ``common`` (n, 6, k): what independent errors
-    of the camera, in their standard deviations, do to all of them.
+    the ``covariance`` (n, 6, 6) of the targets' poses if known, and ``common`` (n, 6, k): the effect of the camera's
+    independent errors, per standard deviation, on all of them.
 
-    ``eye_in_hand``: the camera is on the hand and the target stands; the result's ``cam_T_base`` is ``cam_T_ee`` then,
-    and its ``ee_T_target`` is ``base_T_target``.
+    ``eye_in_hand``: the camera is on the hand and the target is fixed; the result's ``cam_T_base`` is then
+    ``cam_T_ee``, and its ``ee_T_target`` is ``base_T_target``.
     """
     arm = np.stack([invert(T) for T in base_T_ee]) if eye_in_hand else base_T_ee
     start = robot_world.solve(cam_T_target, arm)
@@ -241,7 +242,7 @@ _SIDE_PX = 380
 _TOP_PX = 64
 _CELLS = 12
 _LONGEST_PX = 28.0
-"""Of an arrow as long as three standard deviations."""
+"""Length of an arrow for three standard deviations (px)."""
 _INK, _PALE, _GOOD, _BAD, _EMPTY = (40, 40, 40), (245, 245, 245), (150, 90, 20), (40, 40, 210), (205, 205, 225)
 _SUBPIXEL_BITS = 4
 _Colour = tuple[int, int, int]
@@ -261,8 +262,8 @@ class _Frame:
 
 
 def draw_maps(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> Image:
-    """BGR.  Cells of the image in which no point was seen are tinted; arrows are residuals, enlarged as it says; red
-    ones were left out.  On the right each view's root mean square residual.
+    """Picture of the calibration, BGR.  Image cells without points are tinted; arrows are enlarged residuals, with the
+    factor in the title; red ones were left out.  On the right each view's root mean square residual.
     """
     size = (result.camera.width_px, result.camera.height_px)
     scale = _MAP_PX / size[0]
@@ -273,7 +274,7 @@ def draw_maps(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> Image:
     for sighting, residual, used in zip(sightings, result.residuals_px, result.used, strict=True):
         start = frame.at(sighting.uv_px)
         length = np.linalg.norm(residual, axis=1, keepdims=True) * enlarged
-        # What is far off would cross the whole picture.
+        # Large outliers would cross the whole picture.
         arrow = np.nan_to_num(residual) * enlarged * np.minimum(1.0, 2.0 * _LONGEST_PX / np.maximum(length, 1e-9))
         for a, b, good in zip(start, start + np.nan_to_num(arrow), used.tolist(), strict=True):
             colour = _GOOD if good else _BAD
@@ -329,17 +330,17 @@ def _titles(
 
 
 def write(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> None:
-    """A text that begins at a place (px)."""
+    """Write a text that begins at a place (px)."""
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
 
 
 def line(image: Image, start: Array, end: Array, colour: _Colour, width: int = 1) -> None:
-    """A line between two places (2,), px."""
+    """Draw a line between two places (2,), px."""
     first, last = (np.rint(point * 2**_SUBPIXEL_BITS).astype(int).tolist() for point in (start, end))
     cv2.line(image, first, last, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def disc(image: Image, at: Array, radius: float, colour: _Colour) -> None:
-    """A filled disc at a place (2,), px."""
+    """Draw a filled disc at a place (2,), px."""
     x, y = (round(v * 2**_SUBPIXEL_BITS) for v in at.tolist())
     cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -1,9 +1,9 @@
-"""Cameras with derivatives by their parameters, and one fitted together with plate poses to all points of all views.
+"""Bundle adjustment: a camera with derivatives by its parameters, fitted together with plate poses to all points.
 
-The camera models' maps are those of :mod:`gripmon.model.camera`, so that what is calibrated is what is later used.  The
-fit is weighted, robust least squares on the manifold: the unknowns are the parameters of the lens and, for each view, a
-perturbation of its pose; the Jacobian is analytic.  Wrong points are found by their size against the rest (Tukey's
-biweight on a robust scale) and then left out.
+The camera models' maps are those of :mod:`gripmon.model.camera`, so that the calibrated model is the one used later.
+The fit is weighted, robust least squares on the manifold: the unknowns are the parameters of the lens and, for each
+view, a perturbation of its pose; the Jacobian is analytic.  Outliers are found by their residuals against the rest
+(Tukey's biweight on a robust scale) and then left out.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from gripmon.model.records import Array
 
 LARGEST_ITERATIONS = 200
 OUTLIER = 5.0
-"""Normalised residual, in robust standard deviations, beyond which a point is left out at the end."""
+"""Normalised residual, in robust standard deviations, above which a point is left out at the end."""
 STRANGE = 0.5
-"""Part of a view's points that fit, below which it is not a view of the same target by the same camera."""
+"""Inlier ratio of a view below which it doesn't show the same target with the same camera."""
 PARALLEL = float(np.cos(np.radians(3.0)))
 ROUNDS = 12
-"""Rounds of weights, and of the offsets of discs' centres, at most."""
+"""Maximum number of rounds of reweighting and of correcting the offsets of discs' centres."""
 
 
 _State = tuple[Array, list[Array]]
@@ -49,12 +49,12 @@ _State = tuple[Array, list[Array]]
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """What was estimated.
+    """Result of a fit.
 
-    ``parameters`` (k,) of the lens; ``covariance`` (p, p) of the p free ones and, behind them, 6 for each view
-    (position then rotation of ``cam_T_plate``, camera axes), scaled by the residuals; ``residuals_px`` one (n, 2) a
-    view, measured less predicted; ``used`` one (n,) a view; ``scale`` the residuals' standard deviation over what their
-    covariances say.
+    ``parameters`` (k,) of the lens; ``covariance`` (p, p) of the p free ones followed by 6 for each view (position then
+    rotation of ``cam_T_plate``, camera axes), scaled by the residuals; ``residuals_px``: one (n, 2) per view, measured
+    less predicted; ``used``: one (n,) per view; ``scale``: the residuals' standard deviation over the one by their
+    covariances.
     """
 
     parameters: Array
@@ -74,7 +74,7 @@ class Bundle:
 
 class BundleProblem:
     """Sightings and a lens model; ``free`` (k, p) maps p free parameters to changes of all k: a column with two ones
-    ties two together.
+    ties two parameters together.
     """
 
     def __init__(self, model: LensModel, sightings: Sequence[Sighting], free: Array):
@@ -83,7 +83,7 @@ class BundleProblem:
         self._offsets: list[Array] = [np.zeros(s.uv_px.shape) for s in sightings]
 
     def solve(self, parameters: Array, cam_T_plate: Sequence[Array]) -> Bundle:
-        """From a start near enough.  Raises :class:`CalibrationError` when it leads nowhere."""
+        """Solve from a good start.  Raises :class:`CalibrationError` if that fails."""
         poses = list(cam_T_plate)
         weights: list[Array] = [np.ones(len(s)) for s in self._sightings]
         for turn in range(ROUNDS):
@@ -116,7 +116,7 @@ class BundleProblem:
         ]
 
     def _sizes(self, parameters: Array, poses: Sequence[Array]) -> list[Array]:
-        """Length of each point's whitened residual; infinite where it doesn't project."""
+        """Norm of each point's whitened residual; infinite where it doesn't project."""
         out = []
         for residual, whiten in zip(self._residuals(parameters, poses), self._whiten, strict=True):
             size = np.linalg.norm(np.einsum("nij,nj->ni", whiten, residual), axis=1)
@@ -128,7 +128,7 @@ class BundleProblem:
         return float(sum((w * np.square(np.where(w > 0.0, s, 0.0))).sum() for s, w in zip(sizes, weights, strict=True)))
 
     def _equations(self, parameters: Array, poses: Sequence[Array], weights: Sequence[Array]) -> Equations:
-        """Assembled view by view: p free parameters, then 6 for each view."""
+        """Normal equations, assembled view by view: p free parameters, then 6 for each view."""
         p = self._free.shape[1]
         n = p + 6 * len(poses)
         normal, side = np.zeros((n, n)), np.zeros(n)
@@ -215,9 +215,9 @@ RIM_POINTS = 24
 
 
 def centre_offsets_px(camera: Camera, cam_T_plate: Array, plate_m: Array, radius_m: float) -> Array:
-    """(n, 2): centre of area of each disc's image less the image of its centre; 0 where a rim leaves the lens."""
+    """(n, 2): centroid of each disc's image less the image of its centre; 0 where a rim leaves the lens's domain."""
     angles = 2.0 * np.pi / RIM_POINTS * np.arange(RIM_POINTS)
-    # The polygon through the rim is a little smaller than the disc; its centre is the same to a thousandth of that.
+    # The polygon through the rim is a little smaller than the disc, which changes the offset by a thousandth.
     rim = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(RIM_POINTS)], axis=1)
     points = (plate_m[:, None] + rim).reshape(-1, 3) @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
     rims = camera.project(points).reshape(len(plate_m), RIM_POINTS, 2)
@@ -227,7 +227,7 @@ def centre_offsets_px(camera: Camera, cam_T_plate: Array, plate_m: Array, radius
 
 
 def _centroids(polygons: Array) -> Array:
-    """(n, k, 2) -> (n, 2), centres of area (shoelace formula), reckoned about the first corner for exactness."""
+    """(n, k, 2) -> (n, 2), centroids of area (shoelace formula), relative to the first corner for precision."""
     origin = polygons[:, :1]
     x, y = np.moveaxis(polygons - origin, 2, 0)
     x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
@@ -258,7 +258,7 @@ def parameter_names(model: ModelName) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """A model at an image size.  Parameter vectors are (k,): focal lengths, principal point (px), lens (see
+    """A lens model at an image size.  Parameter vectors are (k,): focal lengths, principal point (px), lens (see
     :func:`parameter_names`; kappa in 1/px², the rest without unit).
     """
 
@@ -267,7 +267,7 @@ class LensModel:
     height_px: int
 
     def settings(self, parameters: Array) -> LensSettings:
-        """The camera with these parameters, as files hold it; nothing is checked."""
+        """The camera with these parameters, as in files; nothing is checked."""
         fx, fy, cx, cy, *lens = parameters.tolist()
         size = {"width_px": self.width_px, "height_px": self.height_px}
         if self.name == "paper":
@@ -277,22 +277,22 @@ class LensModel:
         return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
 
     def camera(self, parameters: Array) -> Camera:
-        """The same, ready to project; unlike :func:`~gripmon.model.camera.make_camera` it refuses nothing: an estimate
-        on its way may pass absurd values.  Points outside the lens's domain project to NaN.
+        """The same, ready to project.  Unlike :func:`~gripmon.model.camera.make_camera` it accepts anything: an
+        estimate may pass through implausible values.  Points outside the lens's domain project to NaN.
         """
         return _camera(self, tuple(parameters.tolist()))
 
     def without_distortion(self, focal_px: float) -> Array:
-        """Parameters (k,) of a lens with this focal length, axis through the image's centre, nothing bent (the fisheye:
-        equidistant).
+        """Parameters (k,) of a lens with this focal length, the principal point at the image's centre and no distortion
+        (for the fisheye: equidistant).
         """
         parameters = np.zeros(len(parameter_names(self.name)))
         parameters[:4] = focal_px, focal_px, 0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)
         return parameters
 
     def project(self, parameters: Array, points_cam_m: Array) -> tuple[Array, Array, Array]:
-        """Points (n, 3) in the camera frame -> pixels (n, 2), their derivatives by the parameters (n, 2, k) and by the
-        points (n, 2, 3); NaN outside the lens's domain.
+        """Points (n, 3) in the camera frame -> pixels (n, 2), and their derivatives by the parameters (n, 2, k) and by
+        the points (n, 2, 3); NaN outside the lens's domain.
         """
         camera = self.camera(parameters)
         uv_px, by_point = camera.project_with_jacobian(points_cam_m)
@@ -306,12 +306,12 @@ class LensModel:
         by_parameters[:, 0, 4:] = fx * by_lens[:, 0]
         by_parameters[:, 1, 4:] = fy * by_lens[:, 1]
         if self.name == "paper":
-            # kappa is per pixel: in normalised coordinates the lens bends by kappa fx², so fx acts through it, too.
+            # kappa is per pixel: in normalised coordinates it is kappa fx², so that fx also acts through it.
             by_parameters[:, :, 0] += by_parameters[:, :, 4] * (2.0 * parameters[4] / fx)
         return uv_px, by_parameters, by_point
 
     def map_of(self, parameters: Array) -> LensMap:
-        """The lens alone."""
+        """The lens's map alone."""
         lens = tuple(parameters[4:].tolist())
         if self.name == "paper":
             return PaperMap(lens[0] * float(parameters[0]) ** 2)
@@ -320,7 +320,7 @@ class LensModel:
     def _by_lens(self, parameters: Array, xy: Array, q: Array) -> Array:
         """Derivatives (n, 2, k - 4) of distorted normalised coordinates ``q`` (n, 2) by the lens's parameters."""
         if self.name == "paper":
-            # xy = q (1 + k |q|²) stays as it is: J dq + q |q|² dk = 0, J the Jacobian of that map.
+            # xy = q (1 + k |q|²) is constant: J dq + q |q|² dk = 0, J the Jacobian of that map.
             qx, qy = q.T
             s2 = qx * qx + qy * qy
             k = parameters[4] * parameters[0] ** 2
@@ -348,14 +348,14 @@ class LensModel:
 
 @functools.lru_cache(maxsize=16)
 def _camera(model: LensModel, parameters: tuple[float, ...]) -> Camera:
-    """One for all views: a lens's tables take longer to make than to use."""
+    """One camera for all views: a lens's tables take longer to make than to use."""
     values = np.array(parameters)
     return Camera(model.settings(values), model.map_of(values))
 
 
 def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
-    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes), the camera
-    being exact; and the fit that it comes from.  Raises :class:`CalibrationError`.
+    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes) for an exact
+    camera, and the fit that it comes from.  Raises :class:`CalibrationError`.
     """
     if len(sighting) < 4:
         raise CalibrationError(f"{len(sighting)} points of the plate; at least 4")
@@ -363,7 +363,7 @@ def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, 
     problem = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0)))
     found: list[Bundle] = []
     failure: CalibrationError | None = None
-    # Seen from afar a plane has two poses that look nearly the same; each is a minimum of its own.
+    # From afar a plane has two poses that look nearly the same; each is a local minimum.
     for start in _plate_pose_starts(lens_model, parameters, sighting):
         try:
             found.append(problem.solve(parameters, [start]))
@@ -376,7 +376,7 @@ def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, 
 
 
 def model_of(camera: LensSettings) -> ModelName:
-    """The calibration's name of a camera's model.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+    """The name of a camera's lens model.  :class:`CalibrationError` for models that aren't calibrated here."""
     tag = camera.__struct_config__.tag
     if tag == "brown_conrady":
         count = len(camera.coefficients)  # type: ignore[union-attr]
@@ -388,7 +388,7 @@ def model_of(camera: LensSettings) -> ModelName:
 
 def plate_pose_start(lens_model: LensModel, parameters: Array, sighting: Sighting) -> Array:
     """``cam_T_plate`` (4, 4) in closed form, from ideal coordinates (Collins and Bartoli, "Infinitesimal plane-based
-    pose estimation", 2014).  :class:`CalibrationError` where the lens doesn't map the points or they lie on a line.
+    pose estimation", 2014).  :class:`CalibrationError` if the lens doesn't map the points or they are collinear.
     """
     return _plate_pose_starts(lens_model, parameters, sighting)[0]
 
@@ -399,7 +399,7 @@ def _plate_pose_starts(lens_model: LensModel, parameters: Array, sighting: Sight
     good = np.isfinite(xy).all(axis=1)
     if good.sum() < 4:
         raise CalibrationError("the start is outside of what the lens model maps")
-    # Centred, as the solver wants it.
+    # The solver expects centred points.
     middle = sighting.plate_m[good].mean(axis=0)
     points = sighting.plate_m[good] - middle
     spread = np.linalg.svd(points[:, :2], compute_uv=False)
@@ -423,19 +423,19 @@ def _plate_pose_starts(lens_model: LensModel, parameters: Array, sighting: Sight
 
 
 def _typical_px(bundle: Bundle) -> float:
-    """Median residual of all points: a wrong pose leaves none out, as all of them are far off alike."""
+    """Median residual of all points: a wrong pose has no outliers, because all points are equally far off."""
     sizes = np.linalg.norm(np.concatenate(bundle.residuals_px), axis=1)
     return float(np.median(np.where(np.isfinite(sizes), sizes, np.inf)))
 
 
 def merit(bundle: Bundle) -> tuple[float, float]:
-    """The smaller the better: points left out, then how well the rest fits."""
+    """Sort key, smaller is better: number of points left out, then the residuals of the rest."""
     used = np.concatenate(bundle.used)
     return float(np.count_nonzero(~used)), bundle.rms_px
 
 
 def lens_vector(camera: LensSettings) -> Array:
-    """A camera's parameters as :class:`LensModel` has them."""
+    """A camera's parameters in the order of :class:`LensModel`."""
     pinhole = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
     lens = getattr(camera, "coefficients", None)
     return np.array([*pinhole, *(lens if lens is not None else (camera.kappa_per_px2,))])  # type: ignore[union-attr]
@@ -451,12 +451,12 @@ class GivenCamera:
 
     @property
     def model(self) -> LensModel:
-        """Its lens with derivatives.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+        """Its lens model with derivatives.  :class:`CalibrationError` for models that aren't calibrated here."""
         return LensModel(model_of(self.lens), self.lens.width_px, self.lens.height_px)
 
     @property
     def free(self) -> Array:
-        """(k, p): what changes of the p ``parameters`` do to all k; fy follows fx where the aspect was held."""
+        """(k, p): effect of the p ``parameters`` on all k; fy follows fx if the aspect was held."""
         names = parameter_names(model_of(self.lens))
         unknown = [name for name in self.parameters if name not in names]
         if unknown:
@@ -469,8 +469,8 @@ class GivenCamera:
 
 
 def pose_slopes(camera: GivenCamera, sighting: Sighting, cam_T_plate: Array) -> Array:
-    """(6, p): what each of the camera's independent errors, in its standard deviations, does to the plate's pose that
-    the image gives (position then rotation, camera axes), to first order; p = 0 for an exact camera.
+    """(6, p): effect of each of the camera's independent errors, per standard deviation, on the plate's pose from the
+    image (position then rotation, camera axes), to first order; p = 0 for an exact camera.
     """
     if camera.covariance is None or not camera.parameters:
         return np.zeros((6, 0))
@@ -482,8 +482,8 @@ def pose_slopes(camera: GivenCamera, sighting: Sighting, cam_T_plate: Array) -> 
 
 
 def independent_errors(covariance: Array) -> Array:
-    """(n, n) rows of independent errors, one standard deviation each; by eigenvectors, as corners that share an edge,
-    or parameters that were hardly free, make a covariance nearly singular.
+    """(n, n) rows of independent errors, one standard deviation each.  By eigenvectors, because a covariance is nearly
+    singular if corners share an edge or parameters were hardly free.
     """
     scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
     variances, axes = np.linalg.eigh(covariance / np.outer(scale, scale))

@@ -1,14 +1,14 @@
-"""Corners of chequerboards: where four squares meet, dark and light by turns; then to a few hundredths of a pixel.
+"""Corners of chequerboards, where four squares meet, alternately dark and light; to a few hundredths of a pixel.
 
-About the corner where two edges cross, ``I(p + d) = I(p - d)``, however blurred the image is and whatever the angle
-between the edges; light that slopes adds a part that is odd and linear in ``d``.  Least squares in the pixels of a disc
-about the point gives its place, its covariance from the image's noise, and tells where something else lies in the disc.
+Around a corner where two edges cross, ``I(p + d) = I(p - d)``, whatever the blur and the angle between the edges; a
+gradient of the light adds a part that is odd and linear in ``d``.  Least squares over the pixels of a disc around the
+point gives its position, its covariance from the image's noise, and a test whether something else lies in the disc.
 
-That is exact where the target's map to the image is linear.  Perspective and lens bend it: a step and its opposite on
-the target lead to ``p + d + q(d)`` and ``p - d + q(d)``, with q quadratic.  Left out, it moves corners by some
-hundredths of a pixel, all of them towards where the target looks smaller; so opposite pixels are taken by ``bend``,
-q's coefficients.  No camera need be known for these: a pixel p leads to coordinates of the lattice by g = (homography)
-o (radial polynomial about a centre), a plane seen through a lens, and where g isn't linear,
+That is exact if the map from target to image is linear.  Perspective and lens bend it: a step and its opposite on the
+target lead to ``p + d + q(d)`` and ``p - d + q(d)``, with q quadratic.  Neglecting q shifts corners by some hundredths
+of a pixel, all of them towards where the target looks smaller; so opposite pixels are sampled with ``bend``, q's
+coefficients.  These need no known camera: g maps a pixel p to lattice coordinates as (homography) o (radial polynomial
+about a centre), a plane seen through a lens, and where g isn't linear,
 
     g(c + d + q) + g(c - d + q) = 2 g(c)    with    q = -1/2 G^-1 g''[d, d],  G = g'(c), to fourth order in d.
 """
@@ -29,10 +29,10 @@ from gripmon.calibrate.lattice import Grey, Index, find_lattice, trimmed
 from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)
-"""Standard deviations (px) of the smoothing at which corners are looked for."""
+"""Standard deviations (px) of the smoothing with which corners are searched."""
 MOST_CANDIDATES = 4000
 WEAKEST = 0.02
-"""Of the strongest candidates' strength."""
+"""Minimum strength of a candidate, relative to the strongest ones."""
 _RING = 32
 _SECOND = 2
 _LATTICES = 3
@@ -40,7 +40,7 @@ _LATTICES = 3
 
 @dataclass(frozen=True)
 class _Turns:
-    """Neighbouring corners are each other's negative: where one has dark squares, the other has light ones."""
+    """Neighbouring corners are negatives of each other: where one has dark squares, the other has light ones."""
 
     second: NDArray[np.complex128]
 
@@ -49,7 +49,7 @@ class _Turns:
         return product.real < -0.4 * abs(product)
 
     def basis(self, at: int, a_px: Array, b_px: Array) -> bool:
-        # A knight's move leads to a negative, too; then less two steps the other way it is shorter.
+        # A knight's move also leads to a negative, but then subtracting two of the other steps makes it shorter.
         return all(
             np.hypot(*(one + side * two)) > np.hypot(*one)
             for one, two in ((a_px, 2.0 * b_px), (b_px, 2.0 * a_px))
@@ -58,9 +58,8 @@ class _Turns:
 
 
 def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[float, float]]]:
-    """Lattices of corners (column, row) -> (u, v), to about a pixel: the one that fits into ``columns`` x ``rows``,
-    either way round, and shows the most contrast in all its corners together, or else what was found instead; empty if
-    there is none.
+    """Lattices of corners (column, row) -> (u, v), to about a pixel: the one that fits into ``columns`` x ``rows`` in
+    either orientation and has the most total contrast, or otherwise the largest that was found; empty if there is none.
     """
     best: dict[Index, tuple[float, float]] = {}
     shown = 0.0
@@ -90,7 +89,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
 
 
 def fits(lattice: dict[Index, tuple[float, float]], columns: int, rows: int) -> bool:
-    """Whether it can be a part of as many columns and rows, either way round, and is enough of it to be recognised."""
+    """Whether a lattice can be part of ``columns`` x ``rows``, in either orientation, and is large enough."""
     if len(lattice) < 9:
         return False
     cells = np.array(list(lattice))
@@ -99,7 +98,7 @@ def fits(lattice: dict[Index, tuple[float, float]], columns: int, rows: int) -> 
 
 
 def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Index, int]:
-    """Looked at once more, in rings as wide as the squares allow: corners of the board's rim are none of its own."""
+    """Test again with rings as wide as the squares allow: corners of the board's rim don't belong to its lattice."""
     indices = np.array(list(lattice.values()))
     steps = cKDTree(candidates[indices]).query(candidates[indices], 2)[0][:, 1]
     good, _ = crossing(grey, candidates[indices], 0.35 * steps)
@@ -108,7 +107,9 @@ def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Inde
 
 
 def saddles(grey: Grey, sigma_px: float) -> Array:
-    """Candidates (n, 2): where the image bends up one way and down the other the most, the strongest ones."""
+    """The strongest candidates (n, 2): maxima of saddle strength, where the image curves up one way and down the
+    other.
+    """
     smooth = cv2.GaussianBlur(grey, (0, 0), sigma_px)
     xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3)
     yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3)
@@ -125,8 +126,8 @@ def saddles(grey: Grey, sigma_px: float) -> Array:
 
 
 def crossing(grey: Grey, points: Array, radius_px: Array) -> tuple[NDArray[np.bool_], NDArray[np.complex128]]:
-    """(n,) where a ring about a point is dark, light, dark, light: two edges cross there, rather than meet; and which
-    way and how strongly, as the ring's second harmonic.
+    """(n,) whether a ring around a point is dark, light, dark, light, so that two edges cross there instead of meeting;
+    and their direction and strength, as the ring's second harmonic.
     """
     if not len(points):
         return np.zeros(0, bool), np.zeros(0, np.complex128)
@@ -136,7 +137,7 @@ def crossing(grey: Grey, points: Array, radius_px: Array) -> tuple[NDArray[np.bo
     levels = cv2.remap(grey, at[:, :, 0], at[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     harmonics = np.fft.rfft(levels.astype(np.float64), axis=1)[:, 1:]
     power = np.square(np.abs(harmonics))
-    # Two crossing edges have even harmonics alone: what is opposite is alike.
+    # Two crossing edges have only even harmonics: opposite pixels are equal.
     even, odd = power[:, 1::2].sum(axis=1), power[:, 0::2].sum(axis=1)
     second = harmonics[:, _SECOND - 1]
     inside = ((points - radius_px[:, None] > 0) & (points + radius_px[:, None] < np.array(grey.shape[::-1]) - 1)).all(
@@ -149,12 +150,12 @@ def crossing(grey: Grey, points: Array, radius_px: Array) -> tuple[NDArray[np.bo
 LARGEST_RADIUS_PX = 12.0
 SMALLEST_RADIUS_PX = 2.5
 ASYMMETRIC = 0.06
-"""Root mean square of what isn't symmetric, over the contrast, beyond what the noise explains."""
+"""Largest root mean square of the asymmetric part, over the contrast, beyond what the noise explains."""
 SYSTEMATIC_PX = 0.015
-"""Of a point's place, that no noise explains."""
+"""Standard deviation of a point's position that noise doesn't explain (px)."""
 _SMOOTH_PX = 0.7
 _SMOOTHED = 0.17
-"""What is left of white noise's variance after that smoothing."""
+"""Fraction of white noise's variance that remains after that smoothing."""
 _STEPS = 12
 _CONVERGED_PX = 1e-3
 
@@ -162,9 +163,9 @@ _CONVERGED_PX = 1e-3
 def centres_of_symmetry(
     grey: Grey, start: Array, radius_px: Array, noise: float, bend: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Near ``start`` (n, 2), in discs of ``radius_px`` (n,): centres (n, 2), their covariances (n, 2, 2) and how
-    asymmetric the image is about each (n,), as a part of its contrast; NaN and infinity where there is none.
-    ``bend`` (n, 3, 2): q of ``d`` = (x, y) px is ``[x², xy, y²]`` times it; none if it isn't known.
+    """Near ``start`` (n, 2), in discs of ``radius_px`` (n,): centres (n, 2), their covariances (n, 2, 2) and the
+    asymmetry of the image about each (n,), over its contrast; NaN and infinity where there is none.  ``bend`` (n, 3,
+    2): q of ``d`` = (x, y) px is ``[x², xy, y²]`` times it; None if unknown.
     """
     radius_px = np.clip(radius_px, SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX)
     if not len(start):
@@ -173,7 +174,7 @@ def centres_of_symmetry(
     start = start - corner
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
     slopes: list[Any] = [cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
-    # Other interpolation than by splines shifts the corners by up to 0.04 px, depending on where in a pixel they are.
+    # Interpolation other than by splines shifts corners by up to 0.04 px, depending on the sub-pixel position.
     levels: Array = spline_filter(smooth, order=3, output=np.float64)
     reach = int(np.ceil(radius_px.max(initial=1.0)))
     dv, du = (a.ravel() for a in np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64))
@@ -181,10 +182,10 @@ def centres_of_symmetry(
     offsets = np.stack([du[half], dv[half]], axis=1)
     bent = 0.0 if bend is None else _quadratic(offsets) @ bend
     weight = np.clip(radius_px[:, None] + 0.5 - np.hypot(*offsets.T), 0.0, 1.0)
-    # What the light's slope adds; its columns don't move with the point.
+    # The effect of a light gradient; its columns don't depend on the point.
     odd = np.broadcast_to(2.0 * offsets, (len(start), *offsets.shape))
     at, moving = start.astype(np.float64).copy(), np.full(len(start), True)
-    # All points at once: a minimiser of single problems would be called hundreds of times an image.
+    # All points at once: a minimiser for single problems would be called hundreds of times per image.
     for _ in range(_STEPS):
         difference, gradient, _ = _opposites(levels, slopes, at[:, None] + bent, offsets)
         rows = np.concatenate([gradient, odd], axis=2)
@@ -206,7 +207,7 @@ def _quadratic(offsets: Array) -> Array:
 
 
 def _cropped(grey: Grey, points: Array, margin: int) -> tuple[Grey, Array]:
-    """The part of the image that the points are in, and its first pixel (2,)."""
+    """The part of the image that contains the points, and its first pixel (2,)."""
     low = np.maximum(np.floor(points.min(axis=0)).astype(int) - margin, 0)
     high = np.minimum(np.ceil(points.max(axis=0)).astype(int) + margin + 1, grey.shape[::-1])
     return np.ascontiguousarray(grey[low[1] : high[1], low[0] : high[0]]), low.astype(np.float64)
@@ -225,7 +226,7 @@ def _judged(
     """Covariances (n, 2, 2) and asymmetries (n,) at the centres."""
     difference, gradient, pairs = _opposites(levels, slopes, middles, offsets)
     rows = np.concatenate([gradient, odd], axis=2)
-    # A difference of two pixels has twice their variance; that smoothing has made them alike evens out over the disc.
+    # A difference of two pixels has twice their variance; the correlation by smoothing averages out over the disc.
     information = np.einsum("nk,nki,nkj->nij", weight, rows, rows)
     size = np.sqrt(np.maximum(np.einsum("nii->ni", information), 1e-12))
     scaled = information / (size[:, :, None] * size[:, None, :]) + 1e-9 * np.eye(4)
@@ -243,8 +244,8 @@ def _judged(
 
 
 def _opposites(levels: Array, slopes: list[Grey], middles: Array, offsets: Array) -> tuple[Array, Array, Array]:
-    """Differences of opposite pixels (n, k) about ``middles`` (n, 1 or k, 2), their derivatives by these (n, k, 2), and
-    the levels (n, k) of the pairs about their mean.
+    """Differences of opposite pixels (n, k) about ``middles`` (n, 1 or k, 2), their derivatives by the middles (n, k,
+    2), and the mean levels of the pairs (n, k) less their average.
     """
     plus, minus = middles + offsets, middles - offsets
     a, b = (
@@ -263,7 +264,7 @@ def _sampled(image: Grey, where: Array) -> Array:
 
 
 def _solve(rows: Array, values: Array, weight: Array) -> Array:
-    """Weighted least squares of each of many small problems (n, k, 4); a little damped, where nothing is to be seen."""
+    """Weighted least squares of many small problems (n, k, 4), slightly damped for featureless discs."""
     normal = np.einsum("nk,nki,nkj->nij", weight, rows, rows)
     side = np.einsum("nk,nki,nk->ni", weight, rows, values)
     size = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-9))
@@ -273,19 +274,20 @@ def _solve(rows: Array, values: Array, weight: Array) -> Array:
 
 
 FEWEST = 9
-"""Points that determine how a plane looks, with some to spare."""
+"""Minimum number of points to determine the map of a plane, with some redundancy."""
 _LENS = 3
 _NOISE_PX = 0.05
 _CENTRE_SHARE = 0.1
-"""Of the image's size: the standard deviation of the lens's centre about the image's, before the points are seen; and
-of the lens's own part in the image's corner."""
+"""Prior standard deviation of the lens's centre about the image's, over the image's size; and (next) that of the lens's
+distortion at the image's corner.
+"""
 _LENS_SHARE = 0.5
 _STEP_PX = 2.0
 
 
 def bends(cells: Array, at: Array, size_px: tuple[int, int]) -> Array:
     """(n, 3, 2): q of ``d`` = (x, y) px is ``[x², xy, y²]`` times these, at the points ``at`` (n, 2) px with the
-    lattice coordinates ``cells`` (n, 2); 0 where fewer than :data:`FEWEST` don't tell, or all lie on a line.
+    lattice coordinates ``cells`` (n, 2); 0 if there are fewer than :data:`FEWEST` points or all are collinear.
     """
     out = np.zeros((len(at), 3, 2))
     if len(at) < FEWEST or np.linalg.svd(cells - cells.mean(axis=0), compute_uv=False)[1] < 1.0:
@@ -304,24 +306,24 @@ def bends(cells: Array, at: Array, size_px: tuple[int, int]) -> Array:
         - view.to_cells(unknown, at - east + south)
     )
     slopes = np.stack([e - w, s - n], axis=2) / (2.0 * _STEP_PX)
-    # Of g's second derivatives those by x x, x y (twice, as it stands twice in the form), y y.
+    # Second derivatives of g by x x, x y (doubled, as it occurs twice in the form), y y.
     second = np.stack([e + w - 2.0 * here, 0.5 * diagonal, s + n - 2.0 * here], axis=2) / _STEP_PX**2
     out[:] = -0.5 * np.linalg.solve(slopes, second).transpose(0, 2, 1)
     return out
 
 
 class _View:
-    """A lattice in an image, scaled to about one."""
+    """A lattice in an image, both scaled to the order of one."""
 
     def __init__(self, cells: Array, at: Array, size_px: tuple[int, int]) -> None:
         self._middle_px, self._scale_px = 0.5 * np.asarray(size_px, float), 0.5 * float(np.hypot(*size_px))
         self._middle, self._extent = cells.mean(axis=0), float(np.ptp(cells, axis=0).max())
         self._cells, self._at = (cells - self._middle) / self._extent, at
-        # Of a residual on the lattice, in pixels.
+        # Pixels per unit of a residual on the lattice.
         self._px = float(np.sqrt(np.linalg.det(np.cov(at.T)) / np.linalg.det(np.cov(self._cells.T))) ** 0.5)
 
     def fitted(self) -> Array | None:
-        """Homography (8), lens (3) and its centre (2); None if there is no such view."""
+        """Homography (8), lens (3) and its centre (2); None if the fit fails."""
         plane, _ = cv2.findHomography(self._normal(self._at), self._cells)
         if plane is None or not np.isfinite(plane).all() or plane[2, 2] == 0.0:
             return None
@@ -333,7 +335,7 @@ class _View:
         return start if np.isfinite(start).all() and np.isfinite(found.cost) else None
 
     def to_cells(self, unknown: Array, at: Array) -> Array:
-        """Pixels (n, 2) -> the lattice."""
+        """Pixels (n, 2) -> lattice coordinates (n, 2)."""
         return self._to_plane(unknown, at) * self._extent + self._middle
 
     def _residuals(self, unknown: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Calibration targets in images, whole or in part: fingers may stand on them.  Points to hundredths of a pixel."""
+"""Detection of calibration targets, whole or partly hidden by fingers that stand on them; to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -31,20 +31,22 @@ _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
 _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
 WINDOW = 0.42
-"""Radius of what is looked at about a corner, in squares."""
+"""Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs twice the number, in
+units of the smaller of gap and radius.
+"""
 TOO_BLURRED = 0.16
-"""Standard deviation of the edges' blur from which an image isn't measured in: in squares; with discs in gaps or radii,
-half as wide.
+"""Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs half of it, in units
+of twice the smaller of gap and radius.
 """
 BLURRED_PX = 3.0
-"""Standard deviation of the edges' blur from which it is reported."""
+"""Standard deviation of the edges' blur above which it is reported."""
 
 
 def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
-    """Points of the target in an image (any that a camera delivers), or why there are none.
+    """Points of the target in an image (of any type that a camera delivers), or why there are none.
 
-    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  :class:`TargetError` if
-    the target itself can't be (a dictionary that isn't there).
+    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  :class:`TargetError` for an
+    impossible target (an unknown dictionary).
     """
     grey = to_grey(image)
     if isinstance(target, Charuco):
@@ -56,14 +58,14 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     shown = to_bytes(grey)
     board, corners, ids, marks = _marked_corners(shown, target)
     if 2 * len(ids) < (target.columns - 1) * (target.rows - 1):
-        # In a mirrored board some marks look like others of the dictionary.
+        # In a mirrored board some markers look like others of the dictionary.
         if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
             return NotFound("the board is mirrored; an image that isn't flipped")
         if len(ids) < FEWEST["charuco"]:
             said = f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}"
             return NotFound(_blurred(grey) or said)
     plate = np.asarray(board.getChessboardCorners(), np.float64)
-    # Marks stand in the white squares, and must not stand in the windows.
+    # Markers are in the white squares, and must be outside the windows.
     margin = 0.5 * (1.0 - target.marker_m / target.square_m)
     steps = _steps(plate[ids, :2] / target.square_m, corners)
     window = np.minimum(WINDOW, 1.3 * margin) * steps - (1.0 if 1.3 * margin < WINDOW else 0.0)
@@ -73,7 +75,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
 
 
 def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
-    """The board, corners (n, 2), their numbers (n,) and how many marks are seen, by the pattern that shows more:
+    """The board, corners (n, 2), their numbers (n,) and the number of visible markers, for the pattern that shows more:
     before version 4.6 of OpenCV boards with an even number of rows began with the other colour.
     """
     if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
@@ -94,7 +96,7 @@ def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
 
 
 def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
-    """(n,) which corners lie about where one plane has them: what looks like a mark need not be one."""
+    """(n,) which corners agree roughly with one plane: what looks like a marker need not be one."""
     if len(places) < 5:
         return np.ones(len(places), bool)
     tolerance_px = 0.6 * float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
@@ -108,7 +110,7 @@ def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
 
 
 def _mirrors(plane: Array, plate: Array) -> bool:
-    """Whether a homography turns the plate over where these points (n, 3) are: elsewhere its sign says nothing."""
+    """Whether a homography flips the plate at these points (n, 3); elsewhere its sign means nothing."""
     depth = plate[:, :2] @ plane[2, :2] + plane[2, 2]
     return bool(np.linalg.det(plane) * np.median(depth) < 0.0)
 
@@ -182,14 +184,14 @@ def _sighting(
 
 
 def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
-    """Cells (n, 2), from 0 on, by rows, and where they are in the image (n, 2)."""
+    """Cells (n, 2), from 0 on, row by row, and their positions in the image (n, 2)."""
     order = sorted(lattice, key=lambda cell: (cell[1], cell[0]))
     cells = np.array(order, np.intp)
     return cells - cells.min(axis=0), np.array([lattice[cell] for cell in order])
 
 
 def _turned(cells: NDArray[np.intp], columns: int, rows: int) -> NDArray[np.intp]:
-    """By a quarter if that makes the target's columns run along x, as far as what is seen tells."""
+    """Rotate by 90 degrees if that makes the target's columns run along x, as far as the visible part shows."""
     seen_columns, seen_rows = cells.max(axis=0) + 1
     if seen_columns <= columns and seen_rows <= rows and (seen_columns, seen_rows) != (rows, columns):
         return cells
@@ -203,14 +205,14 @@ def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str) -> NotFound:
-    # The longer side first, as the target's.
+    # The longer side first, as in the target.
     seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
     larger = max(seen) > max(columns, rows) or min(seen) > min(columns, rows)
     return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}", larger)
 
 
 def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:
-    """(n,) distance in px of each point to its nearest neighbour on the lattice, a step being 1 there."""
+    """(n,) distance in px of each point to its nearest neighbour, per step of the lattice."""
     where, index = cKDTree(points).query(points, 2)
     away = np.linalg.norm(cells[index[:, 1]] - cells, axis=1)
     out: Array = where[:, 1] / np.maximum(away, 1.0)
@@ -218,7 +220,7 @@ def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:
 
 
 def _across_squares(cells: NDArray[np.intp], points: Array) -> tuple[Array, Array]:
-    """Ends (n, 2) of lines across edges: between two neighbouring corners, from square to square."""
+    """Ends (n, 2) of lines across edges: between two neighbouring corners, from one square to the next."""
     where = {(int(c), int(r)): k for k, (c, r) in enumerate(cells.tolist())}
     lines = []
     for (c, r), k in where.items():
@@ -233,13 +235,13 @@ def _across_squares(cells: NDArray[np.intp], points: Array) -> tuple[Array, Arra
 def _sharp(
     grey: Grey, rough: Array, radius_px: Array, cells: Array | NDArray[np.intp]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Corners (n, 2) to sub-pixel, covariances (n, 2, 2), and which of them are what they should be; ``cells`` (n, 2)
-    are their places on the lattice.
+    """Sub-pixel corners (n, 2), covariances (n, 2, 2), and which of them are good; ``cells`` (n, 2): lattice
+    coordinates.
     """
     noise = noise_of(grey)
     found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
     good = _corners(grey, *found, radius_px)
-    # How the lattice bends is known once its corners are.
+    # The bend of the lattice is known once its corners are.
     bend = np.zeros((len(rough), 3, 2))
     size = (grey.shape[1], grey.shape[0])
     bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
@@ -248,7 +250,7 @@ def _sharp(
 
 
 def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
-    """(n,) which are free, and a corner."""
+    """(n,) which points are corners and not occluded."""
     radius = np.clip(radius_px, chequers.SMALLEST_RADIUS_PX, chequers.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])
     edge = np.minimum(uv_px, size - 1 - uv_px).min(axis=1)
@@ -265,13 +267,13 @@ def _note(count: int, total: int, blur_px: float = 0.0) -> str:
 
 
 def _blurred(grey: Grey) -> str:
-    """The reason for an image without target that isn't sharp anywhere."""
+    """The reason if an image without target isn't sharp anywhere; otherwise empty."""
     blur_px = sharpest_blur_px(grey)
     return _too_blurred(blur_px) if blur_px > BLURRED_PX else ""
 
 
 def _too_coarse(blur_px: float, steps: Array) -> str:
-    """The reason for a target whose edges are too wide for it: blurred, or too small in a sharp image."""
+    """The reason if a target's edges are too wide for it: blurred, or too small in a sharp image."""
     if blur_px > BLURRED_PX:
         return _too_blurred(blur_px)
     return (
@@ -287,17 +289,17 @@ def _too_blurred(blur_px: float) -> str:
 
 
 LEAST_CONTRAST = 0.2
-"""Between dark and light squares, over the range of the squares' grey levels: what is less may be light and shadow."""
+"""Minimum contrast of dark and light squares, over the range of their grey levels: less may be light and shadow."""
 BARE = 0.3
-"""Of the contrast: so much what lies beyond may differ from the plate's own ground."""
+"""How far the surroundings may differ from the plate's own ground, over the contrast."""
 _ALL = 0.9
 
 
 def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool) -> bool:
-    """True where a lattice (cells (n, 2) from 0 on, at (n, 2) px) has no gaps and the plate beyond all its four sides
-    is in view and bare.  False says nothing: a finger, the image's border, or something else may hide the rest.
+    """True if a lattice (cells (n, 2) from 0 on, at (n, 2) px) has no gaps and the plate beyond all four sides is
+    visible and bare.  False says nothing: a finger, the image's border, or something else may hide the rest.
 
-    ``squares``: the points are corners of squares, else centres of discs.
+    ``squares``: the points are corners of squares, otherwise centres of discs.
     """
     columns, rows = (cells.max(axis=0) + 1).tolist()
     if len(cells) < columns * rows or min(columns, rows) < 3:
@@ -312,12 +314,12 @@ def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool
     for turn in range(4):
         turned = np.rot90(grid, turn)
         edge, step = turned[0], turned[0] - turned[1]
-        if squares:  # the middles of the squares that would follow those which end the pattern
+        if squares:  # the centres of the squares that would follow those at the end of the pattern
             edge, step = 0.5 * (edge[1:] + edge[:-1]), 0.75 * (step[1:] + step[:-1])
         beyond = edge + step
         if ((beyond < 1.0) | (beyond > np.array(grey.shape[::-1]) - 2.0)).any():
             return False
-        # Beyond squares of two colours may be either, but the same all along.
+        # Beyond a pattern of squares either colour is possible, but the same all along.
         shown, near = _levels(grey, beyond), BARE * abs(ground - ink)
         if max(np.mean(np.abs(shown - level) < near) for level in ((ground, ink) if squares else (ground,))) < _ALL:
             return False
@@ -331,9 +333,9 @@ def _levels(grey: Grey, where: Array) -> Array:
 
 
 def upright(image: Image, sighting: Sighting, board: Chequerboard) -> Sighting | NotFound:
-    """``sighting`` of a whole board whose numbers of corners are one even, one odd, turned such that the square between
-    its first corners along both axes is dark.  :class:`NotFound` where a part of the board is hidden (the lattice's
-    origin is unknown then), or the colours don't tell.
+    """``sighting`` of a whole board with one odd and one even number of corners, rotated so that the square between its
+    first corners along both axes is dark.  :class:`NotFound` if part of the board is hidden (then the lattice's origin
+    is unknown), or if the colours are ambiguous.
     """
     count = board.columns * board.rows
     if len(sighting) != count:
@@ -346,7 +348,7 @@ def upright(image: Image, sighting: Sighting, board: Chequerboard) -> Sighting |
         return NotFound("the corners aren't the whole board; all of them, to tell which way up it is")
     places = np.empty((board.columns, board.rows, 2))
     places[cells[:, 0], cells[:, 1]] = sighting.uv_px
-    # A square's middle by its four corners: perspective and lens hardly bend one square.
+    # The centre of a square from its four corners: perspective and lens hardly distort one square.
     middles = 0.25 * (places[:-1, :-1] + places[1:, :-1] + places[:-1, 1:] + places[1:, 1:])
     grey = to_grey(image)
     levels = grey[tuple(np.rint(middles[..., k]).astype(int) for k in (1, 0))].astype(np.float64)

@@ -39,9 +39,9 @@ class CameraCalibration(
 ):  # fmt: skip
     """A calibrated camera.
 
-    ``covariance`` (n·n, row by row) is that of the n ``parameters``, which are keys of ``camera``
-    (``coefficients.0`` is the first one); what isn't among them was held fixed.  A camera that was imported from
-    another program's file has neither: how certain it is isn't known.
+    ``covariance`` (n·n, row by row) is that of the n ``parameters``, which are keys of ``camera`` (``coefficients.0``
+    is the first one); all others were held fixed.  A camera imported from another program's file has neither: its
+    uncertainty is unknown.
     """
 
     camera: LensSettings
@@ -59,8 +59,8 @@ class CalibratedGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 class HandEyeResiduals(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How well the gripper's corners fit the plane that they stand on; of a gripper from images, how exact its outline
-    is (``corners`` 0: round tips have none).
+    """How well the gripper's corners fit the plane that they stand on; for a gripper from images, the accuracy of its
+    outline (``corners`` 0: round tips have none).
     """
 
     rms_m: Annotated[_Length, Meta(description="root mean square of the residuals on the plate, x and y each (m)")]
@@ -99,9 +99,9 @@ class RobotWorldCalibration(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
     tag="gripmon.robot_world_calibration/1",
 ):  # fmt: skip
-    """``transforms`` by name, two of them: ``cam_T_base`` and ``ee_T_target``, or of a camera on the hand ``cam_T_ee``
-    and ``base_T_target``, and the inverse of the first one.  ``covariance`` (12·12, row by row) of the ``parameters``:
-    position then rotation of the first two, axes of the frame that each maps to.
+    """Result of a robot-world calibration.  ``transforms`` by name: ``cam_T_base`` and ``ee_T_target`` (for a camera on
+    the hand ``cam_T_ee`` and ``base_T_target``), and the inverse of the first one.  ``covariance`` (12·12, row by row)
+    of the ``parameters``: position then rotation of the first two, axes of the frame that each maps to.
     """
 
     transforms: dict[str, Transform]
@@ -115,7 +115,7 @@ class RobotWorldCalibration(
 def robot_world_document(
     found: RobotWorld, names: Sequence[str], provenance: Provenance, *, eye_in_hand: bool
 ) -> RobotWorldCalibration:
-    """What a file holds of a result; ``names`` (n,) of the poses."""
+    """The contents of a result's file; ``names`` (n,) of the poses."""
     first, second, inverse = (
         ("cam_T_ee", "base_T_target", "ee_T_cam") if eye_in_hand else ("cam_T_base", "ee_T_target", "base_T_cam")
     )

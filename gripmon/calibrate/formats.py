@@ -1,6 +1,6 @@
-"""Camera files of ROS, Kalibr and mrcal, read and written; and YAML as their readers take it.
+"""Camera files of ROS, Kalibr and mrcal, read and written; and YAML as their readers accept it.
 
-A value that is wrong is an :class:`InterchangeError`; what is written has a lens that the format has.
+A wrong value raises an :class:`InterchangeError`; cameras to write must have a lens that the format supports.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class InterchangeError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class FileValues:
-    """The ``content`` of a file, or of what stands under a key of it; ``right`` says what should be there."""
+    """The ``content`` of a file, or of a section of it; ``right`` says what should be there."""
 
     file: str
     content: Mapping[str, Any]
@@ -46,7 +46,7 @@ class FileValues:
         return self.content[key]
 
     def below(self, key: str, right: str = "") -> FileValues:
-        """What stands under a key, which has keys itself."""
+        """The section under a key."""
         value = self.value(key, right)
         if not isinstance(value, Mapping):
             raise self.fault(key, f"is {_shown(value)}", right)
@@ -65,7 +65,7 @@ class FileValues:
         return int(number)
 
     def numbers(self, key: str, counts: tuple[int, ...], right: str) -> tuple[float, ...]:
-        """A flat list of as many numbers as one of ``counts``."""
+        """A flat list whose length is one of ``counts``."""
         value = self.value(key, right)
         if not isinstance(value, list | tuple):
             raise self.fault(key, f"is {_shown(value)}", right)
@@ -79,13 +79,13 @@ class FileValues:
         return self.pixels(key, width), self.pixels(key, height)
 
     def choice(self, key: str, value: Any, names: Mapping[str, Any], right: str) -> Any:
-        """What one of several names stands for."""
+        """The meaning of one of several names."""
         if value not in names:
             raise self.fault(key, f"{_shown(value)} is not a model of gripmon's", right)
         return names[value]
 
     def pinhole(self, key: str) -> Pinhole:
-        """Of a camera matrix, 9 numbers row by row."""
+        """From a camera matrix, 9 numbers row by row."""
         matrix = self.numbers(key, (9,), "3 x 3 numbers")
         if not any(matrix):
             raise self.fault(key, "is all zeros: an uncalibrated camera", "a calibrated one")
@@ -97,8 +97,8 @@ class FileValues:
     def camera(
         self, size_px: tuple[int, int], pinhole: Pinhole, coefficients: tuple[float, ...], *, fisheye: bool
     ) -> LensSettings:
-        """OpenCV's standard lens or its fisheye, if a monitor can use it; 14 coefficients if the sensor isn't tilted,
-        none for no lens.
+        """OpenCV's standard lens or its fisheye, if a monitor can use it; 14 coefficients are accepted if the sensor
+        isn't tilted, and none means no distortion.
         """
         if len(coefficients) == 14:
             if any(coefficients[12:]):
@@ -118,25 +118,25 @@ class FileValues:
 
 
 def as_number(value: Any) -> float | None:
-    """A finite number, or text that reads as one, as YAML 1.1 takes ``1e-05`` for text; None for anything else."""
+    """A finite number, or text that reads as one, because YAML 1.1 takes ``1e-05`` for text; None for anything else."""
     if isinstance(value, str):
         with contextlib.suppress(ValueError):
             value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    with contextlib.suppress(OverflowError):  # a whole number beyond all floats
+    with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
         return float(value) if math.isfinite(value) else None
     return None
 
 
 def _shown(value: Any) -> str:
-    """A value for a message: not all of a long one."""
+    """A value for a message, shortened if it is long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def number_text(value: float) -> str:
-    """The shortest text that reads back as the same number, for YAML 1.1, too: ``1.0e-05``."""
+    """The shortest text that reads back as the same number, also in YAML 1.1: ``1.0e-05``."""
     text = repr(float(value))
     mantissa, e, exponent = text.partition("e")
     return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else text
@@ -160,15 +160,15 @@ def read_mapping(file: str, data: bytes, right: str) -> dict[str, Any]:
 
 
 _ROS = "a camera_info file of ROS: image_width, camera_matrix, distortion_model, …"
-# OpenCV, which ROS hands them to, tells its models by the count alone; REP 104 gives plumb_bob 5 and the other 8.
+# OpenCV, which ROS passes them to, distinguishes models only by this count; REP 104 gives plumb_bob 5 and the other 8.
 _ROS_COUNTS = {
     "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8, 12, 14), "equidistant": (4,), "fisheye": (4,),
 }  # fmt: skip
 
 
 def read_ros(data: bytes, file: str) -> LensSettings:
-    """The YAML of ``camera_calibration_parsers``, which ``camera_info_manager`` and ``cameracalibrator`` use.
-    ``rectification_matrix`` and ``projection_matrix`` say how ROS rectifies; they aren't read.
+    """Read the YAML of ``camera_calibration_parsers``, as used by ``camera_info_manager`` and ``cameracalibrator``.
+    ``rectification_matrix`` and ``projection_matrix`` define ROS's rectification; they aren't read.
     """
     content = read_mapping(file, data, _ROS)
     values = FileValues(file, content, _ROS)
@@ -179,7 +179,7 @@ def read_ros(data: bytes, file: str) -> LensSettings:
     }
     flat = FileValues(file, {key.removesuffix(".data"): value for key, value in matrices.items()}, _ROS)
     pinhole = flat.pinhole("camera_matrix")
-    # Older files have no model; the only one that there was then is meant.
+    # Older files name no model; they mean the only one that existed then.
     model = content.get("distortion_model", content.get("camera_model", "plumb_bob"))
     right = "plumb_bob, rational_polynomial or equidistant"
     counts = values.choice("distortion_model", model, _ROS_COUNTS, right)
@@ -189,7 +189,7 @@ def read_ros(data: bytes, file: str) -> LensSettings:
 
 
 def write_ros(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
-    """Rectification and projection are written for a camera that stands alone."""
+    """Write rectification and projection for a monocular camera."""
     coefficients = list(camera.coefficients)  # type: ignore[union-attr]
     if camera.__struct_config__.tag == "fisheye":
         model = "equidistant"
@@ -268,7 +268,7 @@ _MRCAL_COUNTS = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (
 
 
 def read_mrcal(data: bytes, file: str) -> LensSettings:
-    """A ``.cameramodel``, a Python literal; ``extrinsics``, where the camera stands, aren't read."""
+    """Read a ``.cameramodel``, a Python literal; ``extrinsics``, the camera's pose, aren't read."""
     try:
         content = ast.literal_eval(data.decode("utf-8-sig").strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
@@ -286,7 +286,7 @@ def read_mrcal(data: bytes, file: str) -> LensSettings:
 
 
 def write_mrcal(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
-    """Keys in the order that mrcal's own reader wants; ``extrinsics`` are zeros."""
+    """Keys are in the order that mrcal's own reader expects; ``extrinsics`` are zeros."""
     coefficients = camera.coefficients  # type: ignore[union-attr]
     pinhole = not any(coefficients) and len(coefficients) == 4
     intrinsics = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *(() if pinhole else coefficients)]

@@ -1,8 +1,10 @@
-"""Cameras and hand/eye transforms for other programs: by the format's name, with the nearest lens that a format has.
+"""Export cameras and hand/eye transforms for other programs: by format name, with the nearest lens that a format
+supports.
 
-A robot's tree runs from arm to camera, where ``cam_T_grip`` has the gripper in the camera: what is written is the
-camera's pose in the gripper's frame (origin at the TCP, x across the jaws, z out of the gripper), or with
-``gripper_in_camera`` the gripper's pose in the camera."""
+A robot's tree runs from arm to camera, whereas ``cam_T_grip`` gives the gripper in the camera frame.  So the camera's
+pose in the gripper's frame is written (origin at the TCP, x across the jaws, z out of the gripper), or with
+``gripper_in_camera`` the gripper's pose in the camera frame.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,7 @@ from gripmon.model.records import Array, Transform
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0
-"""A fit that is farther off than this is not a calibration."""
+"""Largest error of a fit that still counts as a calibration (px)."""
 _BROWN_COUNTS = {"ros": (4, 5, 8, 12), "kalibr": (4,), "opencv": (4, 5, 8, 12), "mrcal": (4, 5, 8, 12)}
 _FITTED_COUNTS = {"ros": (5, 8), "kalibr": (4,), "opencv": (5, 8), "mrcal": (5, 8)}
 _FISHEYE = ("ros", "kalibr", "opencv")
@@ -45,14 +47,14 @@ _FISHEYE = ("ros", "kalibr", "opencv")
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """A file's bytes, and what had to be said about them."""
+    """A file's bytes, and warnings about them."""
 
     data: bytes
     warnings: tuple[str, ...] = ()
 
 
 def format_of(data: bytes, file: str) -> str:
-    """The format that a file is in, by its content; its name tells OpenCV's JSON from nothing else."""
+    """The format of a file, by its content; only the file name's suffix identifies OpenCV's JSON."""
     head = data[:65536].lstrip(b"\xef\xbb\xbf \t\r\n")
     text = head.decode(errors="replace")
     if b"LENSMODEL_" in data:
@@ -74,9 +76,9 @@ def read_camera(
     size_px: tuple[int, int] | None = None,
     fisheye: bool | None = None,
 ) -> LensSettings:
-    """The camera in a file's bytes.  What a file may leave open: ``which`` of several cameras, the image's size, and
-    whether the lens is a fisheye.  :class:`InterchangeError` for a camera that isn't there, or that no monitor can use,
-    and for options that this format has no use for.
+    """The camera in a file's bytes.  Options for what a file may leave open: ``which`` of several cameras, the image's
+    size, and whether the lens is a fisheye.  :class:`InterchangeError` for a missing camera, for one that no monitor
+    can use, and for options that this format doesn't need.
     """
     given = {"--camera": which, "--size": size_px, "--fisheye": fisheye}
     useful = {"kalibr": {"--camera"}, "opencv": {"--size", "--fisheye"}}.get(kind, set())
@@ -94,10 +96,10 @@ def write_camera(
     camera: LensSettings, kind: str, notes: Sequence[str], *, name: str, file: str, suffix: str = "", fit: bool = False
 ) -> Exported:
     """A file's bytes.  ``notes`` become comments, ``name`` is the camera's; ``file`` is where it comes from, for
-    messages; ``suffix`` of the file to write chooses OpenCV's syntax, YAML unless it is .xml or .json.
+    messages; ``suffix`` of the output file selects OpenCV's syntax: YAML unless it is .xml or .json.
 
-    A lens that the format hasn't is refused with :class:`InterchangeError`, or with ``fit`` written as the nearest one
-    that it has, with a warning of how far off it is anywhere in the image.
+    A lens that the format doesn't support raises :class:`InterchangeError`, or with ``fit`` is written as the nearest
+    one that it supports, with a warning about the largest error in the image.
     """
     warnings: list[str] = []
     if not _has(kind, camera):
@@ -144,24 +146,24 @@ def _nearest(camera: LensSettings, kind: str, file: str, fit: bool) -> tuple[Len
 
 
 GOOD_ENOUGH_PX = 0.001
-"""A fit with fewer coefficients does if it is as near as this."""
+"""Error below which a fit with fewer coefficients is accepted (px)."""
 _STEPS = 20
-"""Of a refinement that begins near its end."""
+"""For a refinement with a good start."""
 _FITTED, _CHECKED = 41, 101
-"""Points along the image's longer and shorter side: where the lens is fitted, and where it is compared."""
+"""Points along each side of the image: where the lens is fitted, and where it is compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedLens:
-    """``camera`` projects what the other one does, up to ``largest_px`` anywhere in the image."""
+    """``camera`` approximates another camera to within ``largest_px`` anywhere in the image."""
 
     camera: BrownConradyLens
     largest_px: float
 
 
 def fit_brown_conrady(camera: LensSettings, counts: tuple[int, ...]) -> FittedLens:
-    """The Brown-Conrady camera with the fewest of ``counts`` coefficients that is near enough, or else the nearest;
-    focal lengths and principal point are kept.  ValueError if the image shows what no such lens maps.
+    """The Brown-Conrady camera with the fewest of ``counts`` coefficients that is near enough, otherwise the nearest;
+    focal lengths and principal point are kept.  ValueError if the image shows directions that no such lens maps.
     """
     original = make_camera(camera)
     best: FittedLens | None = None
@@ -217,8 +219,8 @@ def _seen(camera: Camera, points: int) -> tuple[Array, Array]:
 
 
 def _linear(xy: Array, q: Array, count: int) -> Array:
-    """Radial and tangential terms by least squares: k1 k2 p1 p2 [k3 [k4 k5 k6]], the rational ones after
-    multiplication with the denominator.
+    """Radial and tangential terms by least squares: k1 k2 p1 p2 [k3 [k4 k5 k6]], the rational ones after multiplication
+    by the denominator.
     """
     x, y = xy.T
     r2 = x * x + y * y
@@ -247,10 +249,10 @@ _FRAME = re.compile(r"[^/\s\"'<>&][^\s\"'<>&]*")
 
 @dataclass(frozen=True, slots=True)
 class HandEye:
-    """What is exported: ``cam_T_grip`` with its 6 x 6 covariance (as published), and the frames' names.
+    """The data to export: ``cam_T_grip`` with its 6 x 6 covariance (as published), and the frames' names.
 
-    ``name`` is the calibration's; the marker's frame and the robot's base stand in an easy_handeye2 file for
-    completeness alone.
+    ``name`` is the calibration's; the marker's frame and the robot's base appear in an easy_handeye2 file only for
+    completeness.
     """
 
     cam_T_grip: Transform
@@ -286,14 +288,16 @@ class HandEye:
 
 
 def write_hand_eye(hand_eye: HandEye, kind: str, notes: Sequence[str]) -> str:
-    """The text in one of :data:`HAND_EYE_FORMATS`, ``notes`` as comments.  ValueError if the format can't say it."""
+    """The text in one of :data:`HAND_EYE_FORMATS`; ``notes`` become comments.  ValueError if the format can't express
+    it.
+    """
     notes = [" ".join(note.split()) for note in notes]
     writer = {"ros-static": _ros_static, "urdf": _urdf, "easy_handeye2": _easy_handeye2, "json": _json}[kind]
     return writer(hand_eye, notes)
 
 
 def _ros_static(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A shell script of one command, which keeps the transform published while it runs."""
+    """A shell script with one command, which publishes the transform while it runs."""
     (x, y, z), quaternion = _parts(hand_eye)
     parent, child = hand_eye.frames
     words = ["ros2", "run", "tf2_ros", "static_transform_publisher"]
@@ -305,7 +309,7 @@ def _ros_static(hand_eye: HandEye, notes: Sequence[str]) -> str:
 
 
 def _urdf(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A fixed joint between two links that the robot's description has."""
+    """A fixed joint between two links of the robot's description."""
     parent, child = hand_eye.frames
     xyz = " ".join(map(repr, hand_eye.parent_T_child[:3, 3].tolist()))
     rpy = " ".join(map(repr, roll_pitch_yaw(hand_eye.parent_T_child[:3, :3])))
@@ -318,7 +322,7 @@ def _urdf(hand_eye: HandEye, notes: Sequence[str]) -> str:
 
 
 def _easy_handeye2(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A ``.calib`` file of its eye-in-hand kind: the pose of the camera in the effector's frame, ours at the TCP."""
+    """A ``.calib`` file of the eye-in-hand type: the camera's pose in the effector's frame, here at the TCP."""
     if hand_eye.gripper_in_camera:
         raise ValueError("an easy_handeye2 file has the camera in the effector's frame; without --gripper-in-camera")
     translation, rotation = _parts(hand_eye)
@@ -366,15 +370,15 @@ def _parts(hand_eye: HandEye) -> tuple[list[float], list[float]]:
 
 
 def _xml_comment(text: str) -> str:
-    """Two hyphens would end it, and so would one at its end."""
+    """Avoid double hyphens, which would end the comment."""
     return text.replace("--", "- -").replace("--", "- -")
 
 
 def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
-    """Rotation matrix (3, 3) -> angles (rad) about fixed x, y, z, as URDF has them: ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
+    """Rotation matrix (3, 3) -> angles (rad) about fixed x, y, z, as in URDF: ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
 
-    Where the pitch is a right angle only roll minus (or plus) yaw counts; the angles give the same matrix there, too,
-    as yaw is what is left over when roll and pitch are taken.
+    If the pitch is ±90 degrees, only roll minus (or plus) yaw is defined; the angles still give the same matrix,
+    because yaw is computed after roll and pitch.
     """
     r = np.asarray(rotation, dtype=np.float64)
     pitch = math.atan2(-r[2, 0], math.hypot(r[2, 1], r[2, 2]))

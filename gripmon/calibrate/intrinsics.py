@@ -1,8 +1,8 @@
-"""A camera from views of a flat target: focal lengths, principal point, lens, with covariance and honest doubts.
+"""A camera from views of a flat target: focal lengths, principal point and lens, with covariance and warnings.
 
-Many views: Zhang, "A flexible new technique for camera calibration", 2000, refined over everything at once.  One view
-of a plane: as Tsai ("A versatile camera calibration technique", 1987) with principal point and aspect held fixed,
-which is what the self-viewing method does; see :func:`calibrate_single_view`.
+Many views: Zhang, "A flexible new technique for camera calibration", 2000, then bundle adjustment.  One view of a
+plane: as Tsai ("A versatile camera calibration technique", 1987) with principal point and aspect held fixed, as in the
+self-viewing method; see :func:`calibrate_single_view`.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ from gripmon.model.geometry import log_rotation
 from gripmon.model.records import Array
 
 Fixed = Mapping[str, float | None]
-"""Parameters that aren't estimated, with the values that they are held at; None: where they start."""
+"""Parameters that aren't estimated, with the values at which they are held; None: at their start."""
 
 FEWEST_POINTS = 8
-"""In a view; a plane's pose needs four."""
+"""Minimum number of points in a view; a plane's pose needs four."""
 FOCAL_STARTS = np.geomspace(0.25, 8.0, 31)
-"""Focal lengths over the image's width that are tried: fields of view from 127 to 7 degrees."""
+"""Trial focal lengths over the image's width: fields of view from 127 to 7 degrees."""
 
 ASSUMED_CENTRE = 0.01
-"""Standard deviation of the principal point about the image's centre, in its widths, where a single view can't tell;
-and that of the aspect about 1."""
+"""Standard deviation of the principal point about the image's centre, over the image's width, assumed where a single
+view can't determine it; and (next) that of the aspect about 1.
+"""
 ASSUMED_ASPECT = 1e-3
 
 
@@ -53,12 +54,12 @@ def calibrate(
     fixed: Fixed = MappingProxyType({}),
     near: LensSettings | None = None,
 ) -> IntrinsicsResult:
-    """A camera from views of a plane, all of one size; parameters named in ``fixed`` keep the value there, or with None
-    their start (the principal point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.
-    ``near``: a camera of this model to start from, where one is known.
+    """Calibrate a camera from views of a plane, all of one size.  Parameters named in ``fixed`` keep the value given
+    there, or with None their start (the principal point at the image's centre, coefficients 0); ``"aspect"`` ties
+    ``fy_px`` to ``fx_px``.  ``near``: a camera of this model to start from, if one is known.
 
     Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
-    no convergence, a focal length to be held at no value, or a lens that can't be meant.
+    no convergence, a focal length held without a value, or an implausible lens.
     """
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
@@ -90,7 +91,7 @@ def calibrate_best(
     step: Callable[[], None] = lambda: None,
 ) -> IntrinsicsResult:
     """The one of several models with the smallest information criterion (Schwarz, "Estimating the dimension of a
-    model", 1978); models that can't be fitted drop out, and :class:`CalibrationError` if all do.
+    model", 1978).  Models that can't be fitted are dropped; :class:`CalibrationError` if all fail.
     """
     best: IntrinsicsResult | None = None
     criterion: dict[str, float] = {}
@@ -113,15 +114,15 @@ def calibrate_best(
 def calibrate_single_view(
     sighting: Sighting, model: ModelName = "paper", *, fixed: Fixed = MappingProxyType({})
 ) -> IntrinsicsResult:
-    """Focal length, lens and the plate's pose from one view of a plane, principal point at the image's centre and
-    square pixels: what the self-viewing method's off-line step starts with (Tsai's single-view coplanar calibration).
+    """Focal length, lens and the plate's pose from one view of a plane, with the principal point at the image's centre
+    and square pixels: the start of the self-viewing method's off-line step (Tsai's single-view coplanar calibration).
 
-    That the principal point is there is assumed, to :data:`ASSUMED_CENTRE` and :data:`ASSUMED_ASPECT`; the covariances
-    contain what these do to the rest.  The plate must be tilted against the image, by 30 degrees or so: parallel to
-    it, focal length and distance are one unknown.  Raises :class:`CalibrationError` then.
+    The principal point is assumed to :data:`ASSUMED_CENTRE` and the aspect to :data:`ASSUMED_ASPECT`; the covariances
+    contain the effect of both on the rest.  The plate must be tilted against the image by about 30 degrees: if it is
+    parallel, focal length and distance can't be separated, and :class:`CalibrationError` is raised.
     """
     names = parameter_names(model)
-    # One view can't tell more of a lens than one number.
+    # One view determines only one number of a lens.
     fixed = {**dict.fromkeys(("cx_px", "cy_px", "aspect", *names[5:])), **fixed}
     result = calibrate([sighting], model, fixed=fixed)
     changes = _assumed(result, sighting, _free(model, frozenset(fixed))[1], fixed)
@@ -138,8 +139,8 @@ def calibrate_single_view(
 
 
 def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array, fixed: Fixed) -> list[tuple[Array, Array]]:
-    """What a standard deviation of each assumption changes: all parameters (k,) and the plate's pose (6,); what was
-    given isn't assumed.
+    """Effect of one standard deviation of each assumption: on all parameters (k,) and on the plate's pose (6,); values
+    that were given aren't assumptions.
     """
     lens_model = LensModel(result.model, *sighting.size_px)
     problem = BundleProblem(lens_model, [sighting], free)
@@ -169,8 +170,8 @@ def cross_validate(
     folds: int = 5,
     step: Callable[[], None] = lambda: None,
 ) -> float | None:
-    """Root mean square residual (px) of views that had no part in the calibration, which keep only a pose of their own
-    to fit; None with fewer than four views.
+    """Root mean square residual (px) of views that were left out of the calibration, with only their own pose fitted;
+    None with fewer than four views.
     """
     if len(sightings) < 4:
         return None
@@ -200,8 +201,9 @@ def cross_validate(
 def _supported(
     lens_model: LensModel, sightings: Sequence[Sighting], fixed: Fixed, near: LensSettings | None
 ) -> tuple[tuple[str, ...], Array, Bundle, tuple[str, ...]]:
-    """The fit with as many of the lens's terms as give one that can be meant all over the image: where no point lies,
-    the highest ones bend it at will.  Names of the free parameters, what they change, the fit, and what was held.
+    """The fit with as many of the lens's terms as give a plausible camera all over the image: where there are no
+    points, the highest terms are unconstrained.  Returns the names of the free parameters, their effect, the fit, and
+    what was held.
     """
     held: list[str] = []
     lens = [name for name in parameter_names(lens_model.name)[5:] if name not in fixed]
@@ -227,7 +229,7 @@ def _supported(
 
 
 def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Sighting], fixed: Fixed) -> Bundle:
-    """From the best of several focal lengths: the closed forms for them fail with strong lenses and single views."""
+    """Solve from the best of several focal lengths: closed forms for them fail with strong lenses and single views."""
     starts = []
     for share in FOCAL_STARTS.tolist():
         parameters = _start(lens_model, share * lens_model.width_px, fixed)
@@ -244,7 +246,7 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
         starts.append((cost, share, parameters, poses))
     if not starts:
         raise CalibrationError("no focal length fits the views; images of one camera and the right target")
-    # Where lens and focal length trade places the best start may lead astray: its neighbours get their chance.
+    # Where lens and focal length can trade off, the best start may mislead: try its neighbours, too.
     starts.sort(key=lambda start: start[:2])
     best: Bundle | None = None
     failure: CalibrationError | None = None
@@ -265,7 +267,7 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
 
 
 def _check_held(fixed: Fixed) -> None:
-    """Raise :class:`CalibrationError` for focal lengths that are to be held, but not at which value."""
+    """Raise :class:`CalibrationError` for focal lengths that are to be held without a value."""
     if "aspect" in fixed and fixed.get("fy_px") is not None:
         raise CalibrationError("fy_px can't be held at a value of its own with square pixels; fx_px, or without aspect")
     for name in ("fx_px", "fy_px"):
@@ -274,7 +276,7 @@ def _check_held(fixed: Fixed) -> None:
 
 
 def _start(lens_model: LensModel, focal_px: float, fixed: Fixed) -> Array:
-    """Parameters (k,) to start from, those that are held at their values."""
+    """Start parameters (k,), with held ones at their values."""
     values = {name: value for name, value in fixed.items() if value is not None}
     out = lens_model.without_distortion(values.get("fx_px", values.get("fy_px", focal_px)))
     for k, name in enumerate(parameter_names(lens_model.name)):
@@ -283,7 +285,7 @@ def _start(lens_model: LensModel, focal_px: float, fixed: Fixed) -> Array:
 
 
 def _free(model: ModelName, fixed: frozenset[str]) -> tuple[tuple[str, ...], Array]:
-    """Names of the free parameters, and what they change (k, p)."""
+    """Names of the free parameters, and their effect (k, p)."""
     names = parameter_names(model)
     unknown = fixed - set(names) - {"aspect"}
     if unknown:
@@ -318,8 +320,8 @@ def _one_size(sightings: Sequence[Sighting]) -> tuple[int, int]:
 
 
 def _bayes(bundle: Bundle, free: int) -> float:
-    """Bayes' criterion for normal errors of unknown size; coordinates count over all points, wrong ones at the cost of
-    an outlier's size, so that a model doesn't win by leaving points out.
+    """Bayesian information criterion for normal errors of unknown size.  All points count, outliers at the cost of an
+    outlier's size, so that a model doesn't win by leaving points out.
     """
     squares = 0.0
     count = 0
@@ -332,14 +334,14 @@ def _bayes(bundle: Bundle, free: int) -> float:
 
 
 DOUBTFUL_FOCAL = 0.01
-"""Relative standard deviation of the focal length from which a warning names it; and the one from which there is no
-calibration."""
+"""Relative standard deviation of the focal length above which there is a warning; and (next) no calibration."""
 USELESS_FOCAL = 0.2
 COVERED = 0.6
 """Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
 LARGE_RMS_SHARE = 0.0007
-"""Root mean square residual over the image's width from which a warning calls it large; and the one from which no
-camera of the model fits at all."""
+"""Root mean square residual over the image's width above which a warning calls it large; and (next) above which no
+camera of the model fits at all.
+"""
 LARGEST_RMS_SHARE = 0.003
 
 
@@ -347,9 +349,10 @@ LARGEST_RMS_SHARE = 0.003
 class IntrinsicsResult:
     """A calibrated camera.
 
-    ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; the rest was held fixed.  One a view:
+    ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; all others were held fixed.  One per view:
     ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
-    and ``used`` (n,).  ``criterion``: Bayes' information criterion of each model that was tried, the smallest is best.
+    and ``used`` (n,).  ``criterion``: Bayesian information criterion of each model that was tried, the smallest is
+    best.
     """
 
     model: ModelName
@@ -367,7 +370,7 @@ class IntrinsicsResult:
 
     @property
     def view_rms_px(self) -> tuple[float, ...]:
-        """Root mean square of each view's residuals that were used, u and v each."""
+        """Root mean square of each view's used residuals, u and v each."""
         return tuple(
             float(np.sqrt(np.mean(np.square(r[u])))) if u.any() else math.inf
             for r, u in zip(self.residuals_px, self.used, strict=True)
@@ -375,12 +378,12 @@ class IntrinsicsResult:
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters by name, those that were held, too."""
+        """All parameters by name, including those that were held."""
         return dict(zip(parameter_names(self.model), lens_vector(self.camera).tolist(), strict=True))
 
 
 def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
-    """Refuse what is not a calibration: :class:`CalibrationError`."""
+    """Reject a fit that is not a calibration: :class:`CalibrationError`."""
     if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
         raise CalibrationError(
             f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "
@@ -394,7 +397,7 @@ def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
 
 
 def doubts_of(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> tuple[str, ...]:
-    """What the views can't support; one line each."""
+    """What the views can't support, one line each."""
     return (*_parameters(result), *_views(result, sightings))
 
 

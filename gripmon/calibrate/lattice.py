@@ -1,7 +1,7 @@
-"""Points of an image on a square lattice seen in perspective; discs on one; and how noisy and how sharp an image is.
+"""Points of a square lattice in an image; discs on a lattice; and an image's noise and sharpness.
 
-A lattice is grown from a seed, point by point, by what the neighbours that are known already predict; so a part of a
-plate is enough, whatever lies on it, and lens distortion doesn't matter.
+A lattice is grown from a seed, point by point, by predictions from neighbours that are already known.  A part of a
+plate is therefore enough, whatever lies on it, and lens distortion doesn't matter.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from scipy.spatial import cKDTree
 from gripmon.model.records import Array, Image
 
 NEAR = 0.35
-"""A point is the one that was predicted if it lies within this part of the step; a fisheye's steps change that much."""
+"""Gate for a predicted point, in steps of the lattice: a fisheye's steps change that much."""
 SEEDS = 60
-"""How many starting points are tried."""
+"""Maximum number of seeds that are tried."""
 _NEIGHBOURS = 8
 _STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 Index = tuple[int, int]
 
 
 class Kin(Protocol):
-    """What points know of each other beyond where they are."""
+    """What points know about each other besides their positions."""
 
     def neighbours(self, a: int, b: int, step_px: Array) -> bool:
-        """Whether point b, which lies a step (2,) from a, can be the next one on the lattice."""
+        """Whether point b, a step (2,) from a, can be its neighbour on the lattice."""
 
     def basis(self, at: int, a_px: Array, b_px: Array) -> bool:
         """Whether two steps from a point can be those of a *square* lattice."""
 
 
 def find_lattice(points_px: Array, kin: Kin) -> dict[Index, int]:
-    """Lattice coordinates (column, row) -> index of the point, of the largest lattice among points (n, 2); x and y of
-    the lattice turn as those of the image do.  Empty if there is none of at least 3 x 3.
+    """Lattice coordinates (column, row) -> index of the point, for the largest lattice among points (n, 2); the
+    lattice's axes have the same handedness as the image's.  Empty if there is none of at least 3 x 3.
     """
     if len(points_px) < 9:
         return {}
@@ -66,8 +66,8 @@ def find_lattice(points_px: Array, kin: Kin) -> dict[Index, int]:
 
 
 def trimmed(lattice: dict[Index, int], columns: int, rows: int) -> dict[Index, int]:
-    """Without sparse outermost lines as long as it is larger than ``columns`` x ``rows``, either way round: those are
-    points beside the target that happen to lie well.
+    """Remove sparse outermost lines while the lattice is larger than ``columns`` x ``rows``, in either orientation:
+    those are points beside the target that fit by chance.
     """
     out = dict(lattice)
     while out:
@@ -100,7 +100,7 @@ def extent(lattice: dict[Index, int]) -> tuple[int, int]:
 
 
 def _bases(points: Array, tree: cKDTree, seed: int, kin: Kin) -> list[tuple[Array, Array]]:
-    """Pairs of steps from a point to neighbours that the opposite neighbours confirm; the shortest first."""
+    """Pairs of steps from a point to neighbours that the opposite neighbours confirm, the shortest first."""
     count = min(_NEIGHBOURS + 1, len(points))
     _, near = tree.query(points[seed], count)
     confirmed = []
@@ -148,7 +148,7 @@ def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], k
             taken.add(index)
             moved = local[at].copy()
             moved[axis] = sign * (points[index] - here)
-            # The other step changes slowly: the neighbour's, where it is known.
+            # The other step changes slowly: take the neighbour's where it is known.
             local[to] = _own_steps(points, found, to, moved)
             queue.append(to)
     return found
@@ -164,7 +164,7 @@ def _own_steps(points: Array, found: dict[Index, int], at: Index, otherwise: Arr
 
 
 def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
-    """Without points that lie off the middle of their neighbours on a line: what merely lay near the prediction."""
+    """Remove points that lie off the midpoint of two neighbours on a line: they met a prediction by chance."""
     out = dict(lattice)
     for at, index in lattice.items():
         for axis in (0, 1):
@@ -183,12 +183,12 @@ _TOP = 200.0
 _DIM = 100.0
 _SAMPLES = (33, 400)
 _EDGE = float(np.sqrt(2.0 * np.pi))
-"""Of a blurred edge, height over greatest slope is this times the blur's standard deviation."""
+"""For a blurred edge, height over greatest slope is this times the blur's standard deviation."""
 
 
 def to_grey(image: Image) -> Grey:
-    """Grey values up to about 255 of any image that a camera delivers: 8 bit as they are, dark ones brighter, 16 bit
-    (of which 10 or 12 may be in use) and float by what they hold.
+    """Grey levels up to about 255 for any camera image: 8 bit as they are unless dark, which are brightened; 16 bit (of
+    which 10 or 12 may be in use) and float scaled by their content.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     grey = np.nan_to_num(np.ascontiguousarray(grey, np.float32), posinf=0.0, neginf=0.0)
@@ -199,21 +199,21 @@ def to_grey(image: Image) -> Grey:
 
 
 def to_bytes(grey: Grey) -> NDArray[np.uint8]:
-    """As OpenCV's own detectors want it."""
+    """Bytes, as OpenCV's own detectors expect."""
     return np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
 
 
 def noise_of(grey: Grey) -> float:
-    """Standard deviation of the image's noise, robust against what it shows (Immerkaer, "Fast noise variance
-    estimation", 1996, with a median); at least that of rounding.
+    """Standard deviation of the image's noise, robust against its content (Immerkaer, "Fast noise variance estimation",
+    1996, with a median); at least that of rounding.
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return max(float(np.median(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)))) / (6.0 * 0.6745), 0.3)
 
 
 def edge_blur_px(grey: Grey, start: Array, end: Array) -> float:
-    """Standard deviation (px) of the blur of edges, one across each of the lines from ``start`` to ``end`` (n, 2): the
-    median; infinity if there are none.
+    """Median standard deviation (px) of the blur of edges, one across each of the lines from ``start`` to ``end`` (n,
+    2); infinity if there are none.
     """
     if not len(start):
         return float("inf")
@@ -223,7 +223,7 @@ def edge_blur_px(grey: Grey, start: Array, end: Array) -> float:
     where = (start[:, None] * (1.0 - share) + end[:, None] * share).astype(np.float32)
     levels = cv2.remap(grey, where[:, :, 0], where[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     spacing = length / (samples - 1)
-    # Over three samples: the noise of two alone would look like a slope.
+    # Over three samples: between two the noise would look like a slope.
     slope = np.abs(levels[:, 3:] - levels[:, :-3]).max(axis=1) / (3.0 * spacing)
     height = np.abs(levels[:, :4].mean(axis=1) - levels[:, -4:].mean(axis=1))
     return float(np.median(height / np.maximum(slope, 1e-6))) / _EDGE
@@ -241,25 +241,25 @@ def sharpest_blur_px(grey: Grey) -> float:
 
 
 SMALLEST_PX = 4.0
-"""Diameter."""
+"""Minimum diameter of a disc."""
 ROUND = 0.88
-"""Area of a blob over that of the ellipse with its moments, at least (and at most its inverse)."""
+"""Minimum area of a blob over that of the ellipse with the same moments (the maximum is its inverse)."""
 SLIMMEST = 0.2
 MOST = 4000
 LARGE_PX = 1600
-"""Images larger than this are searched at half their size."""
+"""Images larger than this are searched at half size."""
 SYSTEMATIC_PX = 0.02
-"""Of a centre, that no noise explains."""
+"""Standard deviation of a centre that noise doesn't explain."""
 ASYMMETRIC = 0.025
-"""Root mean square of what isn't symmetric about a disc's centre, over its contrast: something lies on it."""
+"""Largest root mean square asymmetry about a disc's centre, over its contrast: above it something covers the disc."""
 _BLOCKS = (32, 12, 5)
-"""Width of the image over that of the neighbourhood whose mean light is the threshold."""
+"""Width of the image over that of the neighbourhood whose mean level is the threshold."""
 _LATTICES = 3
 
 
 @dataclass(frozen=True)
 class Disc:
-    """A blob's centre (2,), the covariance (2, 2) of its area, and whether it is darker than what is around it."""
+    """A blob's centre (2,), the covariance (2, 2) of its area, and whether it is darker than its surroundings."""
 
     centre_px: Array
     spread_px2: Array
@@ -268,7 +268,7 @@ class Disc:
 
 @dataclass(frozen=True)
 class _Metric:
-    """A disc's own shape tells how long the steps of its lattice must look, and that they are square."""
+    """A disc's own shape predicts the apparent length of the lattice's steps, and whether they are square."""
 
     roots: Array
     expected: float
@@ -284,8 +284,8 @@ class _Metric:
 
 
 def find_discs(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) -> list[dict[Index, Disc]]:
-    """Lattices of discs (column, row) -> disc: the largest that fits into ``columns`` x ``rows``, either way round, or
-    else what was found instead; empty if there is none.
+    """Lattices of discs (column, row) -> disc: the largest that fits into ``columns`` x ``rows``, in either
+    orientation, or otherwise the largest that was found; empty if there is none.
     """
     if max(grey.shape) > LARGE_PX:
         half: Grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
@@ -305,7 +305,7 @@ def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) ->
     seen: dict[bool, tuple[Array, Array]] = {dark: (np.zeros((0, 2)), np.zeros((0, 2, 2))) for dark in (True, False)}
     for part in _BLOCKS:
         for dark in (True, False):
-            # Discs of all sizes together: in a strong lens some are much larger than others.
+            # Discs of all sizes together: with a strong lens some are much larger than others.
             centres, spreads = seen[dark] = _united(seen[dark], _blobs(shown, grey.shape[1] // part, dark))
             for _ in range(_LATTICES):
                 metric = _Metric(_inverse_roots(spreads), 4.0 * spacing_per_diameter)
@@ -327,7 +327,7 @@ def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) ->
 
 
 def _united(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Both, but of the second what isn't among the first."""
+    """All of the first, and those of the second that aren't among the first."""
     if not len(first[0]) or not len(second[0]):
         return second if len(second[0]) else first
     distance, nearest = cKDTree(first[0]).query(second[0])
@@ -380,8 +380,8 @@ def _blobs(shown: NDArray[np.uint8], block_px: int, dark: bool) -> tuple[Array, 
 
 
 def refined(grey: Grey, disc: Disc, noise: float) -> tuple[Array, Array] | None:
-    """Centre (2,) of a disc's missing (or extra) light, with its covariance (2, 2): no threshold biases it, and every
-    pixel of the rim counts by how much of it is covered.  None if it is hardly to be seen, or not all of it.
+    """Centroid (2,) of a disc's missing (or extra) light, with its covariance (2, 2): no threshold biases it, and every
+    pixel of the rim counts by its coverage.  None if the disc is hardly visible, or not completely.
     """
     centre, spread = disc.centre_px, disc.spread_px2
     half = np.ceil(2.0 * np.sqrt(spread.diagonal()) * 1.35 + 2.0).astype(int)
@@ -398,11 +398,11 @@ def refined(grey: Grey, disc: Disc, noise: float) -> tuple[Array, Array] | None:
     core = radius < max(1.0 - 2.0 * pixel, 0.4)
     if ring.sum() < 8 or not core.any():
         return None
-    # The light around it may slope.
+    # The surrounding light may have a gradient.
     design = np.column_stack([np.ones(int(ring.sum())), offset[ring]])
     plane, *_ = np.linalg.lstsq(design, patch[ring], rcond=None)
     around = plane[0] + offset @ plane[1:]
-    # As if it were lit evenly: else the brighter side would weigh more.
+    # Normalise to even light: otherwise the brighter side would weigh more.
     light = np.maximum(around, 0.3 * plane[0]) / plane[0] if plane[0] > 10.0 * noise else 1.0
     depth = ((around - patch) if disc.dark else (patch - around)) / light
     contrast = float(np.median(depth[core]))
@@ -418,7 +418,7 @@ def refined(grey: Grey, disc: Disc, noise: float) -> tuple[Array, Array] | None:
 
 
 def _asymmetry(grey: Grey, centre: Array, offsets: Array, noise: float) -> float:
-    """Root mean square of what isn't symmetric about a point, beyond noise and a slope of the light."""
+    """Root mean square of the asymmetric part about a point, beyond noise and a light gradient."""
     sides = [(centre + sign * offsets).astype(np.float32)[None] for sign in (1.0, -1.0)]
     a, b = (cv2.remap(grey, s[:, :, 0], s[:, :, 1], cv2.INTER_LINEAR)[0].astype(np.float64) for s in sides)
     odd = 0.5 * (a - b)

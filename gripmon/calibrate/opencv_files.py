@@ -1,4 +1,4 @@
-"""OpenCV: what its calibration programs write with ``cv2.FileStorage``, as YAML, XML or JSON."""
+"""OpenCV: files that its calibration programs write with ``cv2.FileStorage``, as YAML, XML or JSON."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from gripmon.calibrate.formats import FileValues, InterchangeError
 from gripmon.model.camera import LensSettings
 
 _OPENCV = "a file that cv2.FileStorage wrote: camera_matrix, distortion_coefficients, image_width, image_height"
-# What OpenCV's samples write, its interactive calibration, and older programs.
+# The names in OpenCV's samples, its interactive calibration, and older programs.
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix")
 _COEFFICIENTS = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients")
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 _SIZE = ("cameraResolution", "image_size", "imageSize")
 DEEPEST = 64
-"""Levels of nesting: what OpenCV writes has four at most, and its reader's stack is full after some 10,000."""
+"""Levels of nesting: OpenCV writes at most four, and its reader overflows the stack at some 10,000."""
 _TAG = re.compile(rb"</|/>|<(?=[A-Za-z_])")
 _BRACKET = re.compile(rb"[][{}]")
 _TEXT = re.compile(rb'"[^"\n]*"|<!--.*?-->', re.DOTALL)
 _INTRODUCER = re.compile(rb"(?:^|(?<=\s))-(?=\s)|:(?=\s|$)")
-_WIDEST_INDENT = 16  # blanks that one level is indented by at most in what OpenCV writes
+_WIDEST_INDENT = 16  # blanks that OpenCV writes to indent one level, at most
 SYNTAXES = {
     ".yaml": cv2.FileStorage_FORMAT_YAML, ".yml": cv2.FileStorage_FORMAT_YAML,
     ".xml": cv2.FileStorage_FORMAT_XML, ".json": cv2.FileStorage_FORMAT_JSON,
@@ -34,8 +34,8 @@ SYNTAXES = {
 def read_opencv(
     data: bytes, file: str, size_px: tuple[int, int] | None = None, is_fisheye: bool | None = None
 ) -> LensSettings:
-    """What ``cv2.FileStorage`` wrote as YAML, XML or JSON; ``size_px`` and ``is_fisheye`` where the file doesn't tell:
-    a fisheye is one by ``fisheye_model: 1``, and a count of four tells nothing of it.
+    """Read a file that ``cv2.FileStorage`` wrote as YAML, XML or JSON; ``size_px`` and ``is_fisheye`` for files that
+    omit them: ``fisheye_model: 1`` marks a fisheye, but four coefficients don't.
     """
     if nesting(data) > DEEPEST:
         raise InterchangeError(file, "", f"is nested more than {DEEPEST} levels deep", _OPENCV)
@@ -61,16 +61,16 @@ def read_opencv(
 
 
 def nesting(data: bytes) -> int:
-    """No fewer levels than OpenCV will find, whatever the bytes are: it recurses at each, until the stack is full."""
+    """An upper bound of the nesting levels that OpenCV will find: it recurses at each, until the stack overflows."""
     xml = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     signs, opening = (_TAG, (b"<",)) if xml else (_BRACKET, (b"[", b"{"))
-    # Closing signs in texts and comments must not make up for those that open.
+    # Closing signs in texts and comments must not cancel opening ones.
     deepest = max(_depth(signs.findall(each), opening) for each in (data, _TEXT.sub(b"", data)))
     return deepest if xml else deepest + max((_introducers(line) for line in data.splitlines()), default=0)
 
 
 def _depth(signs: list[bytes], opening: tuple[bytes, ...]) -> int:
-    """The most that are open at a time."""
+    """The largest number that is open at a time."""
     deepest = depth = 0
     for sign in signs:
         depth = depth + 1 if sign.startswith(opening) and sign != b"</" else max(depth - 1, 0)
@@ -79,13 +79,13 @@ def _depth(signs: list[bytes], opening: tuple[bytes, ...]) -> int:
 
 
 def _introducers(line: bytes) -> int:
-    """What may nest on one line of YAML without brackets, ``- - a: b:``, and its indentation in levels."""
+    """The possible nesting on one line of YAML without brackets, ``- - a: b:``, plus its indentation in levels."""
     block = _BRACKET.split(line, maxsplit=1)[0]
     return len(_INTRODUCER.findall(block)) + (len(line) - len(line.lstrip(b" "))) // _WIDEST_INDENT
 
 
 def _first(values: FileValues, keys: tuple[str, ...]) -> str:
-    """The one of several names that the file uses."""
+    """The first of several names that the file uses."""
     key = next((k for k in keys if k in values.content), None)
     if key is None:
         raise values.fault(keys[0], "is missing")
@@ -109,7 +109,7 @@ def _size(values: FileValues, given: tuple[int, int] | None) -> tuple[int, int]:
 
 
 def _plain(node: cv2.FileNode) -> Any:
-    """A number, a text, or the numbers of a matrix or a list in order, empty if they are something else."""
+    """A number, a text, or the numbers of a matrix or a list in order; empty for anything else."""
     if node.isMap():
         try:
             matrix = node.mat()
@@ -122,10 +122,10 @@ def _plain(node: cv2.FileNode) -> Any:
 
 
 def write_opencv(camera: LensSettings, notes: Sequence[str], name: str, suffix: str = ".yaml") -> bytes:
-    """In the syntax that ``suffix`` is of."""
+    """Write in the syntax that belongs to ``suffix``."""
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | SYNTAXES[suffix])
     if suffix == ".json":
-        # JSON knows no comments, and OpenCV writes some: other readers would stumble.  So they do over \'.
+        # JSON has no comments, but OpenCV writes some, which other readers reject.  They also reject \'.
         storage.write("notes", " | ".join(notes).replace("'", ""))
     else:
         for note in notes:

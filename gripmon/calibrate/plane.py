@@ -1,8 +1,8 @@
-"""``cam_T_grip`` from images of the gripper standing on a calibration plate, with what every error does to it.
+"""``cam_T_grip`` from images of the gripper standing on a calibration plate, with the effect of every error on it.
 
-The method's equations stand in :mod:`gripmon.calibrate.plane_equations`; here are one image with its covariance, and
-several images together.  Errors are carried through the whole solution by central differences, one independent error
-at a time: of the plate's pose, of the corners, and of the camera.
+The method's equations are in :mod:`gripmon.calibrate.plane_equations`; this module handles one image with its
+covariance.  Errors are propagated through the whole solution by central differences, one independent error at a time:
+of the plate's pose, of the corners, and of the camera.
 """
 
 from __future__ import annotations
@@ -30,19 +30,20 @@ from gripmon.model.records import Array
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, count as contradicting their uncertainty."""
 IMPOSSIBLE, MISSHAPEN = 1e-6, 0.005
-"""An inferred gripper's corners are no rectangle if they are improbable as one and leave it by more than this part of
-their reach: so much less than that fingers may be out of line."""
+"""An inferred gripper's corners are not a rectangle if they are less probable than the first and deviate by more than
+the second, a fraction of their reach: fingers may be misaligned by less.
+"""
 LARGEST_RMS_SHARE = 0.005
-"""Root mean square residual of the plate's points over the image's width beyond which they aren't explained at all."""
+"""Root mean square residual of the plate's points, over the image's width, above which they count as unexplained."""
 _STEP = 0.05
-"""Reach of the central differences, in standard deviations."""
+"""Step of the central differences, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class FingerCorners:
     """Measured corners of the gripper in one image: ``names`` (c), ``uv_px`` (c, 2), and ``covariance_px`` (2c, 2c) of
-    u and v of the first, then of the next: corners at both ends of an edge err together.  ``free``: the pose of the
-    whole gripper by all its edges, if it is known that well.
+    u and v of the first, then of the next: errors of corners at both ends of an edge are correlated.  ``free``: the
+    pose of the whole gripper from all its edges, if it is known that well.
     """
 
     names: tuple[str, ...]
@@ -52,7 +53,7 @@ class FingerCorners:
 
     @classmethod
     def independent(cls, names: Sequence[str], uv_px: Array, covariance_px: Array) -> FingerCorners:
-        """With a covariance (c, 2, 2) each."""
+        """From independent covariances (c, 2, 2)."""
         return cls(tuple(names), uv_px, block_diag(*covariance_px) if len(covariance_px) else np.zeros((0, 0)))
 
     @property
@@ -65,8 +66,8 @@ class FingerCorners:
 
 @dataclass(frozen=True, slots=True)
 class KnownCorners:
-    """The gripper's own coordinates (c, 3) of the corners at the images' jaw opening, and where along z its contact
-    plane is (0 where the TCP lies between the fingertips).
+    """The gripper's own coordinates (c, 3) of the corners at the images' jaw opening, and the z of its contact plane (0
+    if the TCP lies between the fingertips).
     """
 
     corners_m: Array
@@ -75,23 +76,23 @@ class KnownCorners:
 
 @dataclass(frozen=True, slots=True)
 class Coincidence:
-    """What one image on the plate tells.
+    """The result of one image on the plate.
 
     ``cam_T_grip`` (4, 4); ``corners_m`` (c, 3) the gripper's corners, given or inferred.  ``own``, ``printed`` and
-    ``common`` (6 + s, k) say what each of k independent errors, in its standard deviations, does to position of the TCP
-    and rotation (camera axes) and to the s lengths that were inferred: ``own`` those of this image alone, ``printed``
-    those of the plate's print, which come into every image but into each in another way, ``common`` those of the
-    camera, the same errors in all images.  ``covariance`` (6, 6) follows.
+    ``common`` (6 + s, k) are the effects of k independent errors, per standard deviation, on the TCP's position and the
+    rotation (camera axes) and on the s inferred lengths: ``own`` of this image alone; ``printed`` of the plate's print,
+    which affects every image in a different way; ``common`` of the camera, the same errors in all images.
+    ``covariance`` (6, 6) follows from these.
 
     ``residuals_m`` (c, 2) on the plate, gripper axes, ``residuals_px`` (c, 2) measured less predicted; ``p_value``: the
-    probability of residuals as large by chance, 1 where nothing is left over to test (two known corners leave one
-    equation, four inferred ones three).  Below :data:`DOUBTED` the corners' part of the errors is ``enlarged`` by as
-    much as the residuals exceed theirs.
+    probability of residuals as large by chance, 1 if there is nothing left to test (two known corners leave one
+    equation, four inferred ones three).  Below :data:`DOUBTED` the corners' part of the errors is ``enlarged`` by the
+    ratio of the residuals to their expected size.
 
-    ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above the plate) by which the gripper, its
-    pose found without the plate, leaves it, with ``apart_covariance`` (3, 3) and ``apart_p``: by all its edges
-    (``corners.free``), or else by the corners; None where fewer than four known ones can't tell.  ``plate_xy_m`` (c,
-    2): the corners in the plate's frame.
+    ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above the plate): how far the gripper, its
+    pose found without the plate, leaves the plate, with ``apart_covariance`` (3, 3) and ``apart_p``.  They come from
+    all its edges (``corners.free``), otherwise from the corners; None with fewer than four known ones.  ``plate_xy_m``
+    (c, 2): the corners in the plate's frame.
     """
 
     sighting: Sighting
@@ -130,9 +131,9 @@ def calibrate_plane(
 ) -> Coincidence:
     """``cam_T_grip`` from one image of the plate with the gripper on it.
 
-    Without ``known`` corners the gripper is inferred: the first four of ``corners`` then are the innermost ones, in the
-    order (first finger, y < 0), (first, y > 0), (second, y < 0), (second, y > 0), the second finger on the side of +x,
-    and all are contact points.  Raises :class:`CalibrationError`.
+    Without ``known`` corners the gripper is inferred: the first four of ``corners`` must then be the innermost ones, in
+    the order (first finger, y < 0), (first, y > 0), (second, y < 0), (second, y > 0), the second finger on the side of
+    +x, and all corners are contact points.  Raises :class:`CalibrationError`.
     """
     _check_count(corners, known)
     cam_T_plate, plate_covariance, bundle = _plate(camera.lens, sighting)
@@ -140,7 +141,7 @@ def calibrate_plane(
     given = _Given(made, cam_T_plate, corners.uv_px)
     solve = _solver(made, corners, known)
     found = solve(given)
-    # Residuals beyond what their covariances say are the print's: the same plate brings them into every image.
+    # Residuals beyond their covariances are attributed to the print, which the same plate brings into every image.
     print_share = 1.0 - 1.0 / max(bundle.scale, 1.0) ** 2
 
     def other_plate(change: Array) -> _Given:
@@ -150,7 +151,7 @@ def calibrate_plane(
         return replace(given, uv_px=given.uv_px + change.reshape(-1, 2))
 
     def other_camera(change: Array) -> _Given:
-        # The plate's pose follows: with another camera the same image shows the plate elsewhere.
+        # The plate's pose follows the camera: with another camera the same image shows the plate elsewhere.
         lens = camera.model.settings(lens_vector(camera.lens) + camera.free @ change)
         seen_by = camera.model.camera(lens_vector(lens))
         return replace(given, camera=seen_by, cam_T_plate=plate_pose(lens, sighting)[0])
@@ -194,7 +195,7 @@ def calibrate_plane(
 
 
 def _plate(lens: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
-    """``cam_T_plate``, its covariance (6, 6) and how it was found.  Raises :class:`CalibrationError`."""
+    """``cam_T_plate``, its covariance (6, 6) and the fit that it comes from.  Raises :class:`CalibrationError`."""
     cam_T_plate, covariance, bundle = plate_pose(lens, sighting)
     if bundle.rms_px > LARGEST_RMS_SHARE * lens.width_px:
         raise CalibrationError(
@@ -202,14 +203,14 @@ def _plate(lens: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle
             "and the target as it is"
         )
     if sighting.disc_radius_m == 0.0 and bundle.scale < 1.0:
-        # Errors that a board's corners share go into the pose, not into its residuals: these don't make it surer than
-        # the corners' own uncertainties do.
+        # Errors shared by a board's corners affect the pose, not its residuals: small residuals must not reduce the
+        # covariance below that of the corners' own uncertainties.
         covariance = covariance / bundle.scale**2
     return cam_T_plate, covariance, bundle
 
 
 def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], Standing]:
-    """The gripper's place from what a solution rests on; ``made`` is the camera as calibrated."""
+    """A function from a solution's inputs to the gripper's pose on the plate; ``made`` is the camera as calibrated."""
     each_px2, free = corners.each_px2, corners.free if known is not None else None
     known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
 
@@ -224,7 +225,7 @@ def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) ->
 
 
 def _misfit(found: Standing) -> float:
-    """Of the innermost corners, over their reach."""
+    """Misfit of the innermost corners, over their reach."""
     left, reach = found.residuals_m[:INFERRED_FROM], found.corners_m[:INFERRED_FROM, :2]
     return float(np.linalg.norm(left) / np.linalg.norm(reach))
 
@@ -240,25 +241,25 @@ def _no_rectangle(names: Sequence[str], residuals_m: Array, p_value: float) -> s
 
 
 def lengths_of(corners_m: Array) -> Array:
-    """What describes an inferred gripper (s,): the rectangle's sides, then x and y of each further corner (m)."""
+    """Parameters of an inferred gripper (s,): the rectangle's sides, then x and y of each further corner (m)."""
     return np.concatenate([2.0 * corners_m[3, :2], corners_m[INFERRED_FROM:, :2].ravel()])
 
 
 def corners_of(lengths: Array) -> Array:
-    """The inverse: corners (c, 3), m."""
+    """The inverse of :func:`lengths_of`: corners (c, 3), m."""
     x, y = 0.5 * lengths[:2]
     xy = np.concatenate([[[-x, -y], [-x, y], [x, -y], [x, y]], lengths[2:].reshape(-1, 2)])
     return np.concatenate([xy, np.zeros((len(xy), 1))], axis=1)
 
 
 def chance(values: Array, covariance: Array) -> float:
-    """Probability of values as large by their (perhaps singular) covariance; 1 where nothing is free."""
+    """Probability of values as large, given their (possibly singular) covariance; 1 if nothing is free."""
     size, freedom = _size(values, covariance)
     return float(chdtrc(freedom, size)) if freedom else 1.0
 
 
 def _size(values: Array, covariance: Array) -> tuple[float, int]:
-    """Weighted squares, and how many values are free."""
+    """Normalised square, and the number of degrees of freedom."""
     variances, axes = np.linalg.eigh(covariance)
     free = variances > 1e-6 * max(float(variances.max()), 1e-300)
     return float((np.square(axes.T[free] @ values) / variances[free]).sum()), int(free.sum())
@@ -275,7 +276,7 @@ def _check_count(corners: FingerCorners, known: KnownCorners | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """What a solution rests on."""
+    """The inputs of a solution."""
 
     camera: Camera
     cam_T_plate: Array
@@ -283,13 +284,13 @@ class _Given:
 
 
 def _ends(changed: Callable[[Array], _Given], covariance: Array) -> list[tuple[_Given, _Given]]:
-    """What a solution rests on at both ends of a central difference, for each of a covariance's independent errors."""
+    """The inputs of a solution at both ends of a central difference, for each of a covariance's independent errors."""
     return [(changed(_STEP * root), changed(-_STEP * root)) for root in independent_errors(covariance)]
 
 
 def _slope(up: Standing, down: Standing) -> tuple[Array, Array, Array]:
-    """Derivatives by one independent error, in its standard deviations: of pose and inferred lengths (6 + s,), of the
-    residuals (2c,), of what lies apart (3,).
+    """Derivatives by one independent error, per standard deviation: of pose and inferred lengths (6 + s,), of the
+    residuals (2c,), of tilt and gap (3,).
     """
     per = 1.0 / (2.0 * _STEP)
     motion = perturbation_between(down.cam_T_grip, up.cam_T_grip)

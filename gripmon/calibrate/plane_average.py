@@ -1,4 +1,4 @@
-"""Several images of a gripper on a calibration plate together, and what a person should know of them."""
+"""The joint result of several images of a gripper on a calibration plate, and warnings about them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array
 
 BESIDE_STEPS = 2.0
-"""Steps of the pattern beyond the points that were seen from which a corner counts as off the plate."""
+"""Distance beyond the visible points, in steps of the pattern, from which a corner counts as off the plate."""
 VAGUE_M = 1.5e-5
-"""Standard deviation of the TCP beyond which one image of an inferred gripper is reported as vague."""
+"""Standard deviation of the TCP above which one image of an inferred gripper is reported as vague."""
 OTHER_WAY_RAD = np.pi / 2.0
-"""No rough calibration is off by as much."""
+"""Largest difference of rotation from a rough calibration (rad): none is off by as much."""
 _ROUNDS = 3
 
 
@@ -28,7 +28,7 @@ _ROUNDS = 3
 class PlaneCalibration:
     """``cam_T_grip`` (4, 4) from all images, with ``covariance`` (6, 6) as in :class:`Coincidence`; ``corners_m`` (c,
     3) with ``lengths_covariance`` (s, s) of what was inferred (see :func:`lengths_of`; s = 0 for a known gripper).
-    ``consistency_p``: probability of images that differ as much; None of one.  ``warnings``: what to doubt, in words.
+    ``consistency_p``: probability of images that differ as much; None for one image.  ``warnings``: doubts, in words.
     """
 
     cam_T_grip: Array
@@ -53,12 +53,12 @@ class PlaneCalibration:
 def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     """The weighted mean of all images on the manifold, pose and inferred lengths jointly.
 
-    Weights are the images' covariances less the camera's part; what the camera, or the plate's print, is off by comes
-    into all of them and isn't taken to average out.  (Weights that left the print out, too, would turn its error along
-    the line of sight, which is large, into errors across it that differ from image to image.)  Where the images differ
-    by more than their covariances allow, the mean's is enlarged by as much (Birge, "The calculation of errors by the
-    method of least squares", 1932), which is a warning.  :class:`CalibrationError` for inferred grippers of different
-    corners.
+    Weights are the inverse of the images' covariances without the camera's part; errors of the camera, or of the
+    plate's print, affect all images and aren't assumed to average out.  (Weights that omitted the print, too, would
+    turn its large error along the line of sight into errors across it that differ between images.)  If the images
+    differ by more than their covariances allow, the mean's covariance is enlarged accordingly (Birge, "The calculation
+    of errors by the method of least squares", 1932), with a warning.  :class:`CalibrationError` for inferred grippers
+    with different corners.
     """
     if inferred and len({i.corners.names for i in images}) > 1:
         raise CalibrationError("the images show different corners; for a gripper that is inferred the same in all")
@@ -99,7 +99,7 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
 
 
 def against(cam_T_grip: Array, rough_cam_T_grip: Array) -> str | None:
-    """What is wrong with a calibration beside a rough one that is known, in words."""
+    """What is wrong with a calibration compared with a known rough one, in words; None if nothing is."""
     turned = float(np.linalg.norm(perturbation_between(rough_cam_T_grip, cam_T_grip)[3:]))
     if turned <= OTHER_WAY_RAD:
         return None
@@ -110,17 +110,19 @@ def against(cam_T_grip: Array, rough_cam_T_grip: Array) -> str | None:
 
 
 def _away(image: Coincidence, cam_T_grip: Array, lengths: Array) -> Array:
-    """(6 + s,) from a pose and lengths to those of an image."""
+    """(6 + s,) difference from a pose and lengths to those of an image."""
     pose = perturbation_between(cam_T_grip, image.cam_T_grip)
     return np.concatenate([pose, lengths_of(image.corners_m) - lengths]) if len(lengths) else pose
 
 
 def _of_print(slopes: Sequence[Array]) -> Array:
-    """A covariance (6 + s, 6 + s) that holds however the images' errors by the print, each (6 + s, k), go together.
+    """A covariance (6 + s, 6 + s) that bounds the images' errors due to the print, each (6 + s, k), whatever their
+    correlation.
 
-    Which of the print's errors an image shows, and how they turn into the pose's, depends on where the plate lies in
-    it.  For weights w that sum to one the sum of C / w over the images is never below the covariance of the errors' sum
-    (Cauchy-Schwarz); with w in proportion to their sizes it is also the smallest such, and equal images are worth one.
+    Which of the print's errors an image shows, and how they affect the pose, depends on where the plate lies in it.
+    For weights w that sum to one, the sum of C / w over the images is never below the covariance of the sum of the
+    errors (Cauchy-Schwarz); with w proportional to their sizes it is also the smallest such sum, and equal images count
+    as one.
     """
     parts = [slope @ slope.T for slope in slopes]
     scale = np.maximum(np.sum(parts, axis=0).diagonal(), 1e-300)
@@ -131,7 +133,7 @@ def _of_print(slopes: Sequence[Array]) -> Array:
 
 
 def _inverse(covariance: Array) -> Array:
-    """Of a matrix whose rows have different units; one direction may be known far better than another."""
+    """Inverse of a matrix whose rows have different units; one direction may be known far better than another."""
     scale = np.sqrt(covariance.diagonal())
     return np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
 
@@ -145,7 +147,7 @@ def _of_images(images: Sequence[Coincidence], inferred: bool) -> list[str]:
 
 
 def doubts(image: Coincidence, inferred: bool) -> list[str]:
-    """What of one image is to be doubted, in words."""
+    """Doubts about one image, in words."""
     out = []
     names = image.corners.names
     if len(names) == FEWEST_CORNERS:
@@ -187,7 +189,7 @@ def _apart_text(image: Coincidence) -> str:
 
 
 def _beside(sighting: Sighting, plate_xy_m: Array) -> list[bool]:
-    """Which points lie clearly beside the pattern that is seen."""
+    """Which points lie clearly outside the visible pattern."""
     seen = sighting.plate_m[:, :2]
     apart = np.linalg.norm(seen[:, None] - seen[None], axis=2)
     np.fill_diagonal(apart, np.inf)

@@ -6,12 +6,12 @@ The contact plane of the fingertips is the plate's x-y plane (self-viewing metho
     plate_T_grip = [[q1, -q2, 0, sx], [q2, q1, 0, sy], [0, 0, 1, -h], [0, 0, 0, 1]]   (6)
     q1² + q2² = 1                                                                  (7)
 
-with both z axes into the plate.  h is the height of the contact plane in the gripper's frame; the paper's, 0, if its
-origin lies between the fingertips.
+with both z axes into the plate.  h is the height of the contact plane in the gripper's frame; it is 0 in the paper,
+whose origin lies between the fingertips.
 
-Beside it a gripper's pose from all edges of it that an image shows, no plate considered, and how it stands off the
-plate then.  Edges that rise from the contact plane tell tilts several times better than corners in it: a plane that is
-tilted a little looks nearly the same, a finger that leans doesn't.
+In addition: the gripper's pose from all its visible edges without the plate, and how far that pose leaves the plate.
+Edges that rise from the contact plane determine tilts several times better than corners in it: a slightly tilted plane
+looks nearly the same, a leaning finger doesn't.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from gripmon.model.records import Array
 FEWEST_CORNERS = 2
 INFERRED_FROM = 4
 LARGEST_MISFIT = 0.1
-"""Part of the corners' spread up to which residuals still mean inaccuracy, not another gripper."""
+"""Residuals, over the corners' spread, above which they mean another gripper and not inaccuracy."""
 SMALLEST_SPREAD_M = 1e-5
 NO_RECTANGLE = "the innermost corners are no rectangle; two corners on each of two parallel fingertips, by their names"
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-"""Of x and y of the innermost corners."""
+"""Signs of x and y of the innermost corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
     """A gripper on a plate: ``corners_m`` (c, 3), given or inferred, ``residuals_m`` (c, 2) on the plate in the
-    gripper's axes, ``apart`` (3,): tilt about the gripper's x and y (rad) and gap (m, the gripper nearer to the camera
-    than the plate) with which the corners are best explained without the plate; None where it can't be told.
+    gripper's axes, ``apart`` (3,): tilt about the gripper's x and y (rad) and gap (m, positive if the gripper is nearer
+    to the camera than the plate) of the pose that explains the corners best without the plate; None if undetermined.
     """
 
     cam_T_grip: Array
@@ -57,9 +57,9 @@ def stand(
     corners_m: Array | None,
     contact_m: float = 0.0,
 ) -> Standing:
-    """All steps for one image: ``uv_px`` (c, 2) with ``covariance_px`` (c, 2, 2), which weighs; the gripper's
-    ``corners_m`` (c, 3), whose contact plane lies at z = ``contact_m``, or None to infer them (see
-    :func:`infer_rectangle`; all are contact points then).  Raises :class:`CalibrationError`.
+    """All steps for one image: ``uv_px`` (c, 2) weighted by ``covariance_px`` (c, 2, 2); the gripper's ``corners_m``
+    (c, 3), whose contact plane lies at z = ``contact_m``, or None to infer them (see :func:`infer_rectangle`; then all
+    are contact points).  Raises :class:`CalibrationError`.
     """
     xy, slopes = camera.undistort_with_jacobian(uv_px)
     if not np.isfinite(xy).all():
@@ -74,7 +74,7 @@ def stand(
         q, shift, sides = _refine(*inner, start[:2], start[2:], sides)
         known = np.concatenate([(plate_xy - shift) @ _turn(q), np.zeros((len(xy), 1))], axis=1)
         rectangle = 0.5 * _SIGNS * sides
-        residuals = np.zeros((len(xy), 2))  # what lies outside the rectangle is as it shows
+        residuals = np.zeros((len(xy), 2))  # corners outside the rectangle are taken as measured
         residuals[:INFERRED_FROM] = known[:INFERRED_FROM, :2] - rectangle
         known[:INFERRED_FROM, :2] = rectangle
         if _spread(residuals[:INFERRED_FROM]) > LARGEST_MISFIT * _spread(rectangle):
@@ -93,13 +93,13 @@ def stand(
 
 
 def back_project(cam_T_plate: Array, xy: Array, z_plate_m: Array) -> Array:
-    """Points (c, 2) of the plate's frame at the heights ``z_plate_m`` (c,) that ideal image points ``xy`` (c, 2) show.
+    """Points (c, 2) of the plate's frame at the heights ``z_plate_m`` (c,) seen at ideal image points ``xy`` (c, 2).
 
     Equation (8), with r the rotation and t the translation of ``cam_T_plate``, X/f = x, Y/f = y:
 
         [r11 r12 -x; r21 r22 -y; r31 r32 -1] [x_W y_W z_C]ᵀ = -[t1 + r13 z_W; t2 + r23 z_W; t3 + r33 z_W]
 
-    Raises :class:`CalibrationError` where a line of sight runs along the plate.
+    Raises :class:`CalibrationError` if a line of sight runs along the plate.
     """
     count = len(xy)
     matrix = np.empty((count, 3, 3))
@@ -134,12 +134,12 @@ def coincide_linear(corners_m: Array, plate_xy_m: Array) -> tuple[Array, Array]:
     if length < 1e-6:
         raise CalibrationError("the corners don't fit the gripper at all (mirrored, or named wrongly?)")
     q = solution[:2] / length
-    # With unit length the best shift is another one: the centres coincide.
+    # Normalising changes the best shift: it makes the centroids coincide.
     return q, (plate_xy_m - corners_m[:, :2] @ _turn(q).T).mean(axis=0)
 
 
 def _check_shape(corners_m: Array, plate_xy: Array, q: Array, shift: Array) -> None:
-    """Refuse corners that aren't this gripper's, with what they may be instead."""
+    """Reject corners that aren't this gripper's, with what they may be instead."""
     spread = _spread(corners_m[:, :2])
     misfit = _spread(plate_xy - shift - corners_m[:, :2] @ _turn(q).T)
     if misfit <= LARGEST_MISFIT * spread:
@@ -157,15 +157,16 @@ def _check_shape(corners_m: Array, plate_xy: Array, q: Array, shift: Array) -> N
 
 
 def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
-    """Sides (2,) along x and y, and ``(q1, q2, sx, sy)``, of the rectangle whose corners the first four points are, in
-    the order of :func:`calibrate_plane`; by means of opposite sides.  :class:`CalibrationError` for what is none.
+    """Sides (2,) along x and y, and ``(q1, q2, sx, sy)``, of the rectangle whose corners are the first four points, in
+    the order of :func:`calibrate_plane`; from means of opposite sides.  :class:`CalibrationError` if it isn't a
+    rectangle.
     """
     a, b, c, d = plate_xy_m[:INFERRED_FROM]
     across, along = 0.5 * ((c - a) + (d - b)), 0.5 * ((b - a) + (d - c))
     sides = np.array([np.hypot(*across), np.hypot(*along)])
     if sides.min() < 1e-4:
         raise CalibrationError("the innermost corners coincide, or have each other's names; two on each finger")
-    # With z into the plate, y lies a quarter turn clockwise of x for who looks at it: x cross y is z.
+    # With z into the plate, y is 90 degrees clockwise of x as seen by the camera: x cross y is z.
     turning = float(across[0] * along[1] - across[1] * along[0]) / float(sides.prod())
     if turning < -0.5:
         raise CalibrationError(
@@ -181,8 +182,8 @@ def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
 def _refine(
     plate_xy: Array, weight: Array, corners_xy: Array, q: Array, shift: Array, sides: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Rotation, shift, and with ``sides`` (2,) those of the rectangle, with the least weighted residuals (``weight``
-    (c, 2, 2) whitens).
+    """Rotation, shift, and with ``sides`` (2,) those of the rectangle, with the least residuals whitened by ``weight``
+    (c, 2, 2).
     """
     start = np.concatenate([[0.0], shift, [] if sides is None else sides])
 
@@ -205,7 +206,7 @@ def _refine(
 
 
 def _apart(cam_T_grip: Array, xy: Array, variance: Array, corners_m: Array) -> Array | None:
-    """Tilt and gap with which the corners, no plate considered, are best explained; None where they don't tell."""
+    """Tilt and gap of the pose that explains the corners best without the plate; None if undetermined."""
     if len(corners_m) < 4 or np.linalg.svd(corners_m - corners_m.mean(axis=0), compute_uv=False)[1] < 1e-4:
         return None
     own = perturbation_between(
@@ -215,7 +216,7 @@ def _apart(cam_T_grip: Array, xy: Array, variance: Array, corners_m: Array) -> A
 
 
 def _on_plate(cam_T_plate: Array, xy: Array, plate_xy: Array, heights: Array, variance: Array) -> Array:
-    """(c, 2, 2) that whiten errors on the plate which come from ``variance`` (c, 2, 2) of ideal coordinates."""
+    """(c, 2, 2) whitening of errors on the plate that come from ``variance`` (c, 2, 2) of ideal coordinates."""
     points = np.concatenate([plate_xy, heights[:, None]], axis=1) @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
     z = points[:, 2, None, None]
     # d(xy)/d(plate x, y), inverted.
@@ -229,14 +230,14 @@ def _turn(q: Array) -> Array:
 
 
 def _spread(xy_m: Array) -> float:
-    """Root mean square distance from the middle."""
+    """Root mean square distance from the centroid."""
     return float(np.sqrt(np.mean(np.sum(np.square(xy_m - xy_m.mean(axis=0)), axis=1))))
 
 
 @dataclass(frozen=True, slots=True)
 class FreePose:
     """``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error (position then rotation, camera axes), measured
-    through ``camera``; ``points_m`` (n, 3) of the gripper, which stand for what was measured.
+    with ``camera``; ``points_m`` (n, 3) of the gripper represent what was measured.
     """
 
     cam_T_grip: Array
@@ -245,7 +246,7 @@ class FreePose:
     points_m: Array
 
     def through(self, camera: Camera) -> Array:
-        """``cam_T_grip`` (4, 4) that the same image shows if ``camera`` took it: least squares over the points."""
+        """The ``cam_T_grip`` (4, 4) that the same image shows if ``camera`` took it: least squares over the points."""
         out = self.cam_T_grip
         if camera is self.camera:
             return out
@@ -255,7 +256,7 @@ class FreePose:
         return pose_of_points(out, self.points_m[seen], xy[seen])
 
     def own_slopes(self, cam_T_plate: Array, contact_m: float) -> Array:
-        """(3, 6): what the pose's own independent errors, in their standard deviations, do to :func:`off_plate`."""
+        """(3, 6): effect of the pose's own independent errors, per standard deviation, on :func:`off_plate`."""
         scale = np.sqrt(self.covariance.diagonal())
         variances, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         roots = (scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))).T
@@ -268,8 +269,8 @@ class FreePose:
 
 
 def pose_of_points(start: Array, points_m: Array, xy: Array, whiten: Array | None = None) -> Array:
-    """The pose (4, 4) near ``start`` that shows points (n, 3) at ideal coordinates ``xy`` (n, 2) with the least
-    residuals, which ``whiten`` (n, 2, 2) makes comparable.
+    """The pose (4, 4) near ``start`` that projects points (n, 3) to ideal coordinates ``xy`` (n, 2) with the least
+    residuals, whitened by ``whiten`` (n, 2, 2).
     """
 
     def linearised(pose: Array) -> tuple[Array, Array]:
@@ -286,8 +287,8 @@ def pose_of_points(start: Array, points_m: Array, xy: Array, whiten: Array | Non
 
 
 def off_plate(cam_T_grip: Array, cam_T_plate: Array, contact_m: float) -> Array:
-    """(3,): tilt about the gripper's x and y (rad) by which its contact plane, z = ``contact_m``, leaves the plate, and
-    the gap (m) at its middle, the gripper nearer to the camera than the plate.
+    """(3,): tilt about the gripper's x and y (rad) of its contact plane, z = ``contact_m``, against the plate, and the
+    gap (m) at its centre, positive if the gripper is nearer to the camera than the plate.
     """
     rotation, normal = cam_T_grip[:3, :3], cam_T_plate[:3, 2]
     across = rotation.T @ np.cross(normal, rotation[:, 2])

@@ -1,17 +1,17 @@
-"""Robot-world and hand-eye at once, from a target on the hand that a fixed camera sees (or the other way round).
+"""Robot-world and hand-eye calibration together, from a target on the hand and a fixed camera (or the reverse).
 
 Dornaika and Horaud, "Simultaneous robot-world and hand-eye calibration" (IEEE Trans. Robotics and Automation, 1998):
 for every pose ``cam_T_target = cam_T_base base_T_ee ee_T_target``, the first and the last unknown.  Closed form by
-quaternions, then all at once.  A camera on the hand is the same with ``ee_T_base`` for ``base_T_ee``: what comes out is
-``cam_T_ee`` and ``base_T_target`` then.
+quaternions, then joint refinement.  A camera on the hand is the same with ``ee_T_base`` for ``base_T_ee``; the results
+are then ``cam_T_ee`` and ``base_T_target``.
 
-How inexact the arm is shows in what its poses leave unexplained beside a target's own covariances.  A target's pose
-from one image is known to some hundredths of a millimetre, most arms aren't: weighed by the images alone, the poses
-seen best count for far more than they know.  Two variances, of the arm's positions and rotations, are estimated by
-restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).  An arm errs at its hand: with a camera on
-the hand a wrong rotation shifts the target by its distance from the hand, however far the base is.
+The arm's inaccuracy shows in what its poses leave unexplained beyond the targets' own covariances.  A target's pose
+from one image is accurate to some hundredths of a millimetre, most arms aren't: weighted by the images alone, the poses
+seen best would count far too much.  Two variances, of the arm's positions and rotations, are estimated by restricted
+maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).  An arm's errors act at its hand: with a camera on the
+hand a wrong rotation shifts the target by its distance from the hand, however far the base is.
 
-What a camera's own calibration is off by is the same in all images; it doesn't average out however many there are.
+Errors of the camera's own calibration are the same in all images; they don't average out however many there are.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ from gripmon.model.records import Array
 
 FEWEST_POSES = 3
 LEAST_TURN_RAD = 5e-3
-"""How far a direction of the end-effector has to turn, root mean square over the orientations."""
+"""Minimum rotation of every direction of the end-effector (rad), root mean square over the orientations."""
 FALSE_OUTLIERS = 0.05
-"""How many good poses of a whole data set may be left out, on average."""
+"""Expected number of good poses in a whole data set that are left out."""
 _ROUNDS, _ARM_ROUNDS = 20, 5
 _LEAST_M, _LEAST_RAD = 1e-7, 1e-7
 _MOST_M, _MOST_RAD = 0.1, 0.5
 _STARTS = (1e-5, 2e-4, 3e-3)
 FARTHEST_M = 20.0
-"""No camera measures a target's pose beyond, and no arm reaches farther from its base: such numbers are millimetres."""
+"""Largest distance of a target from the camera, and of an arm from its base (m): larger numbers are millimetres."""
 SUSPECT_RAD = 0.02
-"""What is left of the rotations (each axis) from which it is asked whether another reading fits."""
+"""Residual rotation (rad, each axis) above which other readings of the poses are tried."""
 HOPELESS_RAD = 0.1
-"""What no arm and no camera are off by."""
+"""Residual rotation (rad, each axis) above the errors of any arm and camera."""
 _BETTER = 0.1
 _AGREEING = 0.7
 OFFSETS = (1, -1, 2, -2)
-"""Rows by which poses and images may be shifted against each other."""
+"""Offsets in rows between poses and images that are tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class RobotWorld:
 
 def solve(cam_T_target: Array, base_T_ee: Array) -> tuple[Array, Array]:
     """Closed form from poses (n, 4, 4) each: ``cam_T_base`` and ``ee_T_target``.  Raises :class:`CalibrationError` for
-    too few poses, or ones turned about one axis only.
+    too few poses, or rotations about a single axis.
     """
     _check_turns(cam_T_target, base_T_ee)
     cam_R_base, target_R_ee = rotations(cam_T_target[:, :3, :3], base_T_ee[:, :3, :3])
@@ -97,9 +97,9 @@ def solve(cam_T_target: Array, base_T_ee: Array) -> tuple[Array, Array]:
 def rotations(cam_R_target: Array, base_R_ee: Array) -> tuple[Array, Array]:
     """``cam_R_base`` and ``target_R_ee`` with ``cam_R_target target_R_ee = cam_R_base base_R_ee`` for all of (n, 3, 3).
 
-    As quaternions ``Q(a) x = W(b) z``; the least sum of squared differences under unit lengths is at the singular
-    vectors of ``sum Q(a)ᵀ W(b)`` with the largest value.  A quaternion and its negative are the same rotation: signs
-    are chosen by motions against the first pose, which the two sides turn by the same angle.
+    As quaternions ``Q(a) x = W(b) z``; the sum of squared differences under unit norms is smallest for the singular
+    vectors of ``sum Q(a)ᵀ W(b)`` with the largest singular value.  A quaternion and its negative are the same rotation:
+    signs are chosen by motions from the first pose, which have the same angle on both sides.
     """
     a = Rotation.from_matrix(cam_R_target).as_quat()
     b = Rotation.from_matrix(base_R_ee).as_quat()
@@ -112,8 +112,8 @@ def rotations(cam_R_target: Array, base_R_ee: Array) -> tuple[Array, Array]:
 
 
 def translations(cam_T_target: Array, base_T_ee: Array, cam_R_base: Array) -> tuple[Array, Array]:
-    """Positions (3,) of ``cam_T_base`` and ``target_T_ee``, linear least squares of
-    ``cam_R_target x + cam_t_target = cam_R_base base_t_ee + z``.
+    """Positions (3,) of ``cam_T_base`` and ``target_T_ee``, linear least squares of ``cam_R_target x + cam_t_target =
+    cam_R_base base_t_ee + z``.
     """
     count = len(cam_T_target)
     rows = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), -cam_T_target[:, :3, :3]], axis=2).reshape(-1, 6)
@@ -132,11 +132,11 @@ def refine(
     eye_in_hand: bool = False,
     common: Array | None = None,
 ) -> RobotWorld:
-    """All twelve unknowns at once, robustly.  ``covariance`` (n, 6, 6) of the measured ``cam_T_target`` (position then
-    rotation, camera axes), believed up to a common scale; without it positions and rotations are weighed by what their
-    residuals show.  With an ``inexact_arm`` what that adds to the covariances is estimated, too; ``eye_in_hand``:
-    ``base_T_ee`` are the arm's poses inverted.  ``common`` (n, 6, k): what each of k independent errors that all
-    poses share, in its standard deviations, does to each of them; it comes into the covariance.
+    """All twelve unknowns together, robustly.  ``covariance`` (n, 6, 6) of the measured ``cam_T_target`` (position then
+    rotation, camera axes), up to a common scale; without it positions and rotations are weighted by their residuals.
+    With an ``inexact_arm`` the arm's contribution to the covariances is estimated, too; ``eye_in_hand``: ``base_T_ee``
+    are the arm's poses inverted.  ``common`` (n, 6, k): effect of each of k independent errors that all poses share,
+    per standard deviation, on each of them; it is added to the covariance.
     """
     cam_T_base, ee_T_target = start
     count = len(cam_T_target)
@@ -156,7 +156,8 @@ def refine(
         root = whiten if whiten is not None else _weights_of(values[used])
         if count > FEWEST_POSES:
             sizes = _sizes(root, values)
-            # Lengths of six coordinates: their usual one is what one coordinate's standard deviation is otherwise.
+            # Norms of six coordinates: sqrt(3) makes the tuning of the biweight, meant for single coordinates, apply to
+            # them.
             weights = tukey_weights(sizes, TUKEY * _scale(sizes, 6) * float(np.sqrt(3.0)))
         before = cam_T_base, ee_T_target
         cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, before, root, weights)
@@ -168,7 +169,7 @@ def refine(
             break
     sizes = _sizes(root, residuals(cam_T_target, base_T_ee, cam_T_base, ee_T_target))
     if count > FEWEST_POSES:
-        # The unknowns take their share of the residuals away.
+        # The unknowns reduce the residuals.
         left = np.sqrt(1.0 - 2.0 / count)
         used = sizes <= np.sqrt(chdtri(6, FALSE_OUTLIERS / count)) * _scale(sizes, 6) / left
     if used.sum() < FEWEST_POSES:
@@ -214,7 +215,7 @@ def _minimise(
 
 
 def arm_slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array, *, eye_in_hand: bool = False) -> Array:
-    """(n, 6, 6): what errors of the arm's poses (position, then rotation about the hand's origin, camera axes) do to
+    """(n, 6, 6): effect of errors of the arm's poses (position, then rotation about the hand's origin, camera axes) on
     the predicted ``cam_T_target``, up to a sign; ``eye_in_hand`` as in :func:`refine`.
     """
     hand = cam_T_base @ (np.eye(4) if eye_in_hand else base_T_ee)
@@ -229,8 +230,8 @@ def arm_sigmas(
     """Standard deviations (2,) of the arm's positions (m) and rotations (rad), each axis.
 
     ``covariance`` (n, 6, 6) of the targets' poses, ``by_arm`` (n, 6, 6) of :func:`arm_slopes`, ``rows`` (n, 6, k) the
-    derivatives by the k unknowns, ``values`` (n, 6) the residuals, of which each pose's has one of the ``weights``
-    (n,).  Begun at what they were ``before``.
+    derivatives by the k unknowns, ``values`` (n, 6) the residuals, weighted per pose by ``weights`` (n,).  Starts at
+    the values ``before``, if given.
     """
     scaled = rows / np.linalg.norm(rows.reshape(-1, rows.shape[2]), axis=0)
 
@@ -249,7 +250,7 @@ def arm_sigmas(
 
 
 def with_arm(covariance: Array, by_arm: Array, sigmas: Array) -> Array:
-    """``covariance`` (n, 6, 6) with what an arm's errors of standard deviations (2,), m and rad, add to it."""
+    """``covariance`` (n, 6, 6) plus the contribution of an arm's errors with standard deviations (2,), m and rad."""
     position, rotation = by_arm[:, :, :3] * sigmas[0], by_arm[:, :, 3:] * sigmas[1]
     out: Array = covariance + position @ position.transpose(0, 2, 1) + rotation @ rotation.transpose(0, 2, 1)
     return out
@@ -282,15 +283,15 @@ def _conclude(
 
 
 def check_target_scale(cam_T_target: Array) -> None:
-    """ValueError for poses (n, 4, 4) of a target that no camera sees so far away."""
+    """ValueError for poses (n, 4, 4) of a target that is too far away for any camera."""
     far_m = float(np.median(np.linalg.norm(cam_T_target[:, :3, 3], axis=1)))
     if far_m > FARTHEST_M:
         raise ValueError(f"the target is {far_m:.4g} m from the camera (median): millimetres? metres")
 
 
 def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> None:
-    """:class:`CalibrationError` where large residuals go away if the poses (n, 4, 4) are read otherwise, and where they
-    are larger than any arm's and camera's errors.
+    """:class:`CalibrationError` if large residuals vanish under another reading of the poses (n, 4, 4), or exceed the
+    errors of any arm and camera.
     """
     if found.rms_rad < SUSPECT_RAD:
         return
@@ -310,7 +311,7 @@ def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> N
 
 
 def _readings(cam_T_target: Array, base_T_ee: Array) -> Iterator[tuple[str, Array, Array]]:
-    # Inverting the arm's poses or the target's comes to the same: which of them it is can't be told.
+    # Inverting the arm's poses is equivalent to inverting the target's: the two can't be distinguished.
     text = (
         "the poses fit with the arm's or the target's inverted: base_T_ee and cam_T_target; or --eye-in-hand is missing"
     )
@@ -338,7 +339,7 @@ def _check_turns(cam_T_target: Array, base_T_ee: Array) -> None:
 
 
 def _weights_of(values: Array) -> Array:
-    """(6, 6), makes residuals unit: positions and rotations by their own robust scale."""
+    """(6, 6) that normalises residuals: positions and rotations each by their own robust scale."""
     sizes = [_scale(np.linalg.norm(part, axis=1), 3) for part in (values[:, :3], values[:, 3:])]
     return np.diag(1.0 / np.repeat(sizes, 3))
 
@@ -353,12 +354,12 @@ def _scale(sizes: Array, freedom: int) -> float:
 
 
 def _left(q: Array) -> Array:
-    """(n, 4, 4): the matrices of multiplication by quaternions x y z w from the left."""
+    """(n, 4, 4): matrices of left multiplication by quaternions x y z w."""
     x, y, z, w = q.T
     return np.stack([np.stack(row, -1) for row in ((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w))], 1)
 
 
 def _right(q: Array) -> Array:
-    """(n, 4, 4): the same from the right."""
+    """(n, 4, 4): matrices of right multiplication."""
     x, y, z, w = q.T
     return np.stack([np.stack(row, -1) for row in ((w, z, -y, x), (-z, w, x, y), (y, -x, w, z), (-x, -y, -z, w))], 1)

@@ -1,4 +1,4 @@
-"""A calibration target as one image shows it."""
+"""A calibration target as seen in one image."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class CalibrationError(NoResultError, ValueError):
 class Sighting:
     """Points of a flat target found in an image: any part of it, in any order.
 
-    ``uv_px`` (n, 2) where they are in the (distorted) image, with ``covariance_px`` (n, 2, 2); ``plate_m`` (n, 3) where
-    they are on the target: right-handed frame, x along its columns, z *into* the plate, away from a camera that sees
-    it; z = 0.  On a lattice without marks the origin is any point of it, and x any of its directions.
-    ``disc_radius_m`` is 0 for corners; for discs ``uv_px`` is the centre of the visible blob, which under
-    perspective is not where the disc's centre is.
+    ``uv_px`` (n, 2): positions in the (distorted) image, with ``covariance_px`` (n, 2, 2); ``plate_m`` (n, 3):
+    positions on the target, in a right-handed frame with x along its columns and z *into* the plate, away from a camera
+    that sees it; z = 0.  On a lattice without markers the origin may be any of its points, and x any of its directions.
+    ``disc_radius_m`` is 0 for corners; for discs ``uv_px`` is the centroid of the visible blob, which under perspective
+    isn't the image of the disc's centre.
     """
 
     uv_px: Array
@@ -48,7 +48,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Why no target was found; one line for a person.  ``larger``: one was, with more points than it should have."""
+    """Why no target was found; one line for a person.  ``larger``: one was found, but it has too many points."""
 
     reason: str
     larger: bool = False

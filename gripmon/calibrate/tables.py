@@ -1,5 +1,5 @@
-"""Tables with a row for each pose of an arm (CSV, YAML or JSON), the ways in which a pose may be written, and the poses
-of a target that a camera saw at each of them, as columns or from the images that they name.
+"""Tables with a row for each pose of an arm (CSV, YAML or JSON), the notations of a pose, and the target's pose at each
+of them, from columns or from the named images.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
 
 
 def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list[str]]:
-    """A table's rows, and where each stands; ``right``: what kind of table it should be, for messages.
-    :class:`~gripmon.model.errors.InputError` for what is none.
+    """A table's rows, and the place of each for messages; ``right``: what kind of table it should be.
+    :class:`~gripmon.model.errors.InputError` for anything else.
     """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
@@ -178,7 +178,7 @@ def _from_vector(vector: Sequence[float], place: str) -> Array:
 
 
 def checked_transform(matrix: Array, place: str) -> Array:
-    """A matrix (4, 4) that is a rigid motion; ValueError for one that isn't."""
+    """A matrix (4, 4) that is a rigid transform; ValueError otherwise."""
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise ValueError(f"{place}: the last row of the 4 x 4 is {_shown(matrix[3])}; 0 0 0 1 (is it transposed?)")
     rotation = matrix[:3, :3]
@@ -209,9 +209,9 @@ def _shown(values: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ArmPoses:
-    """``base_T_ee`` and ``cam_T_target`` (n, 4, 4) with ``names``; where the targets were seen in ``images``, the
-    ``covariance`` (n, 6, 6) of their poses and what the camera's own errors do to them, ``common`` (n, 6, k);
-    ``unseen``: where the target wasn't found, and why.
+    """``base_T_ee`` and ``cam_T_target`` (n, 4, 4) with ``names``.  If the targets were seen in ``images``, also the
+    ``covariance`` (n, 6, 6) of their poses and ``common`` (n, 6, k), the effect of the camera's own errors on them;
+    ``unseen``: images without the target, each with the reason.
     """
 
     names: tuple[str, ...]
@@ -237,10 +237,9 @@ class _Found:
 def read_arm_poses(
     tables: Sequence[Path], camera: GivenCamera | None = None, target: Target | None = None, progress: Progress = quiet
 ) -> ArmPoses:
-    """All rows of all tables; for rows that name images the ``camera`` that took them and the ``target``.
+    """All rows of all tables; rows that name images need the ``camera`` that took them and the ``target``.
 
-    :class:`~gripmon.model.errors.InputError` for wrong tables, :class:`CalibrationError` where no image shows the
-    target.
+    :class:`~gripmon.model.errors.InputError` for wrong tables, :class:`CalibrationError` if no image shows the target.
     """
     found = _Found()
     for path in tables:
@@ -296,9 +295,9 @@ def _take(found: _Found, table: Path, row: Row, place: str, camera: GivenCamera 
 
 
 def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "") -> tuple[Array, Array, Array]:
-    """``cam_T_target`` (4, 4), its covariance (6, 6) with an exact camera, and what the camera's own independent errors
-    do to it (6, k), of a target that tells which way up it is (else :class:`~gripmon.model.targets.TargetError`).
-    :class:`CalibrationError` for an image that doesn't show it.
+    """The pose of a target in an image: ``cam_T_target`` (4, 4), its covariance (6, 6) for an exact camera, and the
+    effect of the camera's own independent errors (6, k).  :class:`~gripmon.model.targets.TargetError` for a target
+    without a unique orientation, :class:`CalibrationError` for an image that doesn't show it.
     """
     if not tells_its_turn(target):
         raise TargetError(
@@ -315,7 +314,7 @@ def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "
 
 
 def _check_once(arm: Array, target: Array, names: Sequence[str]) -> None:
-    """The same pose twice would make every uncertainty too small."""
+    """Reject duplicate poses, which would make every uncertainty too small."""
     seen: dict[tuple[float, ...], str] = {}
     for hand, plate, name in zip(arm, target, names, strict=True):
         key = tuple(np.round(np.concatenate([hand.ravel(), plate.ravel()]), 9).tolist())

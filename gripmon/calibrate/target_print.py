@@ -1,6 +1,6 @@
-"""A calibration target as a page to print: PDF in true size, with a bar to hold a ruler against.
+"""A calibration target as a page to print: PDF in true size, with a bar to check against a ruler.
 
-Written here, not by a PDF library: rectangles, discs and two lines of text are forty lines, and their places must be
+Written without a PDF library: rectangles, discs and two lines of text take forty lines, and their positions must be
 exact to micrometres.  "PDF Reference", sixth edition, 1.7, Adobe 2006 (ISO 32000-1).
 """
 
@@ -23,20 +23,20 @@ _PAPERS_MM = {
 }  # fmt: skip
 """ISO 216 and ANSI/ASME Y14.1."""
 _MARGIN_MM = 7.0
-"""What common printers leave white at a border is 3 to 6.4 mm."""
+"""Common printers leave 3 to 6.4 mm white at each border."""
 _FOOT_MM = 16.0
-"""Below the pattern, for the bar and the text."""
+"""Space below the pattern, for the bar and the text."""
 _DESCENT_MM = 1.0
-"""Of letters of 8 points below their line."""
+"""Descent of 8-point letters below their baseline."""
 _BAR_MM = (200.0, 150.0, 100.0, 50.0)
 _POINTS_PER_MM = 72.0 / 25.4
 _ROUND = 4.0 / 3.0 * (np.sqrt(2.0) - 1.0)
-"""Bezier handles of a quarter circle, in radii; off the circle by at most 0.03 % of the radius."""
+"""Bezier handles of a quarter circle, in radii; they deviate from the circle by at most 0.03 % of the radius."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrintedTarget:
-    """``pdf``: the file; ``paper_mm`` as it is turned; ``bar_mm``: length that the printed bar has to have."""
+    """``pdf``: the file; ``paper_mm``: paper size in its orientation; ``bar_mm``: nominal length of the printed bar."""
 
     pdf: bytes
     paper_mm: tuple[float, float]
@@ -60,10 +60,10 @@ def paper_size(text: str) -> tuple[float, float]:
 
 
 def print_target(target: Target, paper: str = "a4") -> PrintedTarget:
-    """A page with the target in its middle, upright or turned, whichever it fits on.
+    """A page with the target in its middle, in portrait or landscape, whichever fits.
 
-    Raises :class:`~gripmon.model.errors.InputError` for a paper that is none or too small, and
-    :class:`~gripmon.model.targets.TargetError` for a dictionary that isn't there.
+    Raises :class:`~gripmon.model.errors.InputError` for an unknown or too small paper, and
+    :class:`~gripmon.model.targets.TargetError` for an unknown dictionary.
     """
     sheet = paper_size(paper)
     width, height = size_mm(target)
@@ -85,7 +85,7 @@ def print_target(target: Target, paper: str = "a4") -> PrintedTarget:
 
 
 def size_mm(target: Target) -> tuple[float, float]:
-    """Width and height of all that is printed of it (mm)."""
+    """Width and height of the printed pattern (mm)."""
     if isinstance(target, CircleGrid):
         step, disc = 1e3 * target.spacing_m, 1e3 * target.diameter_m
         return (target.columns - 1) * step + disc, (target.rows - 1) * step + disc
@@ -113,7 +113,7 @@ def _shapes(target: Target) -> Iterator[_Shape]:
 
 
 def _marked_squares(target: Charuco) -> Iterator[_Shape]:
-    """Where OpenCV's board has its marks; the squares without one are dark."""
+    """Boxes of OpenCV's board: the markers' dark cells, and the squares without a marker."""
     if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
         raise TargetError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
@@ -137,7 +137,7 @@ def _marked_squares(target: Charuco) -> Iterator[_Shape]:
 
 @dataclass(frozen=True, slots=True)
 class _Page:
-    """PDF counts in points from the lower left corner, y up."""
+    """Coordinates in PDF: points from the lower left corner, y up."""
 
     paper_mm: tuple[float, float]
 
@@ -160,12 +160,12 @@ class _Page:
 
 
 def _foot(target: Target, paper_mm: tuple[float, float], bar_mm: float) -> list[str]:
-    """A bar with a tick at each centimetre, what it has to measure, and the target as commands take it."""
+    """A bar with a tick at each centimetre, its nominal length, and the target as commands take it."""
     page, left, low = _Page(paper_mm), _MARGIN_MM, paper_mm[1] - _MARGIN_MM - _DESCENT_MM
     lines = [page.shape(("box", (0.0, 0.0, bar_mm, 0.3)), left, low - 8.0)]
     for tick in range(round(bar_mm / 10.0) + 1):
         high = 3.0 if tick in (0, round(bar_mm / 10.0)) else 1.5
-        # Its outer borders are the ends: a ruler is held against them.
+        # The ticks' outer borders are the ends: a ruler is held against them.
         x = min(max(10.0 * tick - 0.15, 0.0), bar_mm - 0.3)
         lines.append(page.shape(("box", (x, 0.3 - high, 0.3, high)), left, low - 8.0))
     said = f"{bar_mm:g} mm from end to end: measure it; print at 100 %, without fitting to the page"
@@ -177,7 +177,7 @@ def _foot(target: Target, paper_mm: tuple[float, float], bar_mm: float) -> list[
 
 
 def _pdf(paper_mm: tuple[float, float], content: str) -> bytes:
-    """One page."""
+    """A file with one page."""
     box = " ".join(f"{_POINTS_PER_MM * side:.5f}" for side in paper_mm)
     stream = content.encode("ascii")
     objects = [

@@ -1,7 +1,7 @@
-"""Are two calibrations the same?  Their difference with its uncertainty, and how probable it is by chance.
+"""Comparison of two calibrations: their difference with its uncertainty, and its probability by chance.
 
-Both are taken as independent.  What they share (a camera calibration, a plate) cancels in the difference but not in
-the sum of their covariances, so that differences then look less significant than they are: never the reverse.
+Both are taken as independent.  What they share (a camera calibration, a plate) cancels in the difference but not in the
+sum of their covariances, so that differences then look less significant than they are, never more.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from gripmon.model.least_squares import whitening
 from gripmon.model.records import Array, Transform
 
 CHANCE = 1e-3
-"""Of two measurements of one pose being called different ones."""
+"""Probability that two measurements of one pose are called different."""
 NEGLIGIBLE_PX = 1e-3
-"""Two cameras that are as near as this don't differ, however certain they are."""
+"""Difference (px) below which two cameras count as the same, however certain they are."""
 _GRID = 25
 _DRAWS = 4000
 _SEED = 7
@@ -34,9 +34,9 @@ _SEED = 7
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What is compared, by its ``name``: a ``lens`` with the covariance of its ``parameters``, a ``cam_T_grip`` with
-    ``covariance`` (36), or both; ``kind`` is what it comes from, ``notes`` on its origin, for people, ``pose_notes``
-    more about the transform.
+    """A calibration to compare, with its ``name``: a ``lens`` with the covariance of its ``parameters``, a
+    ``cam_T_grip`` with ``covariance`` (36), or both; ``kind`` is where it comes from, ``notes`` describe its origin for
+    people, ``pose_notes`` add to the transform's.
     """
 
     name: str
@@ -54,10 +54,10 @@ class Calibrated:
 
 @dataclass(frozen=True, slots=True)
 class HandEyeDifference:
-    """What two ``cam_T_grip`` differ by, second against first: the TCP's ``position_m`` (3,) and the ``rotation_rad``
+    """Difference of two ``cam_T_grip``, second against first: the TCP's ``position_m`` (3,) and the ``rotation_rad``
     (3,) vector along the camera's axes, with standard deviations.
 
-    ``chi2`` has six degrees of freedom; ``p_value`` is the probability of as large a one if both are the same,
+    ``chi2`` has six degrees of freedom; ``p_value`` is the probability of one as large if both are the same,
     ``position_p`` and ``rotation_p`` those of the parts alone.
     """
 
@@ -74,11 +74,12 @@ class HandEyeDifference:
 def compare_hand_eye(
     a_cam_T_grip: Array, a_covariance: Array, b_cam_T_grip: Array, b_covariance: Array
 ) -> HandEyeDifference:
-    """Transforms (4, 4) with the covariances (6, 6) of their errors (position, then rotation, camera axes; m, rad).
+    """Compare transforms (4, 4) with the covariances (6, 6) of their errors (position, then rotation, camera axes; m,
+    rad).
 
-    Under no difference ``xi = perturbation_between(a, b)`` has the covariance ``A + B`` to first order, and
-    ``xiᵀ (A + B)⁻¹ xi`` is chi-square with six degrees of freedom.  :class:`CalibrationError` for covariances that are
-    none, or together leave a direction exactly known.
+    If there is no difference, ``xi = perturbation_between(a, b)`` has the covariance ``A + B`` to first order, and
+    ``xiᵀ (A + B)⁻¹ xi`` is chi-square with six degrees of freedom.  :class:`CalibrationError` for invalid covariances,
+    or if their sum leaves a direction exactly known.
     """
     for name, matrix in (("first", a_covariance), ("second", b_covariance)):
         if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
@@ -102,7 +103,7 @@ def _chi2(difference: Array, covariance: Array) -> float:
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     if not (sigma > 0.0).all():
         raise CalibrationError("the uncertainties are zero; covariances that say what isn't known")
-    # In units of the deviations: metres and radians would make any matrix look singular.
+    # In units of the standard deviations: with metres and radians any matrix would look singular.
     correlation = covariance / np.outer(sigma, sigma)
     try:
         root = np.linalg.cholesky(correlation)
@@ -112,8 +113,8 @@ def _chi2(difference: Array, covariance: Array) -> float:
 
 
 def mean_of_one_scene(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
-    """Mean (4, 4) of measurements of one pose, and their mean covariance (6, 6): what makes single images wrong, such
-    as the background, light and the lens, is the same in all of them, so that the number of images earns nothing.
+    """Mean (4, 4) of measurements of one pose, and their mean covariance (6, 6): the causes of errors, such as
+    background, light and lens, are the same in all images, so that more images don't reduce the uncertainty.
     """
     mean = cam_T_grip[0]
     for _ in range(3):
@@ -122,8 +123,8 @@ def mean_of_one_scene(cam_T_grip: Sequence[Array], covariances: Sequence[Array])
 
 
 def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArray[np.bool_]:
-    """The largest set (n,) of measurements of one pose that all agree with one of them, two by two: as far apart as
-    equal ones are in all but :data:`CHANCE` of the cases.
+    """The largest set (n,) of measurements of one pose that all agree with one of them, pairwise: they differ no more
+    than equal ones do in all but :data:`CHANCE` of the cases.
     """
     count = len(cam_T_grip)
     apart = np.zeros((count, count))
@@ -132,7 +133,7 @@ def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArr
             xi = perturbation_between(cam_T_grip[i], cam_T_grip[j])
             apart[i, j] = apart[j, i] = _chi2(xi, np.asarray(covariances[i]) + np.asarray(covariances[j]))
     agree = apart < chdtri(6, CHANCE)
-    # Of equally many the set that lies closer together.
+    # Among sets of equal size take the tighter one.
     spread = np.where(agree, apart, 0.0).sum(axis=1)
     best = np.lexsort((spread, -agree.sum(axis=1)))[0]
     out: NDArray[np.bool_] = agree[best]
@@ -141,8 +142,8 @@ def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArr
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether two calibrations are the ``same``: not told apart at the ``level`` of false alarms, or the difference is
-    ``within`` what doesn't matter.  ``warnings``: what else may explain it.
+    """Whether two calibrations are the ``same``: their difference isn't significant at the ``level`` of false alarms,
+    or is ``within`` the tolerance.  ``warnings``: what else may explain it.
     """
 
     same: bool
@@ -176,9 +177,9 @@ def verify(
     tolerance_rad: float | None = None,
     tolerance_px: float | None = None,
 ) -> Verdict:
-    """Compare two hand/eye calibrations, or two cameras, by their uncertainties; ``tolerance_m`` and ``tolerance_rad``
-    (shift of the TCP and turn), or ``tolerance_px`` (anywhere in the image): differences that don't matter, however
-    significant.  :class:`~gripmon.model.errors.InputError` for what can't be compared.
+    """Compare two hand/eye calibrations, or two cameras, by their uncertainties.  ``tolerance_m`` and ``tolerance_rad``
+    (shift of the TCP and rotation), or ``tolerance_px`` (anywhere in the image): differences that don't matter, however
+    significant.  :class:`~gripmon.model.errors.InputError` for calibrations that can't be compared.
     """
     try:
         if first.cam_T_grip is not None and second.cam_T_grip is not None:
@@ -236,13 +237,13 @@ def _cameras(first: Calibrated, second: Calibrated, level: float, tolerance_px: 
 
 @dataclass(frozen=True, slots=True)
 class CameraDifference:
-    """What two cameras differ by in what they do: where the second one shows what the first one shows at a pixel.
+    """The difference of two cameras' mappings: where the second one shows what the first one shows at a pixel.
 
     ``largest_px`` with its standard deviation along the difference, at ``at_px`` (2,) of the first image; ``rms_px``
-    over the image.  ``turn_rad`` (3,): the turn of the camera about its axes that explains most of it, and
-    ``largest_turned_px`` what is then left: a hand/eye calibration made with each would absorb that turn.  ``p_value``:
-    probability that the place which differs most, measured by its uncertainty, differs as much by chance; None if
-    neither camera's uncertainty is known.  ``compared``: share of the image that both show.
+    over the image.  ``turn_rad`` (3,): the rotation of the camera about its axes that explains most of it, and
+    ``largest_turned_px`` the largest difference after it: a hand/eye calibration made with each would absorb that
+    rotation.  ``p_value``: probability by chance of the most significant difference in the image; None if neither
+    camera's uncertainty is known.  ``compared``: share of the image that both show.
     """
 
     largest_px: float
@@ -256,11 +257,11 @@ class CameraDifference:
 
 
 def compare_cameras(a: GivenCamera, b: GivenCamera) -> CameraDifference:
-    """Models may be different ones; image sizes must not (:class:`CalibrationError`).
+    """Compare two cameras, also with different models; image sizes must be equal (:class:`CalibrationError`).
 
     At pixel u of a grid the difference is ``d = pi_b(pi_a⁻¹(u)) - u``, with covariance ``J_a A J_aᵀ + J_b B J_bᵀ`` to
     first order (J: derivative of the pixel by the parameters).  The statistic is the largest ``dᵀ cov⁻¹ d`` of the
-    grid; its distribution under no difference comes from drawn parameter errors, always the same ones.
+    grid; its distribution without a difference is sampled with random parameter errors, with a fixed seed.
     """
     size = (a.lens.width_px, a.lens.height_px)
     if size != (b.lens.width_px, b.lens.height_px):
@@ -303,7 +304,7 @@ def _grid(size: tuple[int, int]) -> Array:
 
 
 def _root(calibrated: GivenCamera, xy: Array) -> Array:
-    """(n, 2, p): what independent errors of unit size in the parameters do to each pixel."""
+    """(n, 2, p): effect of independent unit errors in the parameters on each pixel."""
     if calibrated.covariance is None or not calibrated.parameters:
         return np.zeros((len(xy), 2, 0))
     points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
@@ -313,8 +314,8 @@ def _root(calibrated: GivenCamera, xy: Array) -> Array:
 
 
 def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
-    """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), from drawn errors."""
-    # What neither camera left free has no variance; there a thousandth of a pixel counts.
+    """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), by sampling errors."""
+    # Directions that neither camera left free have no variance: add a thousandth of a pixel.
     inverse_root = whitening(covariance + NEGLIGIBLE_PX**2 * np.eye(2))
     observed = np.square(inverse_root @ apart_px[:, :, None]).sum(axis=(1, 2)).max()
     whitened = inverse_root @ roots
@@ -326,7 +327,7 @@ def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
 
 
 def _turned(camera: Camera, xy: Array, apart_px: Array) -> tuple[Array, Array]:
-    """The turn of the camera (3,), rad, that explains most of the differences (n, 2), and what is left of them."""
+    """The rotation of the camera (3,), rad, that explains most of the differences (n, 2), and what is left of them."""
     points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     _, by_point = camera.project_with_jacobian(points)
     # omega x p, column by column

@@ -272,9 +272,7 @@ def _scene(result: LaserResult, base_T_ee: Array) -> Image:
 
 
 def _sheet(result: LaserResult, to_base: Array, centre: Array) -> Array:
-    """Corners (up to 4, 3) of the image projected onto the plane, base frame, without those whose rays miss the
-    plane.
-    """
+    """Corners (up to 4, 3) of the image on the plane, base frame, without those whose rays miss the plane."""
     camera, setup = result.refined.camera, result.refined.setup
     width, height = camera.width_px, camera.height_px
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])

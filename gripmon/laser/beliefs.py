@@ -113,9 +113,7 @@ class Bank:
         self._focal_px = 0.5 * (calibrated.camera.fx_px + calibrated.camera.fy_px)
 
     def predicted(self, beliefs: Beliefs, pulse: Pulse) -> tuple[Array, Array]:
-        """Predicted pixels (n, 2), NaN where a belief predicts none, and derivatives (n, 2, 50) by the beliefs'
-        means.
-        """
+        """Predicted pixels (n, 2), NaN where there is no spot, and derivatives (n, 2, 50) by the beliefs' means."""
         change = beliefs.mean[:, :COUNT] + beliefs.mean[:, MOVED]
         shifts = change[:, None, :] * pulse.rows
         uv_px = pulse.predicted_px + shifts.sum(axis=2)

@@ -51,8 +51,8 @@ _NOISE_ROUNDS = 8
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """Measured spots: ``uv_px`` (n, 2) and ``covariance_px`` (n, 2, 2) or None; ``others``: further candidates, one (k,
-    2) per sample.
+    """Measured spots: ``uv_px`` (n, 2), ``covariance_px`` (n, 2, 2) or None; ``others``: further candidates, (k, 2)
+    each.
     """
 
     uv_px: Array

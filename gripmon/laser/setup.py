@@ -23,9 +23,7 @@ PARAMETERS = (
     "plane.tilt_a_rad", "plane.tilt_b_rad", "plane.distance_m",
     "laser.turn_a_rad", "laser.turn_b_rad", "laser.shift_a_m", "laser.shift_b_m",
 )  # fmt: skip
-"""The parameters that :meth:`LaserSetup.moved` changes: a perturbation of the pose as elsewhere, then plane and laser
-line.
-"""
+"""The parameters that :meth:`LaserSetup.moved` changes: pose perturbation as elsewhere, then plane and laser line."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,9 +76,7 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
 
 
 def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> list[Spot] | NotFound:
-    """Candidates in a background-free signal; ``ambient``: the light without the laser, if known; ``grey``: the
-    image.
-    """
+    """Candidates in a signal; ``ambient``: the light without the laser, as far as known; ``grey``: the image."""
     # Quantisation counts as noise, too; the median is ambient light that changed between the images.
     signal = signal - np.median(signal)
     noise = max(1.4826 * float(np.median(np.abs(signal))), ceiling / 255.0 / np.sqrt(12.0))

@@ -42,9 +42,7 @@ from gripmon.model.records import (
 _IMAGE = "image"
 _IMAGE_ALERT_AFTER_S = 1.0
 _STILL = 3.0
-"""Gate for the spot's motion between a pulse's halves, in standard deviations; a half has at most twice a spot's
-own.
-"""
+"""Gate for the motion between a pulse's halves, in standard deviations; a half has at most twice a spot's own."""
 _NO_BACKGROUND = (
     "; no frame to subtract, none since the pulse before had the laser off: a longer pause, by more than "
     "laser.frames.margin_s after a pulse and before the next one"
