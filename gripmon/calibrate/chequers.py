@@ -107,9 +107,7 @@ def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Inde
 
 
 def saddles(grey: Grey, sigma_px: float) -> Array:
-    """The strongest candidates (n, 2): maxima of saddle strength, where the image curves up one way and down the
-    other.
-    """
+    """Saddle candidates (n, 2): where the image curves up one way and down the other; the strongest ones."""
     smooth = cv2.GaussianBlur(grey, (0, 0), sigma_px)
     xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3)
     yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3)

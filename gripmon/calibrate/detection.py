@@ -31,12 +31,10 @@ _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
 _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
 WINDOW = 0.42
+"""Radius of the window around a corner, in squares."""
+TOO_BLURRED = 0.16
 """Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs twice the number, in
 units of the smaller of gap and radius.
-"""
-TOO_BLURRED = 0.16
-"""Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs half of it, in units
-of twice the smaller of gap and radius.
 """
 BLURRED_PX = 3.0
 """Standard deviation of the edges' blur above which it is reported."""
@@ -235,9 +233,7 @@ def _across_squares(cells: NDArray[np.intp], points: Array) -> tuple[Array, Arra
 def _sharp(
     grey: Grey, rough: Array, radius_px: Array, cells: Array | NDArray[np.intp]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Sub-pixel corners (n, 2), covariances (n, 2, 2), and which of them are good; ``cells`` (n, 2): lattice
-    coordinates.
-    """
+    """Sub-pixel corners (n, 2) at lattice coordinates ``cells`` (n, 2), covariances (n, 2, 2), and which are good."""
     noise = noise_of(grey)
     found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
     good = _corners(grey, *found, radius_px)

@@ -219,9 +219,7 @@ def _seen(camera: Camera, points: int) -> tuple[Array, Array]:
 
 
 def _linear(xy: Array, q: Array, count: int) -> Array:
-    """Radial and tangential terms by least squares: k1 k2 p1 p2 [k3 [k4 k5 k6]], the rational ones after multiplication
-    by the denominator.
-    """
+    """Radial and tangential terms by least squares: k1 k2 p1 p2 [k3 [k4 k5 k6]], the rational ones multiplied out."""
     x, y = xy.T
     r2 = x * x + y * y
     columns = [
@@ -288,9 +286,7 @@ class HandEye:
 
 
 def write_hand_eye(hand_eye: HandEye, kind: str, notes: Sequence[str]) -> str:
-    """The text in one of :data:`HAND_EYE_FORMATS`; ``notes`` become comments.  ValueError if the format can't express
-    it.
-    """
+    """The text in one of :data:`HAND_EYE_FORMATS`, with ``notes`` as comments.  ValueError if it can't be expressed."""
     notes = [" ".join(note.split()) for note in notes]
     writer = {"ros-static": _ros_static, "urdf": _urdf, "easy_handeye2": _easy_handeye2, "json": _json}[kind]
     return writer(hand_eye, notes)

@@ -156,8 +156,8 @@ def refine(
         root = whiten if whiten is not None else _weights_of(values[used])
         if count > FEWEST_POSES:
             sizes = _sizes(root, values)
-            # Norms of six coordinates: sqrt(3) makes the tuning of the biweight, meant for single coordinates, apply to
-            # them.
+            # Norms of six coordinates are typically sqrt(3) times those of two, to which TUKEY * scale is applied
+            # elsewhere.
             weights = tukey_weights(sizes, TUKEY * _scale(sizes, 6) * float(np.sqrt(3.0)))
         before = cam_T_base, ee_T_target
         cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, before, root, weights)

@@ -51,8 +51,8 @@ _NOISE_ROUNDS = 8
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """Measured spots: ``uv_px`` (n, 2), ``covariance_px`` (n, 2, 2) or None; ``others``: further candidates, (k, 2)
-    each.
+    """Measured spots: ``uv_px`` (n, 2), ``covariance_px`` (n, 2, 2) or None; ``others`` (k, 2) each: more
+    candidates.
     """
 
     uv_px: Array

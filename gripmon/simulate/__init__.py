@@ -1,4 +1,4 @@
-"""A simulated wrist camera with exact truth: two solid fingers before moving clutter, sensor, disturbances."""
+"""A simulated wrist camera with exact truth: two solid fingers in front of moving clutter, sensor, disturbances."""
 
 from gripmon.simulate.bodies import FrameTruth, Hidden
 from gripmon.simulate.builtin import DEFAULT_FPS, SCENARIO_NAMES, make_scenario

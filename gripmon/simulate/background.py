@@ -1,6 +1,6 @@
-"""The table below the gripper and what stands on it, seen through the lens while the robot moves over it.
+"""The table below the gripper and the things on it, seen through the lens while the robot moves over it.
 
-Its picture need not be exact to a hundredth of a pixel, only believable: textures with straight strong edges, parallax
+The image needn't be exact to a hundredth of a pixel, only realistic: textures with straight strong edges, parallax
 between the table and the tops of boxes, motion blur.  Table frame: z into the table, which is z = 0; x and y periodic.
 """
 
@@ -23,14 +23,14 @@ from gripmon.simulate.scenario import Background
 _TILE_PX = 2048
 _SQUARE_M = 0.01
 _LEG_S = 1.6
-_LIVELY_M_PER_S = 0.06  # from here on a wandering robot also turns and changes its height fully
+_LIVELY_M_PER_S = 0.06  # from this speed on a wandering robot also rotates and changes its height fully
 _LEAST_TEXTURED_PX = 12.0
 _SMEAR_FROM_PX = 0.4
 
 
 @dataclass(frozen=True)
 class _Block:
-    """A box that stands on the table: base centre, half sizes, turn, height, five textures (top, four sides)."""
+    """A box that stands on the table: base centre, half sizes, rotation, height, five textures (top, four sides)."""
 
     centre_m: Array
     half_m: tuple[float, float]
@@ -60,14 +60,14 @@ class TableView:
         self._path = _Path(rng, settings)
 
     def cam_T_table(self, cam_T_grip: Array, t_s: float) -> Array:
-        """Pose of the table in the camera frame while the robot follows its path."""
+        """Pose (4, 4) of the table in the camera frame while the robot follows its path."""
         x, y, turn, height_m = self._path.at(t_s)
         c, s = math.cos(turn), math.sin(turn)
         table_R_grip = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return cam_T_grip @ invert(make_transform(table_R_grip, np.array([x, y, -height_m])))
 
     def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
-        """Picture of the table at the middle of the exposure, smeared by the motion within it."""
+        """Image of the table at the middle of the exposure, blurred by the motion during it."""
         cam_T_table = self.cam_T_table(cam_T_grip, t_s)
         image = self._floor(cam_T_table)
         self._draw_blocks(image, cam_T_table)
@@ -84,7 +84,7 @@ class TableView:
         return np.asarray(image, dtype=np.uint8)
 
     def _smear(self, image: NDArray[np.uint8], cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
-        """Uniform motion over the exposure, as a small kernel."""
+        """Blur by a uniform motion over the exposure, with a small kernel."""
         x, y, _, height_m = self._path.at(t_s)
         below = np.array([x, y, 0.0])  # the table point below the TCP at the middle of the exposure
         ends = []
@@ -190,7 +190,7 @@ class TableView:
 
 
 class _Path:
-    """Where the gripper is over the table: x, y (m), turn about its z axis (rad), height (m)."""
+    """The gripper's path over the table: x, y (m), rotation about its z axis (rad), height (m)."""
 
     def __init__(self, rng: np.random.Generator, settings: Background) -> None:
         self._settings = settings
@@ -235,7 +235,7 @@ class _Path:
 
 
 def _smear_kernel(step_px: Array) -> NDArray[np.float32]:
-    """Kernel of a straight motion (2,): many points on it, each shared among its four pixels."""
+    """Kernel of a straight motion (2,): many points on it, each distributed over its four pixels."""
     half = math.ceil(0.5 * float(np.abs(step_px).max()) + 0.5)
     points = half + (np.linspace(-0.5, 0.5, 8 * half + 1)[:, None] * step_px)
     kernel = np.zeros((2 * half + 2, 2 * half + 2), np.float32)
@@ -255,7 +255,7 @@ def _outline(block: _Block) -> Array:
 
 
 def _paint_quad(image: NDArray[np.uint8], corners_px: Array, texture: NDArray[np.uint8]) -> None:
-    """Paint a textured quadrilateral (4, 2), its texture by the homography of its corners."""
+    """Paint a textured quadrilateral (4, 2), with its texture mapped by the homography of its corners."""
     height, width = image.shape
     low = np.maximum(np.floor(corners_px.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(corners_px.max(axis=0)).astype(int) + 2, (width, height))

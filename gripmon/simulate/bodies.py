@@ -1,6 +1,6 @@
-"""The solids of a scenario and where they are: fingers, the bodies that carry them, the grasped object, covers.  And
-what is true about a frame, to rounding: poses, openings, corner pixels, what hides which corner, and how much of each
-finger's outline can be seen.
+"""The solids of a scenario and their poses: fingers, the bodies that carry them, the grasped object, covers.  Also the
+truth about a frame, up to rounding: poses, openings, corner pixels, what hides each corner, and how much of each
+finger's outline is visible.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from gripmon.simulate.scenario import Cover, Prop, Scenario
 from gripmon.simulate.scene import COVER_TRAVEL, SceneState
 from gripmon.simulate.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place
 
-# Half width of a cover over half the view's larger side.
+# Half width of a cover, over half the larger side of the view.
 COVER_HALF = 1.35
 
 
 class Bodies:
-    """Shapes only, no textures.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
+    """The shapes only, no textures.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
 
     def __init__(self, gripper: Gripper, scenario: Scenario, view_half: Array) -> None:
         self.gripper = gripper
@@ -54,7 +54,7 @@ class Bodies:
         return paint_order(placed)
 
     def _grip_T_body(self, state: SceneState, index: int, part: int, grip_T_prop: Array) -> Array:
-        """Pose of a part of a prop: copies move with the jaws, mirror images the other way along z."""
+        """Pose of a part of a prop: copies move with the jaws, mirror images in the opposite direction along z."""
         match self._copies[index]:
             case "box":
                 return grip_T_prop
@@ -86,7 +86,7 @@ class Bodies:
         return out
 
     def covered(self, state: SceneState, points_cam_m: Array) -> NDArray[np.bool_]:
-        """(n,) which of the points (n, 3) in the camera frame a cover hides."""
+        """(n,) which of the points (n, 3) in the camera frame are hidden by a cover."""
         covered = np.zeros(len(points_cam_m), dtype=bool)
         for _, outline in self.placed_covers(state):
             covered |= _behind(outline, points_cam_m)
@@ -97,7 +97,7 @@ class Bodies:
         return any(solid is own for own in (*self.fingers, *self.carriers))
 
     def _reason(self, solid: Solid) -> tuple[Hidden, NDArray[np.bool_]]:
-        """What a body's hiding is called, and which corners are its own."""
+        """The reason for what a body hides, and which corners are its own."""
         for k, finger in enumerate(self.fingers):
             if finger is solid:
                 return Hidden.OTHER_FINGER, self._corner_finger == k
@@ -106,7 +106,7 @@ class Bodies:
 
 
 def _behind(outline: Array, points_cam_m: Array) -> NDArray[np.bool_]:
-    """(n,) whether the rays to the points pass through a flat outline (k, 3) at constant z before the points."""
+    """(n,) whether the rays to the points pass through a flat outline (k, 3) at constant z in front of the points."""
     depth = outline[0, 2]
     inside = np.zeros(len(points_cam_m), dtype=bool)
     z = points_cam_m[:, 2]
@@ -118,7 +118,7 @@ def _behind(outline: Array, points_cam_m: Array) -> NDArray[np.bool_]:
 
 
 def _carrier(finger: Solid) -> Solid:
-    """The body behind a finger that carries it: a little thicker, reaching outwards."""
+    """The body behind a finger that carries it: slightly thicker, extending outwards."""
     low, high = finger.vertices_m.min(axis=0), finger.vertices_m.max(axis=0)
     size = high - low
     outwards = math.copysign(1.0, float(low[0] + high[0]))
@@ -134,7 +134,7 @@ def _carrier(finger: Solid) -> Solid:
 
 
 def _prop(number: int, prop: Prop, fingers: tuple[Solid, ...]) -> tuple[Solid, ...]:
-    """The bodies of a prop, their names unlike all others."""
+    """The bodies of a prop, with unique names."""
     if prop.shape == "box":
         half = 0.5 * np.array(prop.size_m)
         return (box(f"prop {number}", -half, half),)
@@ -175,9 +175,9 @@ _POINTS_PER_EDGE = 24
 
 @dataclass(frozen=True, slots=True)
 class OutlineSeen:
-    """Shares (f,) of each finger's edges: of those of its tip, and of all of them in the image.
+    """Visible shares (f,) of each finger's edges: of those of its tip, and of all that are in the image.
 
-    1 where nothing but the gripper itself hides any; edges that the gripper hides don't count.
+    1 if nothing but the gripper itself hides any; edges hidden by the gripper don't count.
     """
 
     tips: Array
@@ -185,7 +185,7 @@ class OutlineSeen:
 
 
 class Outline:
-    """Points on the edges of a gripper's model; only contours, so that a wrong model is judged by the true one."""
+    """Points on the edges of a gripper's model; contours only, so that a wrong model is judged by the true one."""
 
     def __init__(self, gripper: Gripper) -> None:
         share = (np.arange(_POINTS_PER_EDGE) + 0.5) / _POINTS_PER_EDGE
@@ -199,7 +199,7 @@ class Outline:
         self._fingers = len(gripper.finger_ids)
 
     def seen(self, camera: Camera, bodies: Bodies, state: SceneState) -> OutlineSeen:
-        """Shares in a scene's state."""
+        """Visible shares in a scene's state."""
         grip = state.points_grip_m
         points = (1.0 - self._share) * grip[self._start] + self._share * grip[self._end]
         points = points @ state.cam_T_grip[:3, :3].T + state.cam_T_grip[:3, 3]
@@ -221,7 +221,7 @@ class Outline:
 
 
 class Hidden(enum.StrEnum):
-    """Why a corner can't be seen."""
+    """Why a corner isn't visible."""
 
     OUTSIDE = "outside"
     SELF = "self"
@@ -235,10 +235,10 @@ class Hidden(enum.StrEnum):
 class FrameTruth:
     """Truth of one frame, at the middle of its exposure.
 
-    ``reference_cam_T_grip`` is what a perfect calibration gave before; ``tcp_shift_m`` (3,) the TCP's displacement
-    since, camera axes.  ``corner_uv_px`` (c, 2), in the gripper's order, lie in the distorted image, NaN behind the
+    ``reference_cam_T_grip`` is a perfect calibration from before; ``tcp_shift_m`` (3,) the TCP's displacement since
+    then, camera axes.  ``corner_uv_px`` (c, 2), in the gripper's order, lie in the distorted image, NaN behind the
     camera; ``hidden`` (c,) is None where visible.  ``finger_bend`` (f, 4, 4) maps a finger's points at nominal opening
-    to where its bending takes them, gripper frame.
+    to where its bending moves them, gripper frame.
     """
 
     index: int
@@ -259,7 +259,7 @@ class FrameTruth:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """(c,) which corners can be seen."""
+        """(c,) which corners are visible."""
         return np.array([h is None for h in self.hidden])
 
     def to_json(self, file: str) -> bytes:

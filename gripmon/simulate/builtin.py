@@ -1,4 +1,4 @@
-"""Named scenarios.  All times scale with the duration that is asked for."""
+"""Named scenarios.  All times scale with the requested duration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PAIR_FPS = 0.1
 
 
 def _between_frames(t_s: float, fps: float) -> float:
-    """The last time before ``t_s`` in the middle between two frames: a jump there is in no frame's exposure."""
+    """The last midpoint between two frames before ``t_s``: a jump at that time is in no frame's exposure."""
     return max(math.floor(t_s * fps - 0.5) + 0.5, 0.5) / fps
 
 
@@ -86,14 +86,15 @@ _TIMED: dict[str, tuple[float, Callable[[float, float], dict[str, Any]]]] = {
         ),
         "sensor": Sensor(jpeg_quality=80),
     }),
-    # The robot wanders over a table; then something hits the camera.
+    # The robot moves over a table; then something hits the camera.
     "work": (3.0, lambda t, fps: {"mount": _knock(t, fps, 0.0, 0.0009)}),
     "bent_finger": (10.0, lambda _t, _fps: {}),
 }  # fmt: skip
-"""How long each takes by itself (s), and what happens in it, whatever its length (s) and rate (1/s)."""
+"""Default duration (s) of each, and a function from duration (s) and frame rate (1/s) to what happens."""
 _SERIES = {"series1": ((1.5e-3, 0.0), 3e-4), "series2": ((0.0, 4.5e-3), 2e-4)}
-"""1: a cable pulls sideways, 1.5 ± 0.3 mm; 2: the mount is turned, 4.5 ± 0.2 mm.  As in the paper the gripper is parked
-on the calibration plate, in both images of a pair."""
+"""1: a cable pulls sideways, 1.5 ± 0.3 mm; 2: the mount is rotated, 4.5 ± 0.2 mm.  As in the paper, the gripper is
+parked on the calibration plate in both images of a pair.
+"""
 SCENARIO_NAMES = (*_TIMED, *_SERIES)
 DEFAULT_FPS = 30.0
 
@@ -106,11 +107,11 @@ def make_scenario(
     finger: str = "left",
     jaw_opening_m: float | None = None,
 ) -> Scenario:
-    """A named scenario, its times scaled to a duration (its own if None).
+    """A named scenario, its times scaled to a duration (the default if None).
 
-    ``finger`` is the one that ``bent_finger`` bends, ``jaw_opening_m`` where the jaws stand in ``work`` (nominal if
-    None).  The series are the paper's: twenty pairs of images, without a
-    time scale, so a duration or a frame rate is refused.  ValueError for an unknown name.
+    ``finger`` is the one that ``bent_finger`` bends, ``jaw_opening_m`` the jaw opening in ``work`` (nominal if None).
+    The series are the paper's: twenty pairs of images without a time scale, so that a duration or a frame rate is
+    refused.  ValueError for an unknown name.
     """
     if name in _SERIES:
         if duration_s is not None or fps is not None:

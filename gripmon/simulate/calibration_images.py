@@ -1,5 +1,5 @@
-"""What the off-line calibrations start from, of one camera and one gripper: images of a plate, of the gripper standing
-on it, of a board seen from many poses of the robot, and spots of a laser pointer for a second camera.
+"""Inputs for the off-line calibrations, of one camera and one gripper: images of a plate, of the gripper standing on
+it, of a board from many poses of the robot, and spots of a laser pointer for a second camera.
 
 Each folder holds ``truth.json`` beside its images.  ``truth`` is what the images were made from; no measurement of
 gripmon's own is used here.
@@ -32,26 +32,26 @@ from gripmon.simulate.scenario import JawScript, Scenario, Sensor
 from gripmon.simulate.sequence import PNG_COMPRESSION, Simulator
 
 PLATE = CircleGrid(12, 10, 0.008, 0.004)
-"""Mostly light, so that dark fingers show before it."""
+"""Mostly light, so that dark fingers stand out in front of it."""
 BOARD = Charuco(8, 6, 0.015, 0.011, "DICT_4X4_250")
 SECOND_PLATE = CircleGrid(12, 10, 0.03, 0.015)
 SECOND_LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=543.0, fy_px=543.0, cx_px=321.0, cy_px=238.5,
     coefficients=(-0.11, 0.04, 0.0004, -0.0003),
 )  # fmt: skip
-"""Of the second camera, fixed beside the robot."""
+"""The second camera, fixed beside the robot."""
 ROUGH_OFF_PX = 4.0
-"""How far a person's rough corners are off at most, u and v."""
+"""Largest error of a person's rough corners, in u and v."""
 _STANDING = 3
 _FREE_VIEWS, _FINGER_VIEWS = 6, 6
 _ROBOT_POSES = 12
 _ORIENTATIONS, _FRESH_ORIENTATIONS = 5, 2
 _BORDER_PX = 15.0
-"""Distance of spots from the image's border: three times their radius."""
+"""Minimum distance of spots from the image's border: three times their radius."""
 _ARM_SIGMAS = np.array([5e-5] * 3 + [1e-4] * 3)
-"""How exact the robot's reported poses are, each axis (m, rad): a good arm's repeatability."""
+"""Standard deviations of the robot's reported poses, each axis (m, rad): a good arm's repeatability."""
 _CAMERA_MOTION = np.array([2e-3, -1e-3, 1e-3, 0.002, 0.004, -0.003])
-"""By which the second camera is knocked before the fresh spots (m, rad)."""
+"""Motion of the second camera before the fresh spots (m, rad)."""
 
 Progress = Callable[[], None]
 
@@ -66,15 +66,15 @@ class Rig:
 
     @property
     def jaw_opening_m(self) -> float:
-        """Far open, so that the fingers stand near the image's borders and leave the plate visible; nominal for a
-        gripper without a jaw.
+        """Nearly fully open, so that the fingers are near the image's borders and leave the plate visible; nominal for
+        a gripper without a jaw.
         """
         low, high = self.gripper.jaw_min_m, self.gripper.jaw_max_m
         return low + 5.0 / 6.0 * (high - low) if self.gripper.has_jaw else self.gripper.jaw_nominal_m
 
 
 def image_count(kind: str) -> int:
-    """How many images a kind of :data:`KINDS` has."""
+    """Number of images of a kind of :data:`KINDS`."""
     return {"plate": _FREE_VIEWS + _FINGER_VIEWS, "standing": _STANDING, "robot_world": _ROBOT_POSES}.get(
         kind, 10 * _ORIENTATIONS + 1 + _FREE_VIEWS + _FINGER_VIEWS
     )
@@ -83,8 +83,8 @@ def image_count(kind: str) -> int:
 def write_calibration_images(
     kind: str, rig: Rig, out_dir: Path, seed: int = 0, progress: Progress = lambda: None
 ) -> None:
-    """Write a kind of :data:`KINDS` into an existing folder.  ``progress`` is called after each image.  OSError when a
-    file can't be written, ValueError when the gripper doesn't suit: no closed convex fingers, or jaws without tips.
+    """Write a kind of :data:`KINDS` into an existing folder.  ``progress`` is called after each image.  OSError if a
+    file can't be written, ValueError for an unsuitable gripper: no closed convex fingers, or jaws without tips.
     """
     _WRITERS[kind](_Folder(out_dir, progress), rig, seed)
 
@@ -116,7 +116,7 @@ def _plain(value: Any) -> Any:
 
 
 def _plate(folder: _Folder, rig: Rig, seed: int) -> None:
-    """First without the gripper, the plate near and out to the image's corners; then behind the fingers."""
+    """First without the gripper, with the plate near and filling the image to its corners; then behind the fingers."""
     rng = np.random.default_rng([seed, 11])
     near_m = float(rig.cam_T_grip[2, 3])
     views = []
@@ -135,7 +135,7 @@ def _plate(folder: _Folder, rig: Rig, seed: int) -> None:
 def _tilted(
     camera: Camera, target: Target, depths: tuple[float, float], unit_m: float, share: float, rng: np.random.Generator
 ) -> Array:
-    """A plate tilted by 0.5 rad to one of the sides all round, its middle beside the image's."""
+    """A plate tilted by 0.5 rad towards one of the directions all round, its centre beside the image's."""
     way = 2.0 * math.pi * share
     depth = float(rng.uniform(*depths)) * unit_m
     half = 0.5 * depth * np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px])
@@ -170,7 +170,7 @@ def _standing(folder: _Folder, rig: Rig, seed: int) -> None:
 
 
 def _robot_world(folder: _Folder, rig: Rig, seed: int) -> None:
-    """A board stands on the table, the wrist camera looks at it from all sides, the robot reports its flange's pose."""
+    """A fixed board on the table, seen by the wrist camera from all sides, with the flange's pose from the robot."""
     rng = np.random.default_rng([seed, 13])
     ee_T_grip = make_transform(exp_rotation(np.array([0.0, 0.0, 0.6])), np.array([0.004, -0.002, 0.165]))
     ee_T_cam = ee_T_grip @ invert(rig.cam_T_grip)
@@ -192,7 +192,7 @@ def _robot_world(folder: _Folder, rig: Rig, seed: int) -> None:
 
 
 def _spots(folder: _Folder, rig: Rig, seed: int) -> None:
-    """A second camera beside the robot: its plate, spots in images, and spots after it was knocked."""
+    """A second camera beside the robot: its plate, images of spots, and spots after it was knocked."""
     rng = np.random.default_rng([seed, 14])
     camera = make_camera(SECOND_LENS)
     views = []
@@ -247,7 +247,7 @@ def _with_gripper(rig: Rig, plate: Plate, seed: int, number: int) -> Image:
     knots = ((0.0, rig.jaw_opening_m),) if rig.gripper.has_jaw else ()
     scenario = Scenario(name="plate", jaw=JawScript(knots=knots))
     backdrop = PlateBackdrop(plate, rig.camera.settings, scenario.sensor.psf_sigma_px)
-    own = seed * 100 + number  # noise of its own for each image
+    own = seed * 100 + number  # independent noise for each image
     return Simulator(rig.camera, rig.gripper, rig.cam_T_grip, scenario, own, backdrop).render(0)
 
 
@@ -259,15 +259,15 @@ def _without_gripper(camera: Camera, plate: Plate, seed: int, number: int) -> Im
 _CONTACT_M = 2e-4
 """Distance from the foremost point within which a point touches the plate."""
 _RISE = 0.35
-"""Of the rising edge's length: some way up, where the edge still shows."""
+"""Fraction of the rising edge's length: some way up, where the edge is still visible."""
 
 
 def rough_corners(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, rng: np.random.Generator, off_px: float
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """True pixels (2,) and rough ones, up to ``off_px`` off in u and v, by the names for a gripper without a file:
-    ``left_inner_near`` and so on, the left finger on the left of the image and the near side above.  ValueError where
-    two fingertips of three corners or more don't stand on one plane.
+    ``left_inner_near`` and so on, with the left finger on the left of the image and the near side at the top.
+    ValueError unless two fingertips with three or more corners each stand on one plane.
     """
     points = gripper.points_grip_m(jaw_opening_m)
     uv = camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])

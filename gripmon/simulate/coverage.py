@@ -1,4 +1,4 @@
-"""Exact coverage of polygons seen through a lens: what share of each pixel a face fills, blurred by the lens.
+"""Exact coverage of polygons seen through a lens: the share of each pixel that a face fills, blurred by the lens.
 
 A mask M is the face's indicator convolved with the camera's point spread function (a Gaussian) and with the square
 pixel, sampled at pixel centres.  By the divergence theorem its derivative along a row is an integral over the boundary,
@@ -6,10 +6,11 @@ pixel, sampled at pixel centres.  By the divergence theorem its derivative along
     dM/dx (x, y) = ∮ K(x - x_b) K(y - y_b) dy_b,     K = Gaussian * unit box,
 
 so each short piece of the boundary adds a small patch, and a running sum along the rows gives M.  K is smooth, so two
-Gauss points a piece are enough; curved boundaries cost nothing.  There is no supersampling and no aliasing: the mask is
-what a sensor with full fill factor would see.
+Gauss points per piece are enough, and curved boundaries cost nothing extra.  There is no supersampling and no aliasing:
+the mask is what a sensor with full fill factor would see.
 
-Beside that the ideal viewing rays of all pixels, on a coarse grid: smooth maps made there are enlarged to the image.
+This module also has the ideal viewing rays of all pixels, on a coarse grid: smooth maps computed there are interpolated
+to the image.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Coverage:
 
 
 class CoverageRaster:
-    """Turns faces in the camera frame into masks, for one camera and one point spread function."""
+    """Computes masks of faces in the camera frame, for one camera and one point spread function."""
 
     def __init__(self, camera: Camera, psf_sigma_px: float) -> None:
         self._camera = camera
@@ -58,7 +59,7 @@ class CoverageRaster:
         self._where, self._what = np.empty((0, 0, 0), dtype=np.intp), np.empty((0, 0, 0))
 
     def masks(self, polygons_cam_m: list[Array]) -> list[Coverage | None]:
-        """One mask a polygon (k, 3), planar, counter-clockwise seen from the camera; None for what is out of sight."""
+        """One mask per polygon (k, 3), planar, counter-clockwise seen from the camera; None if it is out of view."""
         loops = [_clip(polygon, self._view_planes) for polygon in polygons_cam_m]
         pieces = _trace(self._camera, loops, self._step_px, self._radius)
         return [None if piece is None else self._accumulate(*piece) for piece in pieces]
@@ -91,14 +92,14 @@ class CoverageRaster:
         np.multiply((weights_v * dy[:, None])[:, :, None], weights_u[:, None, :], out=what)
         rows = bottom - top + 2 * pad
         slopes = np.bincount(where.ravel(), what.ravel(), minlength=rows * stride).reshape(rows, stride)
-        # Running sums along the rows, by way of sums over rectangles: much faster than a cumulative sum.
+        # Running sums along the rows as differences of an integral image: much faster than a cumulative sum.
         sums = np.asarray(cv2.integral(slopes))[pad : rows - pad + 1, pad + 1 : stride - pad + 1]
         mask = np.empty((bottom - top, right - left), np.float32)
         np.subtract(sums[1:], sums[:-1], out=mask)
         return Coverage(left, top, mask)
 
     def _scratch(self, count: int) -> tuple[NDArray[np.intp], Array]:
-        """Index and weight arrays (count, rows, columns) of patches; kept: fresh memory costs more than the sums."""
+        """Index and weight arrays (count, rows, columns) of patches, reused: fresh memory costs more than the sums."""
         if len(self._where) < count:
             shape = (count + count // 2, 2 * self._reach, 2 * self._reach + 1)
             self._where, self._what = np.empty(shape, dtype=np.intp), np.empty(shape)
@@ -121,7 +122,7 @@ def _kernel_tables(sigma_px: float, reach: int) -> tuple[Array, Array]:
 
 
 def _view_planes(camera: Camera) -> Array:
-    """Planes (p, 3) through the camera's centre, ``a·X >= 0`` inside: a convex cone, a little wider than the view."""
+    """Planes (p, 3) through the camera's centre, ``a·X >= 0`` inside: a convex cone, slightly wider than the view."""
     xy = _view_border(camera)
     centre = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
     angle = np.linspace(0.0, 2.0 * np.pi, 17)[:-1]
@@ -132,7 +133,7 @@ def _view_planes(camera: Camera) -> Array:
 
 
 def _view_border(camera: Camera) -> Array:
-    """Ideal coordinates (n, 2) of the image's border, as far as the lens sees it."""
+    """Ideal coordinates (n, 2) of the image's border, where the lens maps it."""
     share = np.linspace(0.0, 1.0, 49)[:-1]
     zero, one = np.zeros_like(share), np.ones_like(share)
     sides = ((share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share))
@@ -144,7 +145,8 @@ def _view_border(camera: Camera) -> Array:
 def _lens_radius(camera: Camera) -> float:
     """Ideal radius up to which outlines are followed: the end of the lens model, or earlier, just outside the image.
 
-    Infinite for a model without end.  A model stretches without bounds towards its end: hence not further than needed.
+    Infinite for a model without end.  A model stretches without bounds towards its end, so the radius is only as large
+    as needed.
     """
     turn = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
     ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -166,7 +168,7 @@ def _lens_radius(camera: Camera) -> float:
 
 
 def _clip(polygon: Array, planes: Array) -> Array:
-    """Cut a planar polygon (k, 3) by half spaces ``a·X >= 0`` (Sutherland-Hodgman); may become empty."""
+    """Cut a planar polygon (k, 3) by half spaces ``a·X >= 0`` (Sutherland-Hodgman); the result may be empty."""
     heights = polygon @ planes.T
     crossed = (heights < 0.0).any(axis=0)
     if not crossed.any():
@@ -219,7 +221,7 @@ def _trace(camera: Camera, loops: list[Array], step_px: float, radius: float) ->
 
 
 def _piece_counts(camera: Camera, a: Array, b: Array, step_px: float, radius: float) -> NDArray[np.intp]:
-    """Into how many pieces (e,) the lines from a to b (e, 2) have to be cut, so that none is longer than the step."""
+    """Number of pieces (e,) into which the lines from a to b (e, 2) are cut, none longer than the step."""
     share = np.linspace(0.0, 1.0, _PROBES + 1)[None, :, None]
     probes = a[:, None] + share * (b - a)[:, None]
     uv = _distort(camera, probes.reshape(-1, 2), radius).reshape(len(a), _PROBES + 1, 2)
@@ -228,7 +230,7 @@ def _piece_counts(camera: Camera, a: Array, b: Array, step_px: float, radius: fl
 
 
 def _distort(camera: Camera, xy: Array, radius: float) -> Array:
-    """Ideal points (n, 2) -> pixels; what lies beyond the radius goes to it, which is still outside the image."""
+    """Ideal points (n, 2) -> pixels; points beyond the radius are moved to it, which is still outside the image."""
     if math.isfinite(radius):
         xy = xy * np.minimum(1.0, radius / np.maximum(np.hypot(xy[:, 0], xy[:, 1]), radius))[:, None]
     return camera.distort(xy)
@@ -248,7 +250,7 @@ class RayGrid:
         v = (np.arange(rows) - 0.5) * CELL_PX - 0.5
         grid = np.stack(np.meshgrid(u, v), axis=-1)
         xy = camera.undistort(grid.reshape(-1, 2))
-        if not np.isfinite(xy).all():  # beyond the lens: repeat the image's border
+        if not np.isfinite(xy).all():  # outside the lens's domain: repeat the image's border
             inside = np.clip(grid, 0.0, (self.width_px - 1.0, self.height_px - 1.0))
             xy = np.where(np.isfinite(xy), xy, camera.undistort(inside.reshape(-1, 2)))
         self.seen = np.isfinite(xy).all(axis=1).reshape(rows, columns)
@@ -264,7 +266,7 @@ class RayGrid:
         matrix = np.linalg.inv(np.column_stack([cam_T_plane[:3, :2], cam_T_plane[:3, 3]]))
         matrix[:2] *= px_per_m
         x, y, w = np.moveaxis(rays @ matrix.T, -1, 0)
-        w = np.maximum(w, 1e-9)  # rays that leave over the plane's horizon meet nothing: send them far away
+        w = np.maximum(w, 1e-9)  # rays above the plane's horizon meet nothing: send them far away
         limit = _FARTHEST_TEXEL
         return (
             np.clip(x / w, -limit, limit).astype(np.float32),
@@ -272,12 +274,12 @@ class RayGrid:
         )
 
     def enlarge(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A map on all cells -> on all pixels."""
+        """Interpolate a map on all cells to all pixels."""
         large = enlarge_cells(coarse)
         return large[CELL_PX : CELL_PX + self.height_px, CELL_PX : CELL_PX + self.width_px]
 
     def window(self, left: int, top: int, width: int, height: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Cells that cover a pixel window with margin, and where the window lies in the enlarged cells."""
+        """Cells that cover a pixel window with margin, and the window's position in the enlarged cells."""
         first_u, first_v = left // CELL_PX, top // CELL_PX
         last_u, last_v = (left + width - 1) // CELL_PX + 3, (top + height - 1) // CELL_PX + 3
         u, v = left - (first_u - 1) * CELL_PX, top - (first_v - 1) * CELL_PX

@@ -1,5 +1,5 @@
-"""What moves, as closed functions of time: camera mount, fingers, jaws, things in the way, light; no
-history.  And the sensor, from light to counts: vignetting, exposure, shadows, defocus, shot and read noise, saturation,
+"""Everything that moves, as closed functions of time without history: camera mount, fingers, jaws, things in the way,
+light.  And the sensor, from light to counts: vignetting, exposure, shadows, defocus, shot and read noise, saturation,
 JPEG.
 """
 
@@ -45,7 +45,7 @@ def smooth_step(t_s: float, start_s: float, time_s: float) -> float:
 
 
 def pulse(t_s: float, start_s: float, end_s: float, ramp_s: float) -> float:
-    """Rises within ``ramp_s`` from ``start_s`` on, falls within ``ramp_s`` up to ``end_s``."""
+    """Rises within ``ramp_s`` from ``start_s`` on, falls within ``ramp_s`` before ``end_s``."""
     return min(smooth_step(t_s, start_s, ramp_s), 1.0 - smooth_step(t_s, end_s - ramp_s, ramp_s))
 
 
@@ -70,7 +70,7 @@ def law(script: MountScript, t_s: float) -> float:
 
 
 def law_events(script: MountScript, t_s: float) -> tuple[str, ...]:
-    """Labels of what the mount does at a time; empty while it rests."""
+    """Labels of the mount's motions at a time; empty while it rests."""
     match script:
         case Creep():
             past = (t_s - script.start_s) / script.time_s
@@ -88,9 +88,9 @@ def law_events(script: MountScript, t_s: float) -> tuple[str, ...]:
 
 
 def full_motion(motion: MountMotion, pivot_m: Array, tcp_m: Array) -> tuple[Array, Array]:
-    """Rotation vector (3,) about the pivot and translation (3,) of a motion at full size, camera axes.
+    """Rotation vector (3,) about the pivot and translation (3,) of a full-size motion, camera axes.
 
-    Raises ValueError when no turn about the pivot can shift the TCP so far.
+    Raises ValueError if no rotation about the pivot can shift the TCP that far.
     """
     lever = tcp_m - pivot_m
     turned = lever.copy()
@@ -122,7 +122,7 @@ def mount_motion(
 
 
 def about_pivot(turn: Array, shift: Array, pivot_m: Array) -> Array:
-    """4x4 motion that turns by a rotation vector about the pivot, then shifts."""
+    """4x4 motion: a rotation vector about the pivot, then a shift."""
     rotation = exp_rotation(turn)
     return make_transform(rotation, pivot_m - rotation @ pivot_m + shift)
 
@@ -142,7 +142,7 @@ def jaw_opening_m(script: JawScript, nominal_m: float, t_s: float) -> float:
 
 
 def object_distance_m(script: GraspedObject, t_s: float) -> float:
-    """How far the object still is from its place between the fingers, along gripper z."""
+    """Distance of the object from its place between the fingers, along gripper z."""
     start, end = script.arrive_s
     gone, away = script.leave_s
     here = smooth_step(t_s, start, end - start) - smooth_step(t_s, gone, away - gone)
@@ -150,7 +150,7 @@ def object_distance_m(script: GraspedObject, t_s: float) -> float:
 
 
 def prop_offset_m(script: Prop, t_s: float) -> Array | None:
-    """How far a prop is from its place (3,), gripper axes; None while it isn't there."""
+    """Offset (3,) of a prop from its place, gripper axes; None while it isn't there."""
     if not script.start_s <= t_s < script.end_s:
         return None
     here = pulse(t_s, script.start_s, script.end_s, script.move_s)
@@ -186,7 +186,7 @@ _COARSE_FROM_PX = 4.0  # a shadow with a softer border may be computed on coarse
 
 
 class SensorModel:
-    """Turns the light that falls on the sensor (DN at exposure 1, float32) into an 8-bit image."""
+    """Turns the light on the sensor (DN at exposure 1, float32) into an 8-bit image."""
 
     def __init__(self, rays: RayGrid, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
@@ -198,7 +198,7 @@ class SensorModel:
         self._banks = [(b - b.mean()) / b.std() for b in banks]
 
     def expose(self, light: Light32, index: int, time_s: float) -> NDArray[np.uint8]:
-        """Image of frame ``index``; ``light`` is used up."""
+        """Image of frame ``index``; ``light`` is overwritten."""
         scenario = self._scenario
         cv2.multiply(light, self._vignette, light, scale=exposure(scenario.light, time_s))
         for shadow in scenario.light.shadows:
@@ -210,7 +210,7 @@ class SensorModel:
         return image if scenario.sensor.jpeg_quality == 0 else _jpeg(image, scenario.sensor.jpeg_quality)
 
     def _add_noise(self, light: Light32, index: int) -> None:
-        """Two banks of noise, each at a random place, mixed by a random angle: cheap, and new for every frame."""
+        """Two fixed noise images, each at a random offset, mixed by a random angle: cheap, and new for every frame."""
         sensor = self._scenario.sensor
         if sensor.read_noise_dn > 0.0 or sensor.shot_noise_dn > 0.0:
             rng = np.random.default_rng([self._seed, 4, index])
@@ -227,7 +227,7 @@ class SensorModel:
         np.maximum(light, 0.0, out=light)
 
     def _shadow(self, shadow: Shadow, time_s: float) -> Light32:
-        """Factor of all pixels: a band that travels across the view, its borders half cosine waves."""
+        """Factor on all pixels: a band that travels across the view, its borders half cosine waves."""
         height, width = self._size
         cell_px = CELL_PX if shadow.softness * width > _COARSE_FROM_PX else 1
         u = (np.arange(-(-width // cell_px)) + 0.5) * cell_px / width - 0.5
@@ -243,7 +243,7 @@ class SensorModel:
         return coarse if cell_px == 1 else np.ascontiguousarray(enlarge_cells(coarse)[:height, :width])
 
     def _fall_off(self, rays: RayGrid) -> Light32:
-        """1 at the middle, less by the square of the distance; nothing where the lens doesn't see."""
+        """1 at the centre, less by the square of the distance; zero outside the lens's domain."""
         height, width = self._size
         u = np.linspace(-1.0, 1.0, width, dtype=np.float32)
         v = np.linspace(-1.0, 1.0, height, dtype=np.float32)
@@ -254,7 +254,7 @@ class SensorModel:
 
 
 def blur(light: Light32, sigma_px: float) -> Light32:
-    """Gaussian blur whose variance is right however small: three taps where a sampled Gaussian would be too narrow."""
+    """Gaussian blur with the exact variance however small: three taps where a sampled Gaussian would be too narrow."""
     if sigma_px == 0.0:
         return light
     if sigma_px >= _SAMPLED_FROM_PX:

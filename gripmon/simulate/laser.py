@@ -1,8 +1,8 @@
 """A laser pointer on an arm, a plane and a fixed camera: poses that keep the spot in view, and its images.
 
-The set-up is the laser-pointer paper's (Hu and Chang, Industrial Robot 39/2, 2012).  It leaves open how far the hand
-may be from the plane, how slanted the beam, nor how long the shifts: here the laser is 15 to 35 cm from its spot, up to
-50 degrees off the plane's normal, shifts are up to 12 cm.
+The set-up is the laser-pointer paper's (Hu and Chang, Industrial Robot 39/2, 2012).  The paper doesn't state the
+distance of the hand from the plane, the slant of the beam, or the length of the shifts: here the laser is 15 to 35 cm
+from its spot, up to 50 degrees off the plane's normal, and shifts are up to 12 cm.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class LaserCell:
     direction_ee: Array
 
     def seen_by(self, cam_T_base: Array) -> LaserCell:
-        """The same plane and laser before a camera elsewhere."""
+        """The same plane and laser, seen by a camera at another pose."""
         new_T_old = cam_T_base @ invert(self.cam_T_base)
         normal = new_T_old[:3, :3] @ self.normal_cam
         distance_m = self.distance_m + float(normal @ new_T_old[:3, 3])
@@ -40,7 +40,9 @@ class LaserCell:
 
 
 def paper_cell(rng: np.random.Generator) -> LaserCell:
-    """The paper's simulation: base_T_cam, laser, and a plane 550 mm away that is tilted by up to 5 degrees twice."""
+    """The paper's simulation: base_T_cam, laser, and a plane 550 mm away, tilted by up to 5 degrees about x and y
+    each.
+    """
     rotation = Rotation.from_euler("ZYX", [-90.0, -10.0, -170.0], degrees=True).as_matrix()
     base_T_cam = make_transform(rotation, np.array([0.510, 0.151, 0.430]))
     theta, phi = np.radians([-1.80, 53.39])
@@ -59,7 +61,7 @@ def spots_cam_m(cell: LaserCell, base_T_ee: Array) -> Array:
 
 
 def pixels_of(cell: LaserCell, camera: Camera, base_T_ee: Array) -> Array:
-    """The spots' pixels (n, 2), NaN outside the lens."""
+    """The spots' pixels (n, 2), NaN outside the lens's domain."""
     return camera.project(spots_cam_m(cell, base_T_ee))
 
 
@@ -67,8 +69,8 @@ def poses_on_plane(
     cell: LaserCell, camera: Camera, rng: np.random.Generator, *, orientations: int = 5,
     reach_m: tuple[float, float] = (0.15, 0.35), tilt_deg: float = 50.0, shift_m: float = 0.12, border_px: float = 2.0,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """``base_T_ee`` (n, 4, 4) and the number of the orientation (n,): ten spots each, a first pose and three shifts
-    along each of three random directions, all farther than ``border_px`` from the image's border.
+    """``base_T_ee`` (n, 4, 4) and the number of each one's orientation (n,): ten spots per orientation, a first pose
+    and three shifts along each of three random directions, all farther than ``border_px`` from the image's border.
     """
     base_T_cam = invert(cell.cam_T_base)
     size = np.array([camera.width_px, camera.height_px])
@@ -117,9 +119,9 @@ def spot_image(
     height: float = 200.0, speckle: float = 0.0, ambient: Array | None = None, noise: float = 2.0, colour: bool = False,
     reflections: tuple[tuple[float, float, float], ...] = (), dtype: type[Any] = np.uint8,
 ) -> Image:  # fmt: skip
-    """A spot at a pixel (2,), None: the laser is off.  A Gaussian of ``height`` grey levels over the background, cut
-    off at full scale; ``speckle`` contrast of its grains; ``reflections`` further blobs (u, v, height); ``ambient``
-    (h, w) grey levels.  Images of 16 bit hold 12.
+    """Image of a spot at a pixel (2,); None: the laser is off.  A Gaussian of ``height`` grey levels over the
+    background, saturated at full scale; ``speckle``: contrast of its grains; ``reflections``: further blobs (u, v,
+    height); ``ambient`` (h, w) grey levels.  16-bit images hold 12 bits.
     """
     width, rows = size_px
     v, u = np.mgrid[0:rows, 0:width].astype(float)

@@ -1,7 +1,7 @@
 """Calibration plates as a camera sees them: light on the sensor, ray by ray, from lens, pose and print.
 
-Every border of the print is a ramp one sample wide across its true place, so that an outline is right to first order
-however few samples a pixel has.  Nothing of the detection is used here.
+Every border of the print is a ramp one sample wide at its true position, so that an outline is correct to first order
+with any number of samples per pixel.  Nothing of the detection is used here.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from gripmon.model.records import Array
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
 
 SAMPLES = 2
-"""Samples a pixel has along each axis."""
+"""Samples per pixel along each axis."""
 _BEHIND_DN = 120.0
-"""Where a ray doesn't meet the plate's plane in front of the camera."""
+"""Grey value where a ray doesn't meet the plate's plane in front of the camera."""
 _MODULE_TEXELS = 16
-"""Texels along a module of a ChArUco board's marks: their borders are exact, only corners lose some of their tip."""
+"""Texels along a module of a ChArUco board's markers: borders are exact, only corners are slightly rounded."""
 
 Grey = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Print:
-    """A plate's appearance.  ``dark`` and ``light`` grey values (DN); ``margin`` of the plate around its pattern, in
-    squares or spacings, inf for a plate without a border; ``clutter`` what lies in its plane beyond that border;
-    ``inverted``: dark and light exchanged; ``errors_m`` (rows, columns, 2): how far each point of the print is off.
+    """A plate's appearance.  ``dark`` and ``light``: grey values (DN); ``margin`` of the plate around its pattern, in
+    squares or spacings, inf for a plate without a border; ``clutter``: what lies in its plane beyond that border;
+    ``inverted``: dark and light exchanged; ``errors_m`` (rows, columns, 2): error of each point of the print.
     """
 
     dark: float = 40.0
@@ -58,7 +58,7 @@ def points_of(target: Target) -> Array:
 
 
 def facing(target: Target, middle_m: Sequence[float], tilt_rad: Sequence[float], roll_rad: float = 0.0) -> Array:
-    """``cam_T_plate`` (4, 4) of a plate whose middle is at ``middle_m`` (3,), camera frame; it is rolled about the
+    """``cam_T_plate`` (4, 4) of a plate whose centre is at ``middle_m`` (3,), camera frame; it is rolled about the
     optical axis, then tilted about the camera's x and y axes.
     """
     rotation = exp_rotation(np.array([*tilt_rad, 0.0])) @ exp_rotation(np.array([0.0, 0.0, roll_rad]))
@@ -67,7 +67,7 @@ def facing(target: Target, middle_m: Sequence[float], tilt_rad: Sequence[float],
 
 @functools.lru_cache(maxsize=3)
 def sample_rays(lens: LensSettings, samples: int = SAMPLES) -> Array:
-    """Ideal coordinates (rows * samples, columns * samples, 2) of all samples; NaN where the lens doesn't see."""
+    """Ideal coordinates (rows * samples, columns * samples, 2) of all samples; NaN outside the lens's domain."""
     u = (np.arange(lens.width_px * samples) + 0.5) / samples - 0.5
     v = (np.arange(lens.height_px * samples) + 0.5) / samples - 0.5
     camera = make_camera(lens)
@@ -129,18 +129,18 @@ class Plate:
 
 
 class PlateBackdrop:
-    """A plate behind the simulator's gripper; it stands still against the camera."""
+    """A plate behind the simulator's gripper, fixed to the camera."""
 
     def __init__(self, plate: Plate, lens: LensSettings, blur_px: float) -> None:
         self._light = plate.light(lens, blur_px)
 
     def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> Grey:
-        """As :class:`gripmon.simulate.render.Backdrop` wants it."""
+        """As :class:`gripmon.simulate.render.Backdrop` requires."""
         return self._light.copy()
 
 
 class _Grid:
-    """Where the samples' rays meet the plate, x and y (rows, columns), m; and how far one sample reaches there."""
+    """Where the samples' rays meet the plate, x and y (rows, columns), m; and the size of one sample there."""
 
     def __init__(self, x: Array, y: Array) -> None:
         self.x, self.y = x, y
@@ -160,7 +160,7 @@ def _spacing_m(target: Target) -> float:
 
 
 def _covered(samples: Array) -> Array:
-    """Part of a sample on the inner side of a border that is this many samples away."""
+    """Part of a sample on the inner side of a border at this distance, in samples."""
     return np.asarray(np.clip(0.5 + samples, 0.0, 1.0))
 
 
@@ -176,7 +176,7 @@ def _discs(target: CircleGrid, errors_m: Array | None, grid: _Grid) -> Array:
 
 
 def _squares(grid: _Grid, square_m: float, low: float, high: tuple[float, float]) -> Array:
-    """Every second square of those from ``low`` to ``high`` (columns, rows), dark where their numbers' sum is even."""
+    """Every second square from ``low`` to ``high`` (columns, rows), dark where the sum of its indices is even."""
     signs = []
     for value, step, end in zip((grid.x, grid.y), (grid.step(1.0, 0.0), grid.step(0.0, 1.0)), high, strict=True):
         square = value / square_m
@@ -199,13 +199,13 @@ def _box(grid: _Grid, low_m: float, high_m: tuple[float, float]) -> Array:
 
 
 def _marks(target: Charuco, grid: _Grid) -> Array:
-    """The marks in the white squares alone: they don't touch the squares' borders."""
+    """Only the markers in the white squares: they don't touch the squares' borders."""
     distances, modules = _mark_distances(target)
     module_m, tile = target.marker_m / modules, (modules + 2) * _MODULE_TEXELS
     i, j = np.floor(grid.x / target.square_m), np.floor(grid.y / target.square_m)
     white = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows) & ((i + j) % 2 == 1)
     number = np.where(white, (j * target.columns + i) // 2, 0)
-    # From the mark's first module, with one module of white around it.
+    # From the marker's first module, with one module of white around it.
     u, v = (
         np.clip((value - (whole + 0.5) * target.square_m) / module_m + 0.5 * modules, -1.0, modules + 1.0)
         for value, whole in ((grid.x, i), (grid.y, j))
@@ -221,8 +221,8 @@ def _marks(target: Charuco, grid: _Grid) -> Array:
 
 @functools.lru_cache(maxsize=2)
 def _mark_distances(target: Charuco) -> tuple[Grey, int]:
-    """Texels from each texel to the nearest border of a mark's dark part, positive inside, the marks one below the
-    other; and how many modules a mark has along a side.
+    """Distances in texels from each texel to the nearest border of a marker's dark part, positive inside, with the
+    markers stacked vertically; and the number of modules along a marker's side.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     modules = dictionary.markerSize + 2
@@ -236,7 +236,7 @@ def _mark_distances(target: Charuco) -> tuple[Grey, int]:
 
 
 def _shift(target: Chequerboard | Charuco, errors_m: Array, grid: _Grid) -> tuple[Array, Array]:
-    """How far the print is off at each sample: linear between the corners."""
+    """The print's error at each sample: linear between the corners."""
     first = target.square_m if isinstance(target, Charuco) else 0.0
     at = np.stack([np.nan_to_num((value - first) / target.square_m) for value in (grid.y, grid.x)])
     dx, dy = (map_coordinates(errors_m[:, :, k], at, order=1, mode="nearest") for k in (0, 1))
@@ -249,7 +249,7 @@ def _clutter(kind: str, x: Array, y: Array) -> Array:
     waves = 130.0 + 40.0 * np.sin(300.0 * x) * np.cos(170.0 * y)
     if kind == "waves":
         return np.asarray(waves)
-    # Two grids of patches with a value of their own each, turned against each other: corners everywhere.
+    # Two grids of patches, each patch with a value of its own, rotated against each other: corners everywhere.
     out = waves
     for angle, step in ((0.4, 0.013), (1.1, 0.007)):
         a = np.floor((x * np.cos(angle) - y * np.sin(angle)) / step)

@@ -1,8 +1,8 @@
-"""The picture before the sensor: background, fingers, object and covers with exact sub-pixel outlines.
+"""The image before the sensor: background, fingers, object and covers with exact sub-pixel outlines.
 
-The background and the faces' textures are already as blurred as the lens makes them; the masks of
-:mod:`gripmon.simulate.coverage` carry the same blur, so that an outline is at its true place whatever lies beside it.
-Bodies have one shade a face by the lamp's direction, times a texture that sticks to the face.
+The background and the faces' textures already have the lens's blur; the masks of :mod:`gripmon.simulate.coverage` have
+the same blur, so that an outline is at its true position whatever lies beside it.  Bodies have one shade per face from
+the lamp's direction, times a texture fixed to the face.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MOST_SUB_EXPOSURES = 8
 
 @dataclass(frozen=True)
 class _Layer:
-    """A body in its window: what remains of the light behind it, and its own light."""
+    """A body in its window: the transmission for the light behind it, and its own light."""
 
     window: tuple[slice, slice]
     passes: NDArray[np.float32]
@@ -44,15 +44,15 @@ class _Layer:
 
 
 class Backdrop(Protocol):
-    """What is seen behind the gripper: light (height, width) in DN, as blurred as the lens makes it."""
+    """What is visible behind the gripper: light (height, width) in DN, with the lens's blur."""
 
     def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[Any]: ...
 
 
 class Renderer:
-    """Renders scene states of one scenario; keeps the latest gripper layers, because often nothing moves.
+    """Renders scene states of one scenario; caches the latest gripper layers, because often nothing moves.
 
-    ``backdrop`` stands in for the scenario's table.
+    ``backdrop`` replaces the scenario's table.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Renderer:
         return total
 
     def _sub_exposures(self, middle: SceneState, exposure_s: float) -> list[tuple[SceneState, float]]:
-        """States within the exposure and their shares: several (Gauss's) only if the gripper moves in the image."""
+        """States within the exposure and their Gauss weights: several only if the gripper moves in the image."""
         if exposure_s == 0.0 or self._scenario.pairs is not None:
             return [(middle, 1.0)]
         ends = [self._scene.at(max(middle.time_s + k * exposure_s, 0.0)) for k in (-0.5, 0.5)]
@@ -122,7 +122,7 @@ class Renderer:
         return self._camera.project(points[self._bodies.gripper.corner_points])
 
     def _compose(self, canvas: NDArray[np.float32], state: SceneState) -> NDArray[np.float32]:
-        """Lay all bodies over the background, in place."""
+        """Draw all bodies over the background, in place."""
         for layer in self._body_layers(state):
             window = canvas[layer.window]
             cv2.multiply(window, layer.passes, window)
@@ -157,7 +157,7 @@ class Renderer:
         return layers
 
     def _layer(self, parts: list[tuple[Coverage, Surface]], cam_T_body: Array) -> _Layer:
-        """Sum of a body's faces: they share their inner borders, so their masks add up to that of the body."""
+        """Sum of a body's faces: inner borders are shared, so the faces' masks add up to the body's."""
         left, top = min(m.left for m, _ in parts), min(m.top for m, _ in parts)
         right = max(m.left + m.mask.shape[1] for m, _ in parts)
         bottom = max(m.top + m.mask.shape[0] for m, _ in parts)
@@ -193,7 +193,7 @@ _MOST_COMPRESSED = 12.0
 
 @dataclass(frozen=True)
 class Surface:
-    """A face's brightness, texture (DN; None: even), and the frame of its plane in the body's frame."""
+    """A face's brightness, texture (DN; None: uniform), and the frame of its plane in the body's frame."""
 
     level_dn: float
     texture: NDArray[np.float32] | None
@@ -202,7 +202,7 @@ class Surface:
 
 
 class Painter:
-    """Makes the surfaces of bodies: shades by the lamp's direction at the nominal pose, textures from one seed."""
+    """Makes the surfaces of bodies: shades from the lamp's direction at the nominal pose, textures from one seed."""
 
     def __init__(self, rng: np.random.Generator, look: FingerLook, cam_T_grip: Array, focal_px: float) -> None:
         self._rng, self._look, self._cam_T_grip, self._focal_px = rng, look, cam_T_grip, focal_px
@@ -210,7 +210,7 @@ class Painter:
         self._lamp_cam = np.array(look.lamp_cam) / np.linalg.norm(look.lamp_cam)
 
     def metal(self, solid: Solid, gain: float, *, marked: bool = False) -> tuple[Surface, ...]:
-        """Surfaces of a metal body, one a face; ``marked``: a finger, with the look's marks."""
+        """Surfaces of a metal body, one per face; ``marked``: a finger, with the look's marks."""
         look, surfaces = self._look, []
         for face, bevel in enumerate(solid.bevel):
             level = gain * look.level_dn * self._shade(solid, face) * (look.bevel_gain if bevel else 1.0)
@@ -231,7 +231,7 @@ class Painter:
         return tuple(surfaces)
 
     def object(self, solid: Solid, look: ObjectLook) -> tuple[Surface, ...]:
-        """Surfaces of a box, one a face."""
+        """Surfaces of a box, one per face."""
         surfaces = []
         for face in range(len(solid.loops)):
             level = look.level_dn * self._shade(solid, face)
@@ -251,7 +251,7 @@ class Painter:
         return tuple(dataclasses.replace(s, body_T_plane=mirror @ s.body_T_plane) for s in surfaces)
 
     def cover(self, cover: Cover, outline: Array) -> Surface:
-        """Skin, or a printed sheet; beyond its texture the border's grey goes on."""
+        """Skin, or a printed sheet; beyond its texture the border's grey continues."""
         low, high = outline.min(axis=0), outline.max(axis=0)
         length = float(high[0] - low[0])
         px_per_m = min(self._focal_px / cover.distance_m * 0.5, _LARGEST_TEXTURE_PX / length)
@@ -269,7 +269,7 @@ class Painter:
         return self._look.ambient + (1.0 - self._look.ambient) * max(towards, 0.0)
 
     def _sheet(self, solid: Solid, face: int) -> tuple[Array, int, int, float]:
-        """Frame of a face, and rows, columns and pixels a metre of its texture."""
+        """Frame of a face, and rows, columns and pixels per metre of its texture."""
         body_T_plane, extent_m = _plane_frame(solid, face)
         px_per_m = min(self._px_per_m, _LARGEST_TEXTURE_PX / float(extent_m.max()))
         columns, rows = (max(math.ceil(float(e) * px_per_m), 4) for e in extent_m)

@@ -1,7 +1,7 @@
-"""What happens in a simulated sequence: settings only, every length in metres, time in seconds from the first frame.
+"""What happens in a simulated sequence: settings only, all lengths in metres, times in seconds from the first frame.
 
-A scenario holds neither camera, gripper nor nominal calibration; the simulator gets those beside it.  Grey values
-are in DN, the counts 0..255 of the 8-bit image at exposure 1.
+A scenario contains no camera, gripper or nominal calibration; the simulator gets those separately.  Grey values are in
+DN, the counts 0..255 of the 8-bit image at exposure 1.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class _Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 class MountMotion(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A motion of the camera on its bracket at full size; a law scales it over time.
 
-    The camera turns about ``Scenario.pivot_cam_m`` so that the TCP moves by ``tcp_shift_m`` along the camera's x and y
-    axes (z then follows from the arc), rolls about the line pivot-TCP, and shifts.
+    The camera rotates about ``Scenario.pivot_cam_m`` so that the TCP moves by ``tcp_shift_m`` along the camera's x and
+    y axes (z then follows from the arc), rolls about the line pivot-TCP, and shifts.
     """
 
     tcp_shift_m: Annotated[
@@ -41,7 +41,7 @@ class MountMotion(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Creep(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="creep"):
-    """A cable pulls: from nothing at ``start_s`` to the full motion, then constant."""
+    """A cable pulls: the motion grows from zero at ``start_s`` to its full size, then stays."""
 
     start_s: Time = 0.0
     law: Literal["linear", "exponential"] = "exponential"
@@ -70,7 +70,7 @@ class Vibration(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Tilt(MountMotion, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="tilt"):
-    """Someone loosens the mount and turns it: a smooth change within ``time_s`` (0: at once)."""
+    """Someone loosens the mount and rotates it: a smooth change within ``time_s`` (0: at once)."""
 
     start_s: Time = 1.0
     time_s: Annotated[float, Meta(ge=0.0, le=1e7, description="how long the change takes (s)")] = 0.5
@@ -80,7 +80,7 @@ MountScript = Creep | Bump | Vibration | Tilt
 
 
 class BentFinger(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One finger turns about its root (the middle of its rearmost points), so that its tip moves, within ``time_s``."""
+    """One finger rotates about its root (the centre of its rearmost points) within ``time_s``, which moves its tip."""
 
     finger: Annotated[str, Meta(description="name in the gripper file")]
     tip_shift_m: Annotated[Shift, Meta(description="shift of the middle of its foremost points, gripper axes (m)")]
@@ -89,7 +89,7 @@ class BentFinger(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class JawScript(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """True jaw opening over time, and what the robot reports of it."""
+    """True jaw opening over time, and the robot's report of it."""
 
     knots: Annotated[
         tuple[tuple[Time, Positive], ...],
@@ -104,7 +104,7 @@ class JawScript(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class ObjectLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An object's surface.  Lines along the fingers run with gripper z, those along the tips across it."""
+    """An object's surface.  Lines along the fingers run along gripper z, those along the tips across it."""
 
     pattern: Annotated[
         Literal["printed", "plain", "lines_along_fingers", "lines_along_tips", "fold"],
@@ -120,9 +120,9 @@ class ObjectLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class GraspedObject(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A box that comes up between the fingers, is held, and goes again.
+    """A box that arrives between the fingers, is held, and leaves.
 
-    Its far side lies ``depth_m`` beyond the TCP (+z).  ``jaw`` of the scenario has to close on its width.
+    Its far side lies ``depth_m`` beyond the TCP (+z).  The scenario's ``jaw`` has to close to its width.
     """
 
     size_m: Annotated[tuple[Positive, Positive, Positive], Meta(description="x across the jaws, y, z (m)")] = _BOX_M
@@ -135,8 +135,8 @@ class GraspedObject(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Prop(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Something beside, behind or before the fingers whose borders run like theirs: bar, rim, plate, cable, a copy of
-    the fingers, their mirror image.  It comes, stays and goes.
+    """Something beside, behind or in front of the fingers with borders parallel to theirs: bar, rim, plate, cable, a
+    copy of the fingers, or their mirror image.  It arrives, stays and leaves.
     """
 
     shape: Annotated[
@@ -162,7 +162,7 @@ class Prop(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Cover(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A hand or a sheet between camera and gripper: moves in, covers the view, moves out."""
+    """A hand or a sheet between camera and gripper: it moves in, covers the view, and moves out."""
 
     kind: Literal["hand", "sheet"] = "hand"
     start_s: Time = 2.0
@@ -174,7 +174,7 @@ class Cover(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Background(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table below the gripper with things on it; the robot moves over it, the gripper stands still in the image."""
+    """A table below the gripper with things on it; the robot moves over it, while the gripper is fixed in the image."""
 
     kind: Literal["plain", "chequer", "printed", "stripes", "speckle", "blobs", "discs"] = "blobs"
     distance_m: Annotated[
@@ -212,7 +212,7 @@ class FingerMark(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class FingerShape(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """By what the true fingers differ from their model: facets that round the tip's edges, a tip that is worn."""
+    """How the true fingers differ from their model: facets that round the tip's edges, a worn tip."""
 
     tip_bevel_m: Annotated[float, Meta(ge=0.0, le=0.005, description="width of facets on the tip's edges (m)")] = 0.0
     wear_m: Annotated[float, Meta(ge=0.0, le=0.005, description="by which the tip is shorter (m)")] = 0.0
@@ -220,7 +220,7 @@ class FingerShape(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Metal fingers: one shade a face by the lamp's direction, times a brushed texture that sticks to the face."""
+    """Metal fingers: one shade per face from the lamp's direction, times a brushed texture fixed to the face."""
 
     level_dn: Annotated[
         float, Meta(ge=0.0, le=255.0, description="grey value of a face that looks at the lamp (DN)")
@@ -247,7 +247,7 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class LightStep(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """From ``at_s`` on the light is ``factor`` times what it was before."""
+    """From ``at_s`` on the light is ``factor`` times its previous value."""
 
     at_s: Time
     factor: Annotated[float, Meta(gt=0.0, le=20.0, description="(no unit)")]
@@ -283,7 +283,7 @@ class Light(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Defocus(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The lens loses its focus between ``start_s`` and ``end_s``: a Gaussian blur is added to all of the image."""
+    """The lens is out of focus between ``start_s`` and ``end_s``: a Gaussian blur is added to the whole image."""
 
     sigma_px: Annotated[float, Meta(ge=0.0, le=10.0, description="standard deviation of the added blur (px)")] = 1.5
     start_s: Time = 0.0
@@ -303,7 +303,7 @@ class Sensor(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Pairs(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Image pairs before (even frame) and after (odd frame) a disturbance, each pair a new calibration.
+    """Image pairs before (even frame) and after (odd frame) a disturbance, each pair with a new calibration.
 
     The TCP shift of a pair is normal about ``tcp_shift_m``; calibrations scatter about the nominal one.  Frames come at
     ``Scenario.fps`` as always: 0.1 for ten seconds between them.
@@ -320,7 +320,7 @@ class Pairs(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Scenario(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A simulated sequence, up to camera, gripper, nominal calibration and seed."""
+    """A simulated sequence, except for camera, gripper, nominal calibration and seed."""
 
     name: str = "static"
     duration_s: Annotated[float, Meta(gt=0.0, le=1e7, description="length of the sequence (s)")] = 10.0

@@ -1,4 +1,4 @@
-"""Where everything is at a time: a closed function of scenario, seed and time, without pictures."""
+"""Where everything is at a time: a closed function of scenario, seed and time, without images."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gripmon.model.records import Array
 from gripmon.simulate import disturbance
 from gripmon.simulate.scenario import BentFinger, MountMotion, Scenario
 
-_TIP_SHARE = 0.1  # of a finger's length: what counts as its tip, and as its root
+_TIP_SHARE = 0.1  # fraction of a finger's length that counts as its tip, and as its root
 
 
 @dataclass(frozen=True, slots=True)
 class SceneState:
-    """All poses at one time.  ``grip_T_finger`` (f, 4, 4) maps a finger's points at nominal opening to where
-    they are, jaws and bends included; ``bend`` (f, 4, 4) is the bends alone.  ``covers``: index in the scenario, pose;
-    ``props`` likewise, poses in the gripper frame.
+    """All poses at one time.  ``grip_T_finger`` (f, 4, 4) maps a finger's points at nominal opening to where they are,
+    with jaws and bends; ``bend`` (f, 4, 4) has the bends only.  ``covers``: index in the scenario, pose; ``props``
+    likewise, with poses in the gripper frame.
     """
 
     time_s: float
@@ -38,7 +38,7 @@ class SceneState:
 
 
 class Scene:
-    """Evaluates a scenario.  Raises ValueError when it doesn't fit gripper or calibration."""
+    """Evaluates a scenario.  Raises ValueError if it doesn't fit gripper or calibration."""
 
     def __init__(
         self, camera: Camera, gripper: Gripper, nominal_cam_T_grip: Array, scenario: Scenario, seed: int
@@ -134,7 +134,7 @@ class Scene:
         return reference, disturbance.about_pivot(rotation, translation, self._pivot_m)
 
     def _prepare_bend(self, script: BentFinger) -> tuple[int, Array, Array]:
-        """Finger index, rotation vector about its root that shifts its tip across its length, root; gripper frame."""
+        """Finger index, rotation vector about its root that shifts its tip sideways, and root; gripper frame."""
         if script.finger not in self._gripper.finger_ids:
             raise ValueError(
                 f"bent_fingers: there is no finger '{script.finger}'; one of {', '.join(self._gripper.finger_ids)}"
@@ -152,7 +152,7 @@ class Scene:
         return finger, turn, root
 
     def _object(self, cam_T_grip: Array, time_s: float) -> Array | None:
-        """Pose of the object's frame (its centre); None where the scenario has none, or while it is away."""
+        """Pose of the object's frame (its centre); None if the scenario has none, or while it is away."""
         grasped = self._scenario.grasped
         if grasped is None or not grasped.arrive_s[0] < time_s < grasped.leave_s[1]:
             return None
@@ -161,7 +161,7 @@ class Scene:
         return cam_T_grip @ make_transform(np.eye(3), centre)
 
     def _covers(self, time_s: float) -> tuple[tuple[int, Array], ...]:
-        """Covers in view with the poses of their frames: x points where they come from, their leading side at -x."""
+        """Covers in view with the poses of their frames: x points to where they come from, the leading side is -x."""
         out = []
         for index, cover in enumerate(self._scenario.covers):
             share = disturbance.cover_share(cover, time_s)
@@ -176,7 +176,7 @@ class Scene:
         return tuple(out)
 
     def _props(self, time_s: float) -> tuple[tuple[int, Array], ...]:
-        """Props that are there, with their poses in the gripper frame."""
+        """Props that are present, with their poses in the gripper frame."""
         out = []
         for index, prop in enumerate(self._scenario.props):
             offset_m = disturbance.prop_offset_m(prop, time_s)
@@ -197,7 +197,7 @@ class Scene:
                 raise ValueError(f"jaw.knots: opening {opening} m is outside the gripper's jaw, {low} to {high} m")
 
 
-# A cover's leading side travels over this many half views, from outside the view to far beyond it.
+# Travel of a cover's leading side in half views, from outside the view to far beyond it.
 COVER_TRAVEL = 4.2
 
 

@@ -1,4 +1,4 @@
-"""The simulator: frame i of a scenario, with its truth, for any i in any order; and its images and truth as files."""
+"""The simulator: frame i of a scenario with its truth, for any i in any order; also images and truth as files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from gripmon.simulate.scene import Scene
 
 
 class Simulator:
-    """A wrist camera that looks at its own fingertips.
+    """A wrist camera that sees its own fingertips.
 
-    Frame i is a pure function of camera, gripper, calibration, scenario, seed and i.  Not for several threads at once.
-    Raises ValueError when the scenario doesn't fit the gripper, or the gripper has no closed convex fingers.
-    ``backdrop`` stands in for the scenario's table: a calibration plate, say.
+    Frame i is a pure function of camera, gripper, calibration, scenario, seed and i.  Not thread-safe.  Raises
+    ValueError if the scenario doesn't fit the gripper, or the gripper has no closed convex fingers.  ``backdrop``
+    replaces the scenario's table, for example by a calibration plate.
     """
 
     def __init__(
@@ -47,11 +47,11 @@ class Simulator:
 
     @property
     def frame_count(self) -> int:
-        """Frames in ``scenario.duration_s``; later ones can be asked for, too."""
+        """Frames in ``scenario.duration_s``; later ones can be rendered, too."""
         return max(round(self.scenario.duration_s * self.scenario.fps), 1)
 
     def time_s(self, index: int) -> float:
-        """Middle of the exposure of a frame, from that of the first."""
+        """Middle of a frame's exposure, relative to the first frame's."""
         if index < 0:
             raise IndexError(f"there is no frame {index}; frames count from 0")
         return index / self.scenario.fps
@@ -85,7 +85,7 @@ class Simulator:
         )
 
     def outline_seen(self, index: int) -> OutlineSeen:
-        """How much of each finger's outline can be seen in a frame."""
+        """How much of each finger's outline is visible in a frame."""
         return self._outline.seen(self.camera, self._bodies, self._scene.at(self.time_s(index)))
 
     def render(self, index: int) -> NDArray[np.uint8]:
@@ -98,12 +98,12 @@ class Simulator:
         return renderer.render(self.time_s(index))
 
     def expose(self, light: NDArray[np.float32], index: int) -> NDArray[np.uint8]:
-        """Image of a frame from the light on the sensor, which is used up: :meth:`light`'s, or what was made of it."""
+        """Image of a frame from the light on the sensor, which is overwritten: from :meth:`light`, or modified."""
         _, sensor = self._painters()
         return sensor.expose(light, index, self.time_s(index))
 
     def _painters(self) -> tuple[Renderer, SensorModel]:
-        """Renderer and sensor, made when the first picture is asked for: truth needs neither."""
+        """Renderer and sensor, created for the first image: truth needs neither."""
         if self._painting is None:
             scenario, nominal = self.scenario, self.nominal_cam_T_grip
             backdrop = self._backdrop
@@ -112,7 +112,7 @@ class Simulator:
         return self._painting
 
     def frame(self, index: int) -> Frame:
-        """A frame as a camera would hand it over, with the jaw opening that the robot reports."""
+        """A frame as a camera would deliver it, with the jaw opening that the robot reports."""
         opening_m = disturbance.jaw_opening_m(self.scenario.jaw, self.gripper.jaw_nominal_m, self.time_s(index))
         return Frame(
             seq=index,
@@ -126,7 +126,7 @@ class Simulator:
         return self.scenario.start_ns + round(index * 1e9 / self.scenario.fps)
 
     def _reported(self, index: int, opening_m: float) -> float | None:
-        """What the robot reports: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
+        """The robot's report: true opening plus offset and noise, limited to the jaw's range as an encoder's is."""
         jaw = self.scenario.jaw
         if not jaw.reported or not self.gripper.has_jaw:
             return None
@@ -144,16 +144,16 @@ PNG_COMPRESSION = 1  # noise doesn't compress; time matters more
 
 
 def write_sequence(simulator: Simulator, out_dir: Path, progress: Callable[[int, int], None] | None = None) -> int:
-    """Write all frames of a scenario into a folder (made if missing); returns their number.
+    """Write all frames of a scenario into a folder (created if missing); returns their number.
 
-    ``timestamps.csv`` has the columns ``file,stamp_ns,jaw_opening_m`` (what the robot reports; empty where it doesn't),
-    ``truth.jsonl`` one line a frame.  ``progress(done, total)`` is called after each frame.  Raises OSError when a
-    file can't be written, FileExistsError when the folder already holds a sequence.
+    ``timestamps.csv`` has the columns ``file,stamp_ns,jaw_opening_m`` (the robot's report; empty if there is none),
+    ``truth.jsonl`` one line per frame.  ``progress(done, total)`` is called after each frame.  Raises OSError if a file
+    can't be written, FileExistsError if the folder already holds a sequence.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     total = simulator.frame_count
     digits = max(len(str(total - 1)), 6)
-    # Mode "x": an older sequence is never mixed with this one.
+    # Mode "x": never mix an older sequence with this one.
     stamps_path, truth_path = out_dir / "timestamps.csv", out_dir / "truth.jsonl"
     with stamps_path.open("x", encoding="utf-8") as stamps, truth_path.open("xb") as truths:
         stamps.write("file,stamp_ns,jaw_opening_m\n")

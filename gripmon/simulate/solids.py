@@ -1,4 +1,4 @@
-"""Convex solids: fingers from the gripper's faces, bevelled edges, boxes; which hides which, and what they hide."""
+"""Convex solids: fingers from the gripper's faces, bevelled edges, boxes; their occlusion order, and what they hide."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AS_MODELLED = FingerShape()
 class Solid:
     """A convex solid in its body's frame: vertices (v, 3), faces as loops counter-clockwise seen from outside.
 
-    ``bevel``: which faces are bevels, ``normals`` (f, 3) point outwards, ``n·x <= offsets`` (f,) inside.
+    ``bevel``: which faces are bevels; ``normals`` (f, 3) point outwards; ``n·x <= offsets`` (f,) inside.
     """
 
     name: str
@@ -41,7 +41,7 @@ def make_solid(name: str, polygons: list[Array], bevel: list[bool]) -> Solid:
 
 
 def polygon_normal(polygon: Array) -> Array:
-    """Unit normal (3,) of a planar loop (Newell): outwards when it runs counter-clockwise seen from outside."""
+    """Unit normal (3,) of a planar loop (Newell): outwards if it runs counter-clockwise seen from outside."""
     total = np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0)
     return total / np.linalg.norm(total)
 
@@ -54,7 +54,7 @@ def box(name: str, low_m: Array, high_m: Array) -> Solid:
 
 
 def finger_solids(gripper: Gripper, shape: FingerShape = _AS_MODELLED) -> tuple[Solid, ...]:
-    """One solid a finger at nominal opening, its bevels cut, worn by ``shape``.
+    """One solid per finger at nominal opening, with its bevels cut and worn by ``shape``.
 
     Raises ValueError for a gripper without closed faces.
     """
@@ -83,19 +83,19 @@ def finger_solids(gripper: Gripper, shape: FingerShape = _AS_MODELLED) -> tuple[
 
 
 def _bevel_widths_m(gripper: Gripper, shape: FingerShape) -> Array:
-    """Of every edge: the model's, or the shape's on the edges between two corners of a tip."""
+    """Bevel width of every edge: the model's, or the shape's on the edges between two corners of a tip."""
     corner = np.isin(gripper.edge_points, gripper.corner_points).all(axis=1)
     return np.where(corner, np.maximum(gripper.edge_bevel_m, shape.tip_bevel_m), gripper.edge_bevel_m)
 
 
 def mirrored(solid: Solid) -> Solid:
-    """A solid as a mirror at z = 0 shows it, in its body's frame."""
+    """The mirror image of a solid at z = 0, in its body's frame."""
     vertices = solid.vertices_m * (1.0, 1.0, -1.0)
     return make_solid(f"{solid.name} mirrored", [vertices[loop[::-1]] for loop in solid.loops], list(solid.bevel))
 
 
 def _check_closed(solid: Solid, loops: list[NDArray[np.intp]], name: str) -> None:
-    """Every edge of a closed solid belongs to two faces, and no vertex lies outside any face."""
+    """Check that every edge belongs to two faces, and that no vertex lies outside any face."""
     sides: dict[tuple[int, int], int] = {}
     for loop in loops:
         for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
@@ -113,7 +113,8 @@ def _bevel_plane(solid: Solid, sides: list[int], point_m: Array, width_m: float)
     normal = a + b
     length = float(np.linalg.norm(normal))
     normal /= length
-    # The facet's half width over its depth below the edge is the tangent of half the inner angle = cot(half turn).
+    # The facet's half width over its depth below the edge is the tangent of half the inner angle = cot(half the angle
+    # between the normals).
     cosine = 0.5 * length
     depth = 0.5 * width_m * np.sqrt(1.0 - cosine**2) / cosine
     return normal, float(normal @ point_m) - depth
@@ -145,7 +146,7 @@ def _cut(polygons: list[Array], marks: list[bool], normal: Array, offset: float)
     u /= np.linalg.norm(u)
     angle = np.arctan2((points - centre) @ np.cross(normal, u), (points - centre) @ u)
     ordered = points[np.argsort(angle)]
-    # Each rim point came from two faces: drop the twins.
+    # Each rim point came from two faces: drop duplicates.
     distinct = np.linalg.norm(ordered - np.roll(ordered, 1, axis=0), axis=1) > 1e-9
     return [*kept, ordered[distinct]], [*kept_marks, True]
 
@@ -163,7 +164,7 @@ class PlacedSolid:
 
 
 def place(solid: Solid, cam_T_body: Array) -> PlacedSolid:
-    """Put a solid into the camera frame; the camera's centre is the origin, so a face looks at it when d < 0."""
+    """Transform a solid to the camera frame, whose origin is the camera: a face is turned towards it if d < 0."""
     rotation, translation = cam_T_body[:3, :3], cam_T_body[:3, 3]
     normals = solid.normals @ rotation.T
     offsets = solid.offsets_m + normals @ translation
@@ -171,7 +172,7 @@ def place(solid: Solid, cam_T_body: Array) -> PlacedSolid:
 
 
 def paint_order(placed: list[PlacedSolid]) -> list[PlacedSolid]:
-    """From back to front.  Two convex bodies are ordered by a face plane between them, else by their distance."""
+    """From back to front.  Two convex bodies are ordered by a face plane between them, otherwise by their distance."""
     order: list[PlacedSolid] = []
     rest = list(placed)
     while rest:
@@ -193,7 +194,7 @@ def _hides(a: PlacedSolid, b: PlacedSolid) -> bool:
     """Whether a may hide b: a lies on the camera's side of a plane between them."""
     beyond_a = (b.vertices_cam_m @ a.normals_cam.T - a.offsets_m).min(axis=0) >= -_TOUCH_M
     beyond_b = (a.vertices_cam_m @ b.normals_cam.T - b.offsets_m).min(axis=0) >= -_TOUCH_M
-    # The camera sits inside the half space of a face that does not look at it.
+    # The camera is inside the half space of a face that is turned away from it.
     if (beyond_a & a.facing).any() or (beyond_b & ~b.facing).any():
         return False
     if (beyond_a & ~a.facing).any() or (beyond_b & b.facing).any():
@@ -202,7 +203,7 @@ def _hides(a: PlacedSolid, b: PlacedSolid) -> bool:
 
 
 def _hides_across_edges(a: PlacedSolid, b: PlacedSolid) -> bool:
-    """As ``_hides`` where no face separates the two: then a plane along one edge of each does, if anything."""
+    """Like ``_hides`` if no face separates the two: then only a plane along one edge of each can."""
     normals = np.cross(_edge_directions(a)[:, None], _edge_directions(b)[None]).reshape(-1, 3)
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals[lengths > 1e-9] / lengths[lengths > 1e-9, None]
@@ -210,7 +211,7 @@ def _hides_across_edges(a: PlacedSolid, b: PlacedSolid) -> bool:
     gap_up, gap_down = of_b.min(axis=0) - of_a.max(axis=0), of_a.min(axis=0) - of_b.max(axis=0)
     best = int(np.maximum(gap_up, gap_down).argmax())
     if max(gap_up[best], gap_down[best]) < -_TOUCH_M:
-        return _distance(a) < _distance(b)  # the bodies cross each other
+        return _distance(a) < _distance(b)  # the bodies intersect
     if gap_up[best] >= gap_down[best]:  # a below, b above: the camera at height 0
         return bool(of_a[:, best].max() + of_b[:, best].min() > 0.0)
     return bool(of_a[:, best].min() + of_b[:, best].max() < 0.0)
@@ -225,7 +226,7 @@ def _edge_directions(body: PlacedSolid) -> Array:
 def hidden_by(body: PlacedSolid, points_cam_m: Array) -> NDArray[np.bool_]:
     """(n,) whether the body lies between the camera and the points (n, 3); touching is not hiding."""
     length = np.linalg.norm(points_cam_m, axis=1)
-    # On the way s * point, s from 0 to just before the point, inside the half space n·x s <= d.
+    # Along s * point, s from 0 to just before the point, inside the half space n·x s <= d.
     rate = points_cam_m @ body.normals_cam.T
     depth = body.offsets_m - _TOUCH_M
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,9 +1,9 @@
-"""Surfaces of the simulated world, drawn once from a seed: brushed metal, print, skin, and tables full of clutter.
+"""Surfaces of the simulated world, drawn once from a seed: brushed metal, print, skin, and cluttered tables.
 
 Textures of solids are float32 factors with mean near 1; tables are uint8 grey values that tile without a seam.
 
-Lines and areas at stated places of a body are factors on its faces' textures: marks on fingers, lines on objects.
-Sharp borders are spread over a texel, and blurred as the lens would: a texel is about a pixel.
+Lines and areas at given positions of a body are factors on its faces' textures: marks on fingers, lines on objects.
+Sharp borders are spread over a texel, and blurred like the lens does: a texel is about a pixel.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Rng = np.random.Generator
 
 
 def even(height_px: int, width_px: int) -> Factor:
-    """A surface without any texture."""
+    """A uniform surface."""
     return np.ones((height_px, width_px), np.float32)
 
 
 def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: float) -> Factor:
-    """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is about their contrast."""
+    """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is roughly their contrast."""
     if strength == 0.0:
         return even(height_px, width_px)
     mm = px_per_m * 1e-3
@@ -62,7 +62,7 @@ def printed(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
 
 
 def streak(rng: Rng, columns: int, strength: float) -> Factor:
-    """A lamp's reflection (1, columns) in a brushed face: a soft bright band across it, somewhere along its length."""
+    """A lamp's reflection (1, columns) in a brushed face: a soft bright band across it, at a random place along it."""
     centre, width = rng.uniform(0.1, 0.9), rng.uniform(0.05, 0.15)
     along = (np.arange(columns, dtype=np.float32) + 0.5) / columns
     band = 1.0 + strength * np.exp(-0.5 * ((along - centre) / width) ** 2)
@@ -113,7 +113,7 @@ def _noise(rng: Rng, height_px: int, width_px: int, sigma_x_px: float, sigma_y_p
 
 
 def _tile_noise(rng: Rng, size_px: int, sigma_px: float) -> Factor:
-    """As ``_noise`` but without a seam; coarse noise is made small and enlarged."""
+    """Like ``_noise`` but without a seam; coarse noise is computed small and enlarged."""
     shrink = max(int(sigma_px / 3.0), 1)
     small = size_px // shrink
     white = rng.standard_normal((small, small), np.float32)
@@ -183,7 +183,7 @@ def _blobs(rng: Rng, size_px: int, px_per_m: float) -> Factor:
 
 
 def _papers(rng: Rng, size_px: int, px_per_m: float) -> Factor:
-    """Printed sheets and labels that lie on each other."""
+    """Printed sheets and labels that overlap."""
     canvas = np.full((size_px, size_px), 95, np.uint8)
     mm = px_per_m * 1e-3
     for _ in range(int(1.4 * (size_px / (55.0 * mm)) ** 2)):
@@ -197,7 +197,7 @@ def _papers(rng: Rng, size_px: int, px_per_m: float) -> Factor:
 
 
 def _everywhere(canvas: Grey, centre: NDArray[np.float64], reach: float, draw: Callable[..., None]) -> None:
-    """Draw at a centre and at its images beyond the seams."""
+    """Draw at a centre and at its periodic images across the seams."""
     size = canvas.shape[0]
     for dx in (-size, 0, size):
         for dy in (-size, 0, size):
@@ -237,7 +237,7 @@ def _paste(image: Grey, sheet: Grey, centre: NDArray[np.float64], turn_deg: floa
 
 
 def _cable(rng: Rng, image: Grey, px_per_m: float) -> None:
-    """A cable or bar: a bright and a dark line on a smooth path, the path closed over the seam along one axis."""
+    """A cable or bar: a bright and a dark line on a smooth path that is closed across the seam along one axis."""
     size = image.shape[0]
     width = rng.uniform(2.0, 7.0) * 1e-3 * px_per_m
     along = np.linspace(0.0, size, 65)
@@ -278,7 +278,7 @@ def _fixed(point: NDArray[np.float64]) -> tuple[int, int]:
 _LENS_BLUR_PX = 0.6
 _ALONG = np.array([0.0, 0.0, 1.0])
 _FLAT_M = 1e-6
-_LONG_FACE = 0.5  # a face is long if its normal's part along the finger is smaller
+_LONG_FACE = 0.5  # a face is long if its normal's component along the finger is smaller
 
 
 def grid_m(rows: int, columns: int, px_per_m: float, body_T_plane: Array) -> Array:
@@ -314,16 +314,16 @@ def marks(wanted: list[FingerMark], solid: Solid, face: int, grid: Array, px_per
 
 
 def lines(rng: Rng, look: ObjectLook, solid: Solid, grid: Array, px_per_m: float) -> Factor:
-    """Factor of a pattern of lines on one face of an object; the same lines on all faces for the same random state."""
+    """Factor of a line pattern on one face of an object; equal on all faces for the same random state."""
     out = np.ones(grid.shape[:2])
     if look.pattern == "plain":
         return out.astype(np.float32)
-    # Where a face has no extent along the fingers, a line parallel to the tips is at a place along y.
+    # On a face without extent along the fingers, a line parallel to the tips has a position along y.
     beyond = 2 if np.ptp(grid[..., 2]) > _FLAT_M else 1
     if look.pattern == "fold":
         inside = solid.vertices_m[:, beyond].max() - look.pitch_m - grid[..., beyond]
         return _blurred(out - look.contrast * _filled(inside, px_per_m))
-    # Lines along the fingers are at places across them: on each face the axis that varies.
+    # Lines along the fingers have positions across them: on each face the axis that varies.
     axis = beyond if look.pattern == "lines_along_tips" else int(np.ptp(grid[..., :2], axis=(0, 1)).argmax())
     place_m = grid[..., axis]
     start_m, end_m = float(place_m.min()), float(place_m.max())

@@ -109,8 +109,8 @@ class Gripper:
         return self._rounds.seen_from(eye_grip_m, self._nominal_points_m + offsets_m, offsets_m)
 
     def point_motion(self, jaw_opening_m: float) -> Array:
-        """Derivative (p, 3) of all points by the jaw opening, m/m: central difference over 0.1 mm (motion is piecewise
-        linear).
+        """Derivative (p, 3) of all points by the jaw opening, m/m; central difference over 0.1 mm, as motion is
+        piecewise linear in the opening.
         """
         low, high = max(jaw_opening_m - 5e-5, self.jaw_min_m), min(jaw_opening_m + 5e-5, self.jaw_max_m)
         if not high > low:
