@@ -51,9 +51,7 @@ _NOISE_ROUNDS = 8
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """Measured spots: ``uv_px`` (n, 2), ``covariance_px`` (n, 2, 2) or None; ``others`` (k, 2) each: more
-    candidates.
-    """
+    """Measured spots: ``uv_px`` (n, 2), ``covariance_px`` (n, 2, 2) or None; ``others`` (k, 2) each: alternatives."""
 
     uv_px: Array
     covariance_px: Array | None = None

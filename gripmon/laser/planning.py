@@ -109,7 +109,7 @@ def candidates(setup: LaserSetup, refined: Refined, reach_m: float, rng: np.rand
 
 
 def _weights(setup: LaserSetup) -> Array:
-    """(13, 13) weights of a covariance of :data:`PARAMETERS`: mean square error (m²) of a point as far as the plane."""
+    """(13, 13) weights of a covariance of :data:`PARAMETERS`: mean square error (m²) of a point at plane distance."""
     out = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     change = pose_jacobian(setup.cam_T_base)
     size = np.diag([1.0] * 3 + [setup.distance_m**2] * 3)

@@ -40,9 +40,7 @@ class LaserCell:
 
 
 def paper_cell(rng: np.random.Generator) -> LaserCell:
-    """The paper's simulation: base_T_cam, laser, and a plane 550 mm away, tilted by up to 5 degrees about x and y
-    each.
-    """
+    """The paper's simulation: base_T_cam, laser, and a plane 550 mm away, tilted by up to 5 degrees about x and y."""
     rotation = Rotation.from_euler("ZYX", [-90.0, -10.0, -170.0], degrees=True).as_matrix()
     base_T_cam = make_transform(rotation, np.array([0.510, 0.151, 0.430]))
     theta, phi = np.radians([-1.80, 53.39])
