@@ -182,9 +182,7 @@ def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
 def _refine(
     plate_xy: Array, weight: Array, corners_xy: Array, q: Array, shift: Array, sides: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Rotation, shift, and with ``sides`` (2,) those of the rectangle: least residuals, whitened by ``weight`` (c, 2,
-    2).
-    """
+    """Rotation, shift, and with ``sides`` (2,) the rectangle's: least residuals, whitened by ``weight`` (c, 2, 2)."""
     start = np.concatenate([[0.0], shift, [] if sides is None else sides])
 
     def turned_by(unknown: Array) -> Array:

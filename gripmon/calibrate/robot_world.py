@@ -112,8 +112,8 @@ def rotations(cam_R_target: Array, base_R_ee: Array) -> tuple[Array, Array]:
 
 
 def translations(cam_T_target: Array, base_T_ee: Array, cam_R_base: Array) -> tuple[Array, Array]:
-    """Positions (3,) of ``cam_T_base`` and ``target_T_ee``, linear least squares of ``cam_R_target x + cam_t_target =
-    cam_R_base base_t_ee + z``.
+    """Positions (3,) of ``cam_T_base`` and ``target_T_ee``, linear least squares of
+    ``cam_R_target x + cam_t_target = cam_R_base base_t_ee + z``.
     """
     count = len(cam_T_target)
     rows = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), -cam_T_target[:, :3, :3]], axis=2).reshape(-1, 6)
