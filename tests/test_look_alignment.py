@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support.by_numpy import look as by_numpy
 from support.simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, simulator
 
 from gripmon.model.camera import make_camera
@@ -13,7 +14,7 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import load_gripper
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import FingerLook, JawScript, Light, LightStep, Shadow, Tilt
-from gripmon.track.look import LookAlignment, LookFusion, LookMotion, kernel, plain
+from gripmon.track.look import LookAlignment, LookFusion, LookMotion, kernel
 from gripmon.track.look.alignment import FEWEST_VIEWS, LINEAR_PX
 from gripmon.track.look.fusion import MEMORY, PER_OPENING
 
@@ -72,7 +73,7 @@ def random_patches(rng: np.random.Generator, patches: int = 12, pixels: int = 36
 @pytest.mark.parametrize("seed", range(6))
 def test_the_compiled_fit_is_that_of_numpy(seed: int):
     patches = random_patches(np.random.default_rng(seed))
-    for one, other in zip(kernel.align(*patches), plain.align(*patches), strict=True):
+    for one, other in zip(kernel.align(*patches), by_numpy.align(*patches), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
@@ -83,7 +84,10 @@ def test_the_compiled_reading_is_that_of_numpy(shape: tuple[int, ...]):
     weights = np.full(shape[2], 1.0 / shape[2])
     base_px = rng.uniform(-3.0, 53.0, (9, 16, 2))
     flow, motion = rng.normal(0.0, 1.0, (9, 16, 2, 7)), rng.normal(0.0, 0.3, 7)
-    one, other = kernel.read(image, weights, base_px, flow, motion), plain.read(image, weights, base_px, flow, motion)
+    one, other = (
+        kernel.read(image, weights, base_px, flow, motion),
+        by_numpy.read(image, weights, base_px, flow, motion),
+    )
     assert np.isnan(one).any()
     np.testing.assert_allclose(one, other, rtol=1e-9)
 

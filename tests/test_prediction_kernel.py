@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.by_numpy import prediction as by_numpy
 from support.meters import FISHEYE_LENS, box_gripper, moved
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
-from gripmon.model.compiled import COMPILES
 from gripmon.model.gripper import load_gripper
-from gripmon.track.edges import prediction, prediction_kernel, prediction_plain
+from gripmon.track.edges import prediction, prediction_kernel
 from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 
-pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
 CLOSE = 1e-9
 GRIPPERS = {"box": box_gripper(), "arc": load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")}
 WAYS = {
@@ -25,7 +24,7 @@ WAYS = {
 
 
 def predicted(by: object, lens: object, gripper: str, way: str, monkeypatch: pytest.MonkeyPatch) -> Prediction:
-    monkeypatch.setattr(prediction, "_by", by)
+    monkeypatch.setattr(prediction, "prediction_kernel", by)
     camera, pose = make_camera(lens), moved(nominal_cam_T_grip(), WAYS[way])
     settings = SamplingSettings(creases=True)
     layout = lay_out(camera, GRIPPERS[gripper], pose, 0.031, settings)
@@ -39,7 +38,7 @@ def predicted(by: object, lens: object, gripper: str, way: str, monkeypatch: pyt
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
 def test_both_predict_the_same(lens: object, gripper: str, way: str, monkeypatch: pytest.MonkeyPatch):
     one = predicted(prediction_kernel, lens, gripper, way, monkeypatch)
-    other = predicted(prediction_plain, lens, gripper, way, monkeypatch)
+    other = predicted(by_numpy, lens, gripper, way, monkeypatch)
     np.testing.assert_array_equal(one.layout.edge, other.layout.edge)
     np.testing.assert_allclose(one.layout.fraction, other.layout.fraction, atol=CLOSE)
     assert way != "as expected" or len(one.layout.edges) >= 6
@@ -52,7 +51,7 @@ def test_both_predict_the_same(lens: object, gripper: str, way: str, monkeypatch
     for name in ("map_x", "map_y"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=3e-7, atol=1e-4, err_msg=name)
     xi = np.array([1e-3, -2e-3, 5e-4, 0.01, -0.02, 0.005])
-    motions = [by.largest_motion(one.jacobian, xi) for by in (prediction_kernel, prediction_plain)]
+    motions = [by.largest_motion(one.jacobian, xi) for by in (prediction_kernel, by_numpy)]
     assert motions[0] == pytest.approx(motions[1], rel=CLOSE)
 
 
@@ -67,7 +66,7 @@ def test_the_longest_run_inside_the_image_is_sampled():
     uv_px[3, 20:40] = uv_px[3, 20]  # seen end on
     wanted = rng.uniform(size=60) < 0.8
     wanted[:4] = True
-    one, other = (by.sampled_ranges(uv_px, inside, wanted, 4.0, 8.0) for by in (prediction_kernel, prediction_plain))
+    one, other = (by.sampled_ranges(uv_px, inside, wanted, 4.0, 8.0) for by in (prediction_kernel, by_numpy))
     np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-7)
     assert not one[0].any() and one[1, 2] > 100.0 and not one[~wanted].any()
     assert 20 < np.count_nonzero(one[:, 2]) < 60

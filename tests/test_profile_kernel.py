@@ -8,25 +8,20 @@ import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from support.by_numpy import profiles as by_numpy
 from test_robust_fit import EDGES, PREDICTION, SETTINGS
 
-from gripmon.model.compiled import COMPILES
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.profiles import (
     EdgeSettings,
     estimate_noise,
     find_candidates,
-    find_candidates_with_numpy,
     full_scale,
-    low_third_difference,
     quantum,
     read_profiles,
-    read_profiles_with_numpy,
     weigh,
-    weigh_with_numpy,
 )
 
-compiles = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
 CLOSE = 1e-9
 HEIGHT, WIDTH = 576, 768
 
@@ -61,7 +56,6 @@ def maps(seed: int = 2, zoom: float = 1.0, inside: bool = True) -> tuple[np.ndar
     return map_x.astype(np.float32), map_y.astype(np.float32)
 
 
-@compiles
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("inside", [True, False])
 def test_the_compiled_sampler_is_that_of_numpy(kind: str, inside: bool):
@@ -70,7 +64,7 @@ def test_the_compiled_sampler_is_that_of_numpy(kind: str, inside: bool):
         places = maps(zoom=zoom, inside=inside)
         np.testing.assert_allclose(
             read_profiles(image, *places),
-            read_profiles_with_numpy(image, *places),
+            by_numpy.read_profiles(image, *places),
             rtol=0.0,
             atol=CLOSE * full_scale(image),
         )
@@ -118,7 +112,7 @@ def test_images_may_be_read_only_or_parts_of_others():
 def test_places_that_are_no_numbers_are_read_at_the_border():
     image = picture("uint8")
     place = np.array([np.nan, -np.inf, np.inf, 1e9, -1e9], dtype=np.float32)[None, None]
-    for read in (read_profiles, read_profiles_with_numpy):
+    for read in (read_profiles, by_numpy.read_profiles):
         profile = read(image, place, np.full_like(place, 7.0))[0]
         np.testing.assert_allclose(profile, image[7, [0, 0, -1, -1, 0]], atol=1e-9)
 
@@ -130,45 +124,41 @@ def some_profiles() -> list[tuple[np.ndarray, float, float]]:
     out = []
     for kind in ("uint8", "uint16", "float32"):
         image = picture(kind)
-        profiles = read_profiles_with_numpy(image, *maps())
+        profiles = by_numpy.read_profiles(image, *maps())
         out.append((profiles, estimate_noise(profiles, quantum(image)), full_scale(image)))
     broken = out[0][0].copy()
     broken[::9, 11] = np.nan
     return [*out, (broken, *out[0][1:])]
 
 
-@compiles
 @pytest.mark.parametrize("zoom", [1, 2])
 def test_the_compiled_candidates_are_those_of_numpy(zoom: int):
     ok = np.arange(200) % 11 != 3
     for profiles, noise, most in some_profiles():
         for settings in (EdgeSettings(), EdgeSettings(blur_px=1.2, noise_factor=8.0, contrast_fraction=0.1)):
             one, other = (
-                find(profiles, ok, noise, most, settings, zoom)
-                for find in (find_candidates, find_candidates_with_numpy)
+                find(profiles, ok, noise, most, settings, zoom) for find in (find_candidates, by_numpy.find_candidates)
             )
             assert len(one.sample) > 20
             assert_alike(one, other)
 
 
-@compiles
 def test_the_compiled_noise_is_that_of_numpy():
     for profiles, _, _ in some_profiles():
-        assert profile_kernel.low_third_difference(profiles) == low_third_difference(profiles)
+        assert profile_kernel.low_third_difference(profiles) == by_numpy.low_third_difference(profiles)
     for nothing in (np.zeros((0, 29)), np.zeros((5, 6))):
-        assert profile_kernel.low_third_difference(nothing) == low_third_difference(nothing) == 0.0
+        assert profile_kernel.low_third_difference(nothing) == by_numpy.low_third_difference(nothing) == 0.0
     unknown = np.full((30, 29), np.nan)
-    assert np.isnan(profile_kernel.low_third_difference(unknown)) and np.isnan(low_third_difference(unknown))
+    assert np.isnan(profile_kernel.low_third_difference(unknown)) and np.isnan(by_numpy.low_third_difference(unknown))
 
 
-@compiles
 def test_the_compiled_weights_are_those_of_numpy():
     polarity = (np.arange(EDGES) % 3 - 1).astype(np.int8)
     for profiles, noise, most in some_profiles():
-        found = find_candidates_with_numpy(profiles, np.ones(200, dtype=bool), noise, most, EdgeSettings())
+        found = by_numpy.find_candidates(profiles, np.ones(200, dtype=bool), noise, most, EdgeSettings())
         nothing = replace(found, **{f.name: getattr(found, f.name)[:0] for f in fields(found)[:6]})
         for candidates in (found, replace(found, width_px=5.0 * found.width_px), nothing):
-            one, other = (w(candidates, PREDICTION, polarity, SETTINGS) for w in (weigh, weigh_with_numpy))
+            one, other = (w(candidates, PREDICTION, polarity, SETTINGS) for w in (weigh, by_numpy.weigh))
             assert len(one.cut_off_px) == EDGES
             assert_alike(one, other)
 

@@ -9,7 +9,7 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
 from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.track.edges.profiles import Candidates, Edgels, base_weights, profile_offsets_px
+from gripmon.track.edges.profiles import Candidates, Edgels, profile_offsets_px, weigh
 from gripmon.track.edges.robust_fit import (
     Prior,
     RobustFit,
@@ -82,7 +82,7 @@ def votes_for(
     edge_spread_px: np.ndarray | None = None,
 ) -> Edgels:
     spread_px = np.full(EDGES, settings.edge_floor_px) if edge_spread_px is None else edge_spread_px
-    return Edgels(found, PREDICTION, base_weights(found, PREDICTION, polarity, settings), spread_px, np.zeros(EDGES))
+    return Edgels(found, PREDICTION, weigh(found, PREDICTION, polarity, settings).weight, spread_px, np.zeros(EDGES))
 
 
 def fit(found: Candidates, settings: RobustFitSettings = SETTINGS, start: np.ndarray | None = None) -> RobustFit:
@@ -314,12 +314,12 @@ def test_polarity_discards_candidates_of_the_wrong_sign():
     polarity = ANY.copy()
     polarity[edge] = 1
     found = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), step=-40.0)
-    weights = base_weights(found, PREDICTION, polarity, SETTINGS)
+    weights = weigh(found, PREDICTION, polarity, SETTINGS).weight
     mine = PREDICTION.layout.edge[found.sample] == edge
     assert (weights[mine] == 0.0).all() and (weights[~mine] > 0.0).all()
     brighter = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), step=40.0)
-    assert (base_weights(brighter, PREDICTION, polarity, SETTINGS) > 0.0).all()
-    assert (base_weights(brighter, PREDICTION, -polarity, SETTINGS)[mine] == 0.0).all()
+    assert (weigh(brighter, PREDICTION, polarity, SETTINGS).weight > 0.0).all()
+    assert (weigh(brighter, PREDICTION, -polarity, SETTINGS).weight[mine] == 0.0).all()
 
 
 def test_candidates_of_the_wrong_sign_do_not_count_even_where_they_lie_right():

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.by_numpy import drift
 from support.drift_noise import COVARIANCE, autocorrelated, claimed
 
-from gripmon.judge.drift.statistics import LENGTHS, PRIOR_SHARE, PRIOR_WINDOWS, Scatter, Windows
+from gripmon.judge.drift.statistics import LENGTHS, PRIOR_SHARE, PRIOR_WINDOWS, RARE, Scatter, Windows
 
 FRAMES, STREAMS = 12_000, 24
 NO_MORE = np.ones((len(LENGTHS), STREAMS))
@@ -23,6 +24,13 @@ def learnt(shifts: np.ndarray, every: int = 4) -> Scatter:
             _, usable = windows.full()
             scatter.learn(difference, np.zeros(usable.shape), usable, every)
     return scatter
+
+
+def covariances(scatter: Scatter, reported: np.ndarray, inflation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(k, s, 6, 6) of means and of differences, ``reported`` (s, 6, 6) being what a frame claims for itself, and what
+    the stream has shown counting by the variance's ``inflation`` (k, s) more.
+    """
+    return drift.covariances(reported, scatter.of_differences, scatter.learnt, inflation, RARE)
 
 
 def share(covariance: np.ndarray) -> float:
@@ -42,7 +50,7 @@ def test_means_of_windows_scatter_as_those_of_an_ar_process(memory: float):
     """Twice the claimed standard deviation, so that nothing of it is missing."""
     rng = np.random.default_rng(1)
     scatter = learnt(2.0 * autocorrelated(rng, FRAMES, STREAMS, memory))
-    of_mean, _ = scatter.covariances(claimed(STREAMS), NO_MORE)
+    of_mean, _ = covariances(scatter, claimed(STREAMS), NO_MORE)
     for k, frames in enumerate(LENGTHS[:7]):  # longer ones still show the prior
         # Neighbours a and b of one length: var(a - b) = 2 var(a) + 2 var(b) - 4 var((a + b) / 2).
         expected = 4.0 * mean_variance(memory, frames)
@@ -58,12 +66,12 @@ def test_the_sum_over_octaves_is_the_variance_of_the_means():
     """Haar: what is left of the mean's variance at the longest length, plus all differences over four."""
     rng = np.random.default_rng(2)
     scatter = learnt(3.0 * autocorrelated(rng, FRAMES, STREAMS, 0.5))
-    of_mean, of_difference = scatter.covariances(1e-6 * claimed(STREAMS), NO_MORE)
+    of_mean, of_difference = covariances(scatter, 1e-6 * claimed(STREAMS), NO_MORE)
     for k in range(len(LENGTHS) - 1):
         np.testing.assert_allclose(of_mean[k], of_mean[k + 1] + 0.25 * of_difference[k], rtol=1e-4, atol=1e-16)
     np.testing.assert_allclose(of_mean[-1], 0.5 * of_difference[-1], rtol=1e-4, atol=1e-16)
     np.testing.assert_allclose(scatter.of_single_frames() + 0.25 * scatter.of_differences[-1], of_mean[0], rtol=1e-4)
-    more, _ = scatter.covariances(1e-6 * claimed(STREAMS), 5.0 * NO_MORE)
+    more, _ = covariances(scatter, 1e-6 * claimed(STREAMS), 5.0 * NO_MORE)
     np.testing.assert_allclose(more, 5.0 * of_mean, rtol=1e-4)
 
 
@@ -73,7 +81,7 @@ def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
     factor = np.linalg.cholesky(COVARIANCE)
     size = np.array([0.5, 0.5, 0.5, 2.0, 2.0, 2.0])
     shifts = (rng.normal(size=(FRAMES, STREAMS, 6)) * size) @ factor.T
-    of_mean, of_difference = learnt(shifts).covariances(claimed(STREAMS), NO_MORE)
+    of_mean, of_difference = covariances(learnt(shifts), claimed(STREAMS), NO_MORE)
     inverse = np.linalg.inv(factor)
     white = (inverse @ of_mean.mean(axis=1) @ inverse.T).diagonal(axis1=1, axis2=2)
     assert white[0, :3] == pytest.approx(np.full(3, 1.15), abs=0.2), "single frames: what they claim, at least"
@@ -87,7 +95,7 @@ def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
 def test_before_anything_was_seen_means_are_worth_about_what_frames_claim():
     scatter = Scatter(1)
     scatter.begin(claimed(1))
-    of_mean, _ = scatter.covariances(claimed(1), NO_MORE[:, :1])
+    of_mean, _ = covariances(scatter, claimed(1), NO_MORE[:, :1])
     assert 1.0 <= share(of_mean[0]) < 2.5
     assert (np.array([share(each) for each in of_mean]) >= 1.0).all()
     assert (np.diff([share(each) for each in of_mean]) <= 0.0).all()

@@ -16,7 +16,7 @@ from gripmon.model.records import Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
-from gripmon.track.edges import prediction_kernel, prediction_plain
+from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.ends import along_fingers
 from gripmon.track.edges.prediction import ROWS, SHORTEST_PX, SamplingSettings, independent_part, lay_out
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, profile_offsets_px, read_profiles
@@ -44,14 +44,13 @@ TIPS = ["half round", "three facets"]
 # --- what is sampled, and what that is worth ---
 
 
-@pytest.mark.parametrize("by", [prediction_kernel, prediction_plain], ids=["compiled", "numpy"])
 @pytest.mark.parametrize(
     ("length_px", "left_px"), [(7.9, 0.0), (8.0, 4.0), (10.0, 6.0), (12.0, 8.0), (14.0, 8.0), (16.0, 8.0), (40.0, 32.0)]
 )
-def test_the_margin_at_the_ends_of_short_edges_is_halved_at_most(by: object, length_px: float, left_px: float):
+def test_the_margin_at_the_ends_of_short_edges_is_halved_at_most(length_px: float, left_px: float):
     uv_px = np.column_stack([np.linspace(20.0, 20.0 + length_px, 65), np.full(65, 30.0)])[None]
     one = np.ones((1, 65), dtype=bool)
-    ranges = by.sampled_ranges(uv_px, one, one[:, 0], MARGIN_PX, SHORTEST_PX)  # type: ignore[attr-defined]
+    ranges = prediction_kernel.sampled_ranges(uv_px, one, one[:, 0], MARGIN_PX, SHORTEST_PX)
     assert ranges[0, 2] == pytest.approx(left_px, abs=1e-6)
     if left_px:
         assert ranges[0, 0] == pytest.approx(0.5 - 0.5 * left_px / length_px)
@@ -87,7 +86,7 @@ def test_the_mean_of_profiles_that_share_pixels_scatters_as_if_they_were_fewer(l
         uv_px = middle + along_px[:, None] * np.array([normal[1], -normal[0]])
         rows_px = np.arange(-1, 2).astype(np.float32)
         assert len(rows_px) == ROWS
-        maps = prediction_plain.maps(uv_px, np.tile(normal, (count, 1)), offsets_px.astype(np.float32), rows_px)
+        maps = prediction_kernel.maps(uv_px, np.tile(normal, (count, 1)), offsets_px.astype(np.float32), rows_px)
         profiles, noise = read_profiles(image, *maps), noise_dn / 255.0 / np.sqrt(ROWS)
         found = find_candidates(profiles, np.ones(count, dtype=bool), noise, 1.0, EdgeSettings())
         near = np.abs(found.offset_px) < 0.8

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 
-import numba
 import pytest
 
-from gripmon.model import compiled
 from gripmon.monitor import warm_up, warming
 
 
@@ -65,26 +66,29 @@ def test_a_full_disk_costs_time_at_every_start_and_no_start(part: Part):
     assert "No space left on device" in said and "NUMBA_CACHE_DIR" in said
 
 
-def test_without_a_compiler_it_is_said_how_to_get_one(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(warming, "COMPILES", False)
-    assert "pip install numba" in warm_up()
+DOUBLED = """
+from gripmon.model.compiled import compiled
+
+@compiled
+def double(x):
+    return x + x
+
+assert double(21.0) == 42.0
+print(len(double.signatures), double._cache.__class__.__name__)
+"""
 
 
-def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch):
-    """A service without a home on a read-only system: numba refuses to cache when the module is imported."""
-    njit, asked = numba.njit, []
-
-    def without_a_folder(*functions: object, **options: object) -> object:
-        if functions:  # numba's own
-            return njit(*functions, **options)
-        asked.append(options)
-        if options.get("cache"):
-            raise RuntimeError("cannot cache function 'double': no locator available")
-        return njit(**options)
-
-    def double(x: float) -> float:
-        return x + x
-
-    monkeypatch.setattr(numba, "njit", without_a_folder)
-    assert compiled.compiled(double)(21.0) == 42.0
-    assert [bool(options.get("cache")) for options in asked] == [True, False]
+@pytest.mark.parametrize("kept", [True, False])
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(tmp_path: Path, kept: bool):
+    """A service without a home on a read-only system: neither NUMBA_CACHE_DIR nor any other folder can be written to."""
+    (tmp_path / "doubled.py").write_text(DOUBLED)
+    (tmp_path / "__pycache__").touch()  # no folder, and none can be made in its place
+    (nowhere := tmp_path / "file").touch()
+    cache = tmp_path / "cache" if kept else nowhere / "cache"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "HOME": str(nowhere), "XDG_CACHE_HOME": str(nowhere)}
+    said = subprocess.run(
+        [sys.executable, tmp_path / "doubled.py"], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert (said.returncode, said.stderr) == (0, "")
+    assert said.stdout.split() == ["1", "FunctionCache" if kept else "NullCache"]
+    assert any(tmp_path.glob("cache/*/*.nbi")) == kept

@@ -22,9 +22,8 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.linalg.lapack import dposv
 
-from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.compiled import compiled
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
@@ -184,20 +183,12 @@ class PoseFilter:
         return innovation - way
 
 
-def _gain_numpy(mine: Array, other: Array, innovation: Array) -> tuple[Array, float]:
-    """Gain (6, 6) of a measurement with the covariance ``other`` and the ``innovation`` (6,), to a state with ``mine``;
-    and the innovation's normalised square, negative if that isn't positive definite.
-    """
-    # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
-    sides = np.empty((6, 7), order="F")  # as LAPACK wants it: no copy
-    sides[:, :6], sides[:, 6] = mine, innovation
-    _, both, failed = dposv(mine + other, sides)
-    return both[:, :6].T, -1.0 if failed else float(innovation @ both[:, 6])
-
-
 @compiled
-def _gain_compiled(mine: Array, other: Array, innovation: Array) -> tuple[Array, float]:
-    """The same by Cholesky's decomposition."""
+def _gain(mine: Array, other: Array, innovation: Array) -> tuple[Array, float]:
+    """Gain P (P + R)^-1 (6, 6) of a measurement with the covariance R, ``other``, to a state with P, ``mine``; and the
+    normalised square of the ``innovation`` (6,), negative where P + R isn't positive definite.  By Cholesky's
+    decomposition.
+    """
     root, gain, white, surprise = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), 0.0
     for i in range(6):
         for j in range(i + 1):
@@ -228,15 +219,9 @@ def _gain_compiled(mine: Array, other: Array, innovation: Array) -> tuple[Array,
     return gain, surprise
 
 
-def _corrected_numpy(covariance: Array, gain: Array, innovation: Array) -> tuple[Array, Array]:
-    """The way (6,) of the state, and its covariance (6, 6) after that."""
-    left = covariance - gain @ covariance
-    return gain @ innovation, 0.5 * (left + left.T)
-
-
 @compiled
-def _corrected_compiled(covariance: Array, gain: Array, innovation: Array) -> tuple[Array, Array]:
-    """The same."""
+def _corrected(covariance: Array, gain: Array, innovation: Array) -> tuple[Array, Array]:
+    """The way (6,) of the state, K times the innovation, and its covariance (6, 6) after that, (1 - K) P."""
     way, left, out = np.zeros(6), covariance.copy(), np.empty((6, 6))
     for i in range(6):
         for j in range(6):
@@ -249,26 +234,14 @@ def _corrected_compiled(covariance: Array, gain: Array, innovation: Array) -> tu
     return way, out
 
 
-def _scaled_numpy(covariance: Array, share: Array) -> Array:
-    """A covariance (6, 6) with the ``share`` (6,) of its variances, as correlated as before."""
-    scale = np.sqrt(share)
-    out: Array = covariance * (scale[:, None] * scale)
-    return out
-
-
 @compiled
-def _scaled_compiled(covariance: Array, share: Array) -> Array:
-    """The same."""
+def _scaled(covariance: Array, share: Array) -> Array:
+    """A covariance (6, 6) with the ``share`` (6,) of its variances, as correlated as before."""
     out = np.empty((6, 6))
     for i in range(6):
         for j in range(6):
             out[i, j] = covariance[i, j] * math.sqrt(share[i]) * math.sqrt(share[j])
     return out
-
-
-_gain = _gain_compiled if COMPILES else _gain_numpy
-_corrected = _corrected_compiled if COMPILES else _corrected_numpy
-_scaled = _scaled_compiled if COMPILES else _scaled_numpy
 
 
 def warm_up() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.judge.inspection import FULL_SCALE, sparse
-from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.compiled import compiled
 from gripmon.model.records import Cause, Frame, Image
 from gripmon.model.records.values import NS_PER_S
 
@@ -187,7 +187,7 @@ def _stands_in_large_parts(sample: Image, before: Image | None) -> bool:
         return False
     if sample.size < FEWEST_INNER:
         return False
-    if COMPILES and sample.dtype in FULL_SCALE:
+    if sample.dtype in FULL_SCALE:  # for no other type is it compiled again
         count, standing = inner_pixels(sample.ravel(), before.ravel())
         return bool(count >= FEWEST_INNER and STOOD_SHARE * count <= standing)
     stands = sample == before

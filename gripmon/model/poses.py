@@ -1,6 +1,6 @@
 """SE(3) for every frame, compiled: same names as the functions of :mod:`gripmon.model.geometry`.
 
-Where numba can't run these names are those functions.  A transform is a contiguous float64 (4, 4) array here.
+A transform is a contiguous float64 (4, 4) array here.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import math
 
 import numpy as np
 
-from gripmon.model import geometry
-from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.compiled import compiled
 from gripmon.model.geometry import SMALL_RAD
 from gripmon.model.records import Array, Transform
 
@@ -51,7 +50,10 @@ def _turn_between(from_T: Array, to_T: Array) -> Array:
 
 
 @compiled
-def _perturbation_between(from_T: Array, to_T: Array) -> Array:
+def perturbation_between(from_T: Array, to_T: Array) -> Array:
+    """``xi`` (6,) = (rho, omega) from one pose (4, 4) to another: ``to_t = from_t + rho``, ``to_R = exp(omega)
+    from_R``.
+    """
     x, y, z, w = quaternion_of(_turn_between(from_T, to_T))
     sine = math.sqrt(x * x + y * y + z * z)
     factor = 2.0 * math.atan2(sine, w) / sine if sine > SMALL_RAD else 2.0 / w
@@ -63,7 +65,8 @@ def _perturbation_between(from_T: Array, to_T: Array) -> Array:
 
 
 @compiled
-def _perturb(a_T_b: Array, xi: Array) -> Array:
+def perturb(a_T_b: Array, xi: Array) -> Array:
+    """The pose (4, 4) after ``xi`` (6,) = (rho, omega), equations (11) to (13) with the exponential."""
     x, y, z = xi[3], xi[4], xi[5]
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
@@ -94,7 +97,8 @@ def _perturb(a_T_b: Array, xi: Array) -> Array:
 
 
 @compiled
-def _motion_between(from_T: Array, to_T: Array) -> tuple[float, float]:
+def motion_between(from_T: Array, to_T: Array) -> tuple[float, float]:
+    """Length d (m) and angle delta (rad) of the motion from one pose (4, 4) to another, equation (14)."""
     turn = _turn_between(from_T, to_T)
     x, y, z, w = quaternion_of(turn)
     square = 0.0
@@ -104,21 +108,10 @@ def _motion_between(from_T: Array, to_T: Array) -> tuple[float, float]:
     return math.sqrt(square), 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), w)
 
 
-def _motion_between_numpy(from_T: Array, to_T: Array) -> tuple[float, float]:
-    motion = to_T @ geometry.invert(from_T)
-    return float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), geometry.rotation_angle(motion[:3, :3])
-
-
-perturb = _perturb if COMPILES else geometry.perturb
-perturbation_between = _perturbation_between if COMPILES else geometry.perturbation_between
-motion_between = _motion_between if COMPILES else _motion_between_numpy
-"""Length d (m) and angle delta (rad) of the motion from one pose (4, 4) to another, equation (14)."""
-
-
 def to_record(a_T_b: Array) -> Transform:
     """A pose (4, 4) as it is published."""
     x, y, z = a_T_b[:3, 3].tolist()
-    return Transform((x, y, z), quaternion_of(a_T_b) if COMPILES else geometry.quaternion_xyzw(a_T_b[:3, :3]))
+    return Transform((x, y, z), quaternion_of(a_T_b))
 
 
 def warm_up() -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 from gripmon.judge import drift, smoothing, stream
 from gripmon.model import poses
-from gripmon.model.compiled import COMPILES
 from gripmon.track import edges, integrity, look
 
 _log = logging.getLogger(__name__)
@@ -25,8 +24,6 @@ def warm_up() -> str:
     """Load the machine code that frames need, or compile it, which takes a minute, once on a machine; what a person
     should know of it, or empty.
     """
-    if not COMPILES:
-        return "numba can't be imported: every frame takes about ten times as long (pip install numba)"
     begin_s = time.perf_counter()
     unkept = ""
     patience = threading.Timer(LOADED_WITHIN_S, _log.info, ["compiling what every frame needs: about a minute, once"])

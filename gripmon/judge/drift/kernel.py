@@ -1,7 +1,8 @@
 """The arithmetic of the sequential test, compiled: k lengths of windows, s streams, six axes.
 
-The same by NumPy stands in :mod:`~gripmon.judge.drift.plain`, function by function; what the quantities are for, in
-:mod:`~gripmon.judge.drift.sequential` and :mod:`~gripmon.judge.drift.statistics`.  What is learnt is changed in place.
+Values are m and rad or, after a whitening W of their covariance C with W C W' = 1, standard deviations.  What they are
+for stands in :mod:`~gripmon.judge.drift.sequential` and :mod:`~gripmon.judge.drift.statistics`.  What is learnt is
+changed in place.  Tests hold each function against that of its name in ``tests/support/by_numpy/drift.py``.
 """
 
 from __future__ import annotations
@@ -53,12 +54,11 @@ def _invert_root(root: Array, inverse: Array) -> None:
 
 
 @compiled
-def _whiten(matrix: Array, root: Array, whitening: Array) -> bool:
-    """W with ``W C W' = 1``, lower triangular."""
+def _whiten(matrix: Array, root: Array, whitening: Array) -> None:
+    """W with ``W C W' = 1``, lower triangular; LinAlgError for a matrix that isn't positive definite."""
     if not _root(matrix, root):
-        return False
+        raise np.linalg.LinAlgError("a covariance of the drift test isn't positive definite")
     _invert_root(root, whitening)
-    return True
 
 
 @compiled
@@ -85,7 +85,12 @@ def squares(whitening: Array, values: Array) -> Array:
 
 @compiled
 def _square_beyond(whitening: Array, shift: Array, tolerated: Array, sweeps: int) -> float:
-    """Smallest normalised square of ``shift`` (6,) less what lies within ``tolerated`` (6,), by coordinate descent."""
+    """Smallest normalised square of ``shift`` (6,) less a shift within ``tolerated`` (6,) on every axis.
+
+    Errors of the axes belong together: what is tolerated on each axis by itself must not be taken off by itself, or
+    what is left would be a shift that C takes to be impossible.  Coordinate descent from both ends, nothing taken off
+    and all of it; never more than the square of the shift itself.
+    """
     precision, left, best = np.zeros((6, 6)), np.empty(6), math.inf
     for i in range(6):
         for j in range(6):
@@ -107,12 +112,11 @@ def _square_beyond(whitening: Array, shift: Array, tolerated: Array, sweeps: int
 
 
 @compiled
-def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int) -> tuple[bool, float]:
-    """Normalised square of what of a shift (6,) isn't tolerated; and False before it where there is no root."""
+def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int) -> float:
+    """Normalised square of what of a shift (6,) with a covariance (6, 6) isn't tolerated."""
     root, whitening = np.empty((6, 6)), np.empty((6, 6))
-    if not _whiten(covariance, root, whitening):
-        return False, 0.0
-    return True, _square_beyond(whitening, shift, tolerated, sweeps)
+    _whiten(covariance, root, whitening)
+    return _square_beyond(whitening, shift, tolerated, sweeps)
 
 
 @compiled
@@ -363,13 +367,15 @@ def refresh(
     learnt_whitening: Array,
     to_reported: Array,
     from_reported: Array,
-) -> bool:
+) -> None:
     """Covariances of means and of differences again, and their whitening.
 
+    With A(n) ``of_difference`` that of a mean is the sum of A(n), A(2 n), A(4 n) ... over four, but of what was seen so
+    often as to be always there what is missing of ``reported`` (s, 6, 6) comes on top, direction by direction.
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
     (k,): length from which on noise is rare; ``lasting`` (k, 6, 6): what differences have on top.  The rest is
-    overwritten.  False if rounding leaves no root.
+    overwritten.  LinAlgError if rounding leaves no root.
     """
     lengths, streams = learnt.shape
     total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
@@ -384,25 +390,17 @@ def refresh(
                 total[way, k] = times[way, k, s] * part
                 if k < lengths - 1:
                     total[way, k] += total[way, k + 1]
-        if not _root(reported[s], from_reported[s]):
-            return False
-        _invert_root(from_reported[s], to_reported[s])
+        _whiten(reported[s], from_reported[s], to_reported[s])
         _missing(seen[0], from_reported[s], to_reported[s], never)
         for k in range(lengths):
             _missing(seen[0] - seen[rare[k]], from_reported[s], to_reported[s], missing)
             mean_covariance[k, s] = total[1, k] + never + reference[s]
             way = 2 if known[0, k, s] else 0
-            if not _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s]):
-                return False
+            _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s])
             way = 2 if known[1, k, s] else 0
             missing[:] = 2.0 * missing + lasting[k]
-            if not _whiten(times[way, k, s] * of_difference[k, s] + missing, root, whitening[1, k, s]):
-                return False
-            if not _whiten(of_difference[k, s], root, learnt_whitening[k, s]):
-                return False
+            _whiten(times[way, k, s] * of_difference[k, s] + missing, root, whitening[1, k, s])
+            _whiten(of_difference[k, s], root, learnt_whitening[k, s])
             if k < plain.shape[1]:
-                if not _whiten(total[2, k] + never, root, plain[0, k, s]):
-                    return False
-                if not _whiten(times[2, k, s] * of_difference[k, s] + missing, root, plain[1, k, s]):
-                    return False
-    return True
+                _whiten(total[2, k] + never, root, plain[0, k, s])
+                _whiten(times[2, k, s] * of_difference[k, s] + missing, root, plain[1, k, s])

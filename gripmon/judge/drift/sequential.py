@@ -13,21 +13,18 @@ has shown enough extremes of its own, the thresholds of short windows are learnt
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from scipy import special
 
-from gripmon.judge.drift import plain
+from gripmon.judge.drift import kernel
 from gripmon.judge.drift.settings import DriftSettings
 from gripmon.judge.drift.statistics import (
-    ARITHMETIC,
     BLOCK_FRAMES,
     COUNT,
     LARGEST_SQUARE,
     LENGTHS,
     RARE,
-    ByArithmetic,
     Extremes,
     Scatter,
     Windows,
@@ -103,14 +100,12 @@ class Finding:
     excess: Array
 
 
-class SequentialTest(ByArithmetic):
+class SequentialTest:
     """Tests ``streams`` series of shifts against a reference."""
 
-    def __init__(self, settings: DriftSettings, streams: int = 1, by: ModuleType = ARITHMETIC):
-        """``by``: whose arithmetic, :mod:`~gripmon.judge.drift.kernel` or :mod:`~gripmon.judge.drift.plain`."""
-        super().__init__(by)
+    def __init__(self, settings: DriftSettings, streams: int = 1):
         self._settings, self._streams = settings, streams
-        self.windows, self.scatter = Windows(streams, by), Scatter(streams, by)
+        self.windows, self.scatter = Windows(streams), Scatter(streams)
         self._tolerated = settings.tolerated
         self._frames_per_s = settings.frames_per_s
         self._last_two = np.zeros((2, streams, 6))
@@ -164,7 +159,6 @@ class SequentialTest(ByArithmetic):
         ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.  Windows of
         fewer than ``at_least`` frames decide nothing now.
         """
-        by = self._by
         self.learn()
         if self._frames == 0:
             self._reported = np.array(covariance)
@@ -174,7 +168,7 @@ class SequentialTest(ByArithmetic):
         # The median of three frames: no single frame can decide, and a step is late by one.  In axes in which errors
         # are independent: medians of others need not be a shift that any of the frames makes likely.
         mean, difference = self.windows.add(
-            by.steady(
+            kernel.steady(
                 shift, covariance, REPORTED_MEMORY, self._reported, self._seen, self._sure, self._last_two,
                 self._to_reported, self._from_reported,
             )
@@ -183,7 +177,7 @@ class SequentialTest(ByArithmetic):
         if self._since_restart < 3:
             # Of fewer than three frames there is no middle one.
             self.windows.keep(self._seen < 3, 0)
-        beyond, found = by.decide(
+        beyond, found = kernel.decide(
             mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
             self._tolerated, SEARCH_THRESHOLD_RATIO, SWEEPS, LENGTHS.index(at_least),
         )  # fmt: skip
@@ -213,8 +207,7 @@ class SequentialTest(ByArithmetic):
 
     def square_beyond(self, shift: Array, covariance: Array) -> float:
         """Normalised square of what of a shift (6,) with a covariance (6, 6) isn't tolerated."""
-        rooted, found = self._by.square_beyond(covariance, shift, self._tolerated, SWEEPS)
-        return float(found if rooted else plain.square_beyond(covariance, shift, self._tolerated, SWEEPS)[1])
+        return float(kernel.square_beyond(covariance, shift, self._tolerated, SWEEPS))
 
     def noticed(self) -> Array | None:
         """(6,) constant shifts, each alone on its axis, that the first stream's windows that are full show by their
@@ -240,7 +233,7 @@ class SequentialTest(ByArithmetic):
 
     def _learn(self, difference: Array, usable: np.ndarray) -> None:
         """What differences (k, s, 6) show of the noise, where they are usable (k, s)."""
-        normalised = self._by.squares(self._learnt_whitening, difference)
+        normalised = kernel.squares(self._learnt_whitening, difference)
         self.scatter.learn(difference, normalised, usable, LEARN_EVERY)
         self._learn_surge(normalised, usable)
         self._learn_tail(normalised, usable)
@@ -260,7 +253,7 @@ class SequentialTest(ByArithmetic):
 
     def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
         """Means about that of the longest window: an offset that stays is no noise, and a creep is hardly any."""
-        squares = self._by.extremes(
+        squares = kernel.extremes(
             mean, difference, self._middle, self._plain, self._limit, self._known, OUTLIER_LIMIT_RATIO
         )  # fmt: skip
         usable = usable[:, :SHORT_LENGTHS].copy()
@@ -292,13 +285,11 @@ class SequentialTest(ByArithmetic):
         """Covariances of means and differences, and their whitening, where the variance of what was seen counts so
         many times, ``each`` (3, k, s): for limits that are assumed, standard deviations, and limits that are learnt.
         """
-        of = (
+        kernel.refresh(
             self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference + self._bias,
             self._lasting, self._known, self._plain, self._mean_covariance, self._whitening, self._learnt_whitening,
             self._to_reported, self._from_reported,
         )  # fmt: skip
-        if not self._by.refresh(*of):
-            plain.refresh(*of)
 
     def _limits(self) -> tuple[Array, np.ndarray]:
         """Squares (2, k, s) beyond which the camera has moved, and which of them are learnt.

@@ -20,13 +20,10 @@ holds for the next block although the tail's scale is known from few blocks: the
 from __future__ import annotations
 
 import math
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
-from gripmon.judge.drift import kernel, plain
-from gripmon.model.compiled import COMPILES
+from gripmon.judge.drift import kernel
 from gripmon.model.records import Array
 
 LENGTHS = tuple(2**k for k in range(13))
@@ -35,33 +32,14 @@ LENGTHS = tuple(2**k for k in range(13))
 COUNT = np.array(LENGTHS, dtype=float)[:, None]
 """(k, 1) the lengths, for what is reckoned for all of them at once."""
 
-ARITHMETIC: ModuleType = kernel if COMPILES else plain
-"""Whose functions are used, the compiled ones if anything compiles."""
 
-_EITHER = {module.__name__: module for module in (kernel, plain)}
-
-
-class ByArithmetic:
-    """What calls the functions of one of both, and can be copied with what a stream has taught: a module can't."""
-
-    def __init__(self, by: ModuleType):
-        self._by = by
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_by": self._by.__name__}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _by=_EITHER[state["_by"]])
-
-
-class Windows(ByArithmetic):
+class Windows:
     """Running means of ``streams`` series of 6-vectors, from a ring of their sums.
 
     One stream is the daemon; benchmarks run hundreds beside one another.
     """
 
-    def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
-        super().__init__(by)
+    def __init__(self, streams: int):
         self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
         self._lengths = np.array(LENGTHS)
         self._newest = 0
@@ -77,7 +55,7 @@ class Windows(ByArithmetic):
         """
         self._newest = (self._newest + 1) % len(self._ring)
         self.frames += 1
-        of: tuple[Array, Array] = self._by.slide(self._ring, self._newest, values, self._lengths)
+        of: tuple[Array, Array] = kernel.slide(self._ring, self._newest, values, self._lengths)
         return of
 
     def full(self) -> tuple[np.ndarray, np.ndarray]:
@@ -117,11 +95,10 @@ RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in 
 """(k,) number of the first length in which noise is rare to each."""
 
 
-class Scatter(ByArithmetic):
+class Scatter:
     """Covariances of window means (k lengths, s streams, 6, 6)."""
 
-    def __init__(self, streams: int, by: ModuleType = ARITHMETIC):
-        super().__init__(by)
+    def __init__(self, streams: int):
         lengths = len(LENGTHS)
         self._of_difference = np.zeros((lengths, streams, 6, 6))
         self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
@@ -140,7 +117,7 @@ class Scatter(ByArithmetic):
         (k, s) to a mean of 6, and which of them to learn from.
         """
         share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
-        self._by.learn(
+        kernel.learn(
             difference, normalised, usable, self._of_difference, self._windows, share, _MOST_WINDOWS,
             6.0 * LARGEST_SQUARE,
         )  # fmt: skip
@@ -149,14 +126,6 @@ class Scatter(ByArithmetic):
     def of_differences(self) -> Array:
         """(k, s, 6, 6) of the differences between neighbouring windows, as learnt."""
         return self._of_difference
-
-    def covariances(self, reported: Array, inflation: Array) -> tuple[Array, Array]:
-        """(..., k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones.
-
-        ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (..., k, s) by how much more the
-        variance of what the stream has shown counts.
-        """
-        return plain.covariances(reported, self._of_difference, self.learnt, inflation, RARE)
 
     @property
     def learnt(self) -> Array:

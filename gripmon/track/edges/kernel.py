@@ -1,8 +1,9 @@
-"""The joint fit and its covariance in machine code: what ``consensus`` and ``uncertainty`` do with NumPy, where each
-step's reason stands; both are held together by a test.
+"""The joint fit and its covariance in machine code.
 
-k candidates sorted by profile, n profiles, e edges of the gripper, m unknowns.  Inside, everything has :data:`SIZE`
-unknowns: without a jaw the seventh has no derivative, and a prior that holds it at zero.
+k candidates sorted by profile, n profiles, e edges of the gripper, g stretches of agreed points, m unknowns (m, rad).
+Inside, everything has :data:`SIZE` unknowns: without a jaw the seventh has no derivative, and a prior that holds it at
+zero.  Tests hold the functions against those of their names in ``tests/support/by_numpy/fit.py``, :func:`fit` against
+``fit_irls``.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def fit(
     mean: Any, prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float,
     support_sigmas: float, support_share: float,
 ) -> Any:  # fmt: skip
-    """``robust_fit.fit_irls``: whether it could be solved, then the fields of ``RobustFit`` in their order."""
+    """What ``robust_fit.fit_irls`` says: whether it could be solved, then the fields of ``RobustFit`` in their order."""
     count = len(start)
     near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
     unknowns, wanted, held = np.zeros(SIZE), np.zeros(SIZE), np.ones(SIZE)
@@ -85,7 +86,9 @@ def fit(
 def _near(
     sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, start: Any, reach_px: float
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """``consensus._near``: place, jacobian (j, SIZE), offset, sigma, weight and edge of the candidates near by."""
+    """The j candidates with a weight within ``reach_px`` of where ``start`` (m,) puts the edges: place among all,
+    jacobian (j, SIZE), offset, sigma, weight and edge.
+    """
     place = np.empty(len(sample), np.intp)
     count = 0
     for k in range(len(sample)):
@@ -112,8 +115,13 @@ def _near(
 def _irls(
     near: Any, edge_spread_px: Any, mean: Any, prior: Any, xi: Any, width: float, rounds: int, start_width_px: float,
 ) -> tuple[bool, Any, Any, float, float]:  # fmt: skip
-    """The rounds of ``robust_fit.fit_irls``; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
-    solved, weights of the candidates near by, information (SIZE, SIZE), spread and stiffness.
+    """Iteratively re-weighted least squares; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
+    solved, weights of the candidates near by, 1/px², information (SIZE, SIZE), spread (px) and stiffness.
+
+    From round to round the width, at first that of the start's error, decays, and the robust spread s of the residuals
+    takes over: a candidate counts by Tukey's weight (1 - (r / reach)²)², zero beyond its reach, which is the root of
+    width² + (TUKEY s sigma)², at most max(width, TUKEY times the spread in px).  All points of an edge together are
+    worth no more than one with the spread that they share: w / (1 + spread² sum w).
     """
     _, jacobian, offset, sigma, base, edge = near
     count = len(offset)
@@ -126,7 +134,6 @@ def _irls(
         if round_:
             width *= WIDTH_DECAY
             spread, spread_px = _spread(residual, sigma, start_width_px, buffer)
-        # Tukey's biweight; all points of an edge together are worth no more than one with the spread that they share.
         on_edge[:] = 0.0
         farthest = max(width, TUKEY * spread_px)
         for j in range(count):
@@ -183,7 +190,9 @@ def _residuals(jacobian: Any, offset: Any, xi: Any, residual: Any) -> None:
 
 @compiled
 def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float, float]:
-    """``consensus._spread``; ``buffer`` is overwritten."""
+    """Robust size of the residuals that may belong to the fit, 1.4826 times their median: over their standard
+    deviations, at least 1, and in px.  ``buffer`` (j,) is overwritten.
+    """
     count = 0
     for j in range(len(residual)):
         if abs(residual[j]) < min(width, INNER_SIGMAS * sigma[j] + INNER_PX):
@@ -225,7 +234,11 @@ def _nth(values: Any, count: int, nth: int) -> float:
 
 @compiled
 def _stiffness(weight: Any, residual: Any, reach: Any) -> float:
-    """``consensus._stiffness``."""
+    """How much the biweight's pull really grows with the residuals, over what its weights say: the mean of its
+    derivative, (1 - u²) (1 - 5 u²) with u = r / reach, over that of (1 - u²)².
+
+    0.83 for normal residuals; less where many points lie half way out and pull the less the farther they go.
+    """
     pull, growth = 0.0, 0.0
     for j in range(len(weight)):
         if weight[j] != 0.0:
@@ -242,7 +255,13 @@ def _judge(
     sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, independence: Any,
     start_width_px: float, gate_px: float, support_sigmas: float, support_share: float,
 ) -> tuple[Any, Any, Any, float]:  # fmt: skip
-    """``robust_fit._judge``: the profiles that agree, each edge's share and whether it is seen, the share of pairs."""
+    """Who agrees: the profiles (n,), each edge's share of them and whether it is seen (e,), and the share of pairs.
+
+    Held against chance: the density of candidates tells how many would lie in the gate anyway, of N independent
+    profiles N p +- sqrt(N p (1 - p)); profiles that see the same pixels agree by the same chance.  Edge responses end
+    before the profiles do: what was found tells how far candidates reach.  What chance supports is scattered, what the
+    gripper supports comes in runs: neighbours are counted, not profiles.
+    """
     supported, edges = np.zeros(len(edge), np.bool_), len(independence)
     profiles, agreeing, others = np.zeros(edges), np.zeros(edges), np.zeros(edges)
     reach_px = start_width_px
@@ -309,8 +328,9 @@ def assess(
     sample: Any, weight: Any, residual_px: Any, information: Any, stiffness: float, jacobian: Any, edge: Any,
     stretch: Any, edge_spread_px: Any, cut_off_px: Any, prior: Any, expected_shared_px: float,
 ) -> Any:  # fmt: skip
-    """``uncertainty.assess``: whether it could be solved, then covariance, line weights, shared spread and
-    contradiction, and edge, pull, information and middle of the ``NormalEquations``.
+    """The covariance of ``uncertainty.assess``, whose equation stands there: whether it could be solved, then
+    covariance, line weights, shared spread and contradiction, and edge, pull, information and middle of the
+    ``NormalEquations``.
     """
     unknowns, line_weight = len(prior), np.zeros(len(weight))
     worth = _worth(sample, weight, edge, edge_spread_px)
@@ -322,6 +342,7 @@ def assess(
         shared = (contradiction - 1.0) * len(total) / total.sum()
     if len(total):
         shared = max(shared, (stiffness * expected_shared_px) ** 2)
+    # A scatter that is itself estimated from few stretches makes Student's distribution, with this variance.
     student = freedom / (freedom - 2.0) if freedom >= FEWEST_FREE else float(FEWEST_FREE)
     # Sums over each edge: of points, of stretches, and of the edge as a whole.
     of_edge, seen, last = np.empty(len(first), np.intp), np.empty(len(first), np.intp), 0
@@ -367,7 +388,9 @@ def assess(
 
 @compiled
 def _worth(sample: Any, weight: Any, edge: Any, edge_spread_px: Any) -> Any:
-    """(e,) by what the weights of an edge's points were limited for what they share."""
+    """(e,) 1 - spread² sum w: by what the weights of an edge's points were limited for what they share; w over this is
+    what a point is worth alone.
+    """
     worth = np.zeros(len(edge_spread_px))
     for k in range(len(sample)):
         worth[edge[sample[k]]] += weight[k]
@@ -402,7 +425,10 @@ def _stretches(
 
 @compiled
 def _contradiction(total: Any, moment: Any, unknowns: int) -> float:
-    """``uncertainty._contradiction``."""
+    """Weighted squares of the stretches' means over their degrees of freedom; 1 where too few stretches are left.
+
+    Above 1 it gives tau² = (contradiction - 1) * stretches / sum of their weights.
+    """
     freedom = len(total) - unknowns
     if freedom < FEWEST_FREE:
         return 1.0

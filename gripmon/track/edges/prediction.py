@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -18,11 +17,10 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.compiled import COMPILES
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.track.edges import prediction_kernel, prediction_plain
+from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.kernel import FEWEST_AGREEING
 
 if TYPE_CHECKING:
@@ -71,8 +69,6 @@ SHORTEST_PX = float(FEWEST_AGREEING - 1)
 
 PLACES = 65
 """Places of an edge, evenly spaced, at which it is seen whether it lies in the image."""
-
-_by: ModuleType = prediction_kernel if COMPILES else prediction_plain
 
 
 @dataclass(frozen=True)
@@ -190,27 +186,11 @@ class Prediction:
         """(e,) profiles inside the image, for every edge of the gripper."""
         return np.bincount(self.layout.edge[self.ok], minlength=len(self.line_origin))
 
-    @cached_property
-    def pair(self) -> NDArray[np.bool_]:
-        """(n - 1,) whether a profile and the next one lie on the same edge, both inside the image."""
-        edge = self.layout.edge
-        return (edge[1:] == edge[:-1]) & self.ok[1:] & self.ok[:-1]
-
-    @cached_property
-    def pairs(self) -> int:
-        """How many such neighbours there are."""
-        return int(np.count_nonzero(self.pair))
-
-    @cached_property
-    def some_profiles(self) -> NDArray[np.intp]:
-        """(e,) the profiles of each edge, or one where there is none: a divisor."""
-        return np.maximum(self.profiles, 1)
-
     def moved_px(self, xi: Array) -> float:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
         linearisation pose.
         """
-        return float(_by.largest_motion(self.jacobian, xi))
+        return float(prediction_kernel.largest_motion(self.jacobian, xi))
 
 
 def lay_out(
@@ -239,7 +219,9 @@ def lay_out(
     uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
     margin_px = settings.end_margin_px
     shortest_px = max(margin_px, SHORTEST_PX)  # the margin is zoomed, and so is what has to be left
-    ranges = _by.sampled_ranges(uv, _inside(camera, uv, settings.reach_px), wanted, margin_px, shortest_px)
+    ranges = prediction_kernel.sampled_ranges(
+        uv, _inside(camera, uv, settings.reach_px), wanted, margin_px, shortest_px
+    )
     lengths = ranges[:, 2]
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
@@ -288,10 +270,10 @@ def predict(
     edge = layout.edge
     start, end = gripper.tangents_m(points_grip_m @ rotation.T, edge, layout.fraction, rotation)
     rate = gripper.point_motion(jaw_opening_m) @ rotation.T if jaw_unknown else np.zeros_like(points_grip_m)
-    lever, points_cam_m = _by.levers(start, end, layout.fraction, translation)
+    lever, points_cam_m = prediction_kernel.levers(start, end, layout.fraction, translation)
     uv, d_uv = camera.project_with_jacobian(points_cam_m)
     of_edge = rate[gripper.edge_points[:, 0]]
-    normal, gradient, jacobian = _by.across_edges(d_uv, start, end, lever, edge, of_edge, jaw_unknown)
+    normal, gradient, jacobian = prediction_kernel.across_edges(d_uv, start, end, lever, edge, of_edge, jaw_unknown)
     mapped = np.isfinite(gradient).all(axis=1)
     if not mapped.all():
         kept = layout.only(mapped)
@@ -304,7 +286,7 @@ def predict(
         spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
         edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0)
-    xy, way_xy, along, origin, direction = _by.ideal_lines(
+    xy, way_xy, along, origin, direction = prediction_kernel.ideal_lines(
         points_cam_m, edge, layout.edges, layout.first, len(gripper.edge_ids)
     )
     if gripper.has_curves:
@@ -314,7 +296,7 @@ def predict(
     # Rows as far apart as the profiles' pixels: noise and fine texture differ, the edge doesn't.
     spacing_px = (offsets_px[1] - offsets_px[0]) / STEP_PX if len(offsets_px) > 1 else 1.0
     rows_px = (spacing_px * np.arange(-(ROWS // 2), ROWS // 2 + 1, dtype=np.float32)).astype(np.float32)
-    map_x, map_y = _by.maps(uv, normal, offsets_px.astype(np.float32), rows_px)
+    map_x, map_y = prediction_kernel.maps(uv, normal, offsets_px.astype(np.float32), rows_px)
     return Prediction(
         cam_T_grip=cam_T_grip,
         jaw_opening_m=jaw_opening_m,
@@ -325,7 +307,7 @@ def predict(
         xy=xy,
         way_xy=way_xy,
         along=along,
-        gain=_by.gains(points_cam_m, normal, d_uv, way_xy),
+        gain=prediction_kernel.gains(points_cam_m, normal, d_uv, way_xy),
         line_origin=origin,
         line_direction=direction,
         ok=ok,

@@ -1,7 +1,8 @@
-"""The geometry of a prediction in machine code: what ``prediction`` does with NumPy, where each step's reason stands;
-both are held together by a test.
+"""The geometry of a prediction in machine code.
 
-n samples, s places along each profile, r rows of them, e edges of the gripper, v of them sampled.
+n samples, s places along each profile, r rows of them, e edges of the gripper, v of them sampled; points in the camera
+frame (m), images of them in px.  Tests hold each function against that of its name in
+``tests/support/by_numpy/prediction.py``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from gripmon.model.compiled import compiled
 
 @compiled
 def largest_motion(jacobian: Any, xi: Any) -> float:
-    """``Prediction.moved_px``."""
+    """Largest of the motions |J xi| of n samples by their ``jacobian`` (n, 6 or 7), px; 0 of none."""
     largest = 0.0
     for n in range(len(jacobian)):
         moved = 0.0
@@ -28,7 +29,13 @@ def largest_motion(jacobian: Any, xi: Any) -> float:
 
 @compiled
 def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
-    """``prediction_plain.sampled_ranges``."""
+    """First and last fraction and length in px (e, 3) of the longest run of each edge that is ``inside`` the image
+    (e, c), less the margin; zeros if nothing is left, or the edge isn't ``wanted`` (e,).  Of edges ``uv_px`` (e, c, 2)
+    c places, evenly spaced; the lens maps those that are NaN nowhere.
+
+    Of a short edge the margin leaves twice ``shortest_px``, if half of it suffices for that, or else what half of it
+    leaves.
+    """
     edges, places = inside.shape
     out, travelled = np.zeros((edges, 3)), np.empty(places)
     for e in range(edges):
@@ -84,6 +91,10 @@ def across_edges(
 ) -> tuple[Any, Any, Any]:
     """Normals (n, 2) of edges that go from ``start`` to ``end`` (n, 3), gradients (n, 3) of the motion along them by a
     point's, and Jacobian (n, 6 or 7); ``rate`` (e, 3): motion of the edges by the opening.
+
+    With the derivative D (2, 3) of a pixel by its point, ``d_uv`` (n, 2, 3), the tangent is D times the edge's span,
+    the normal n is across it, to the right, and the gradient g = n' D; a motion (rho, omega) of a point with the
+    ``lever`` l moves the edge by g rho + (l x g) omega, and the opening by g rate (equations (3), (15)).
     """
     count = len(edge)
     normal, gradient, jacobian = np.empty((count, 2)), np.empty((count, 3)), np.empty((count, 7 if jaw_unknown else 6))
@@ -110,7 +121,9 @@ def across_edges(
 
 @compiled
 def maps(uv_px: Any, normal: Any, offsets_px: Any, rows_px: Any) -> tuple[Any, Any]:
-    """Where ``r`` rows of each profile are read, (r, n, s) each, in single precision as it is kept."""
+    """Columns and rows of the image (r, n, s) where r rows of each profile are read: ``offsets_px`` (s,) along the
+    normal and ``rows_px`` (r,) along the edge from ``uv_px`` (n, 2), in single precision as it is kept.
+    """
     map_x = np.empty((len(rows_px), len(uv_px), len(offsets_px)), np.float32)
     map_y = np.empty(map_x.shape, np.float32)
     for r in range(len(rows_px)):
@@ -127,7 +140,11 @@ def maps(uv_px: Any, normal: Any, offsets_px: Any, rows_px: Any) -> tuple[Any, A
 def ideal_lines(
     points_cam_m: Any, edge: Any, edges: Any, first: Any, edge_count: int
 ) -> tuple[Any, Any, Any, Any, Any]:
-    """``prediction_plain.ideal_lines``."""
+    """The edges as straight lines in ideal coordinates: samples ``xy`` and the line's direction there (n, 2), the place
+    ``along`` (n,) it; origins and directions (e, 2) of the lines.
+
+    Lines of edges that are not sampled are NaN; a curved edge's is that from its first sample to its last.
+    """
     count = len(edge)
     xy, way_xy, along = np.empty((count, 2)), np.empty((count, 2)), np.empty(count)
     origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
@@ -151,7 +168,11 @@ def ideal_lines(
 
 @compiled
 def gains(points_cam_m: Any, normal: Any, d_uv: Any, way_xy: Any) -> Any:
-    """``prediction_plain.gains``."""
+    """(n,) by how much an offset of a pixel along the image normal moves a point off its edge in ideal coordinates.
+
+    ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal coordinates,
+    the inverse of which takes the normal there; what of that is across ``way_xy`` (n, 2) counts.
+    """
     gain = np.empty(len(normal))
     for n in range(len(normal)):
         z = points_cam_m[n, 2]

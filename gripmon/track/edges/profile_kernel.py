@@ -1,7 +1,8 @@
-"""Profiles and edge candidates in machine code: what ``profiles`` and ``saturation`` do with NumPy, where each step's
-reason stands; both are held together by a test.
+"""Profiles and edge candidates in machine code.
 
-n profiles of s samples, k candidates, e edges of the gripper.
+n profiles of s samples, k candidates, e edges of the gripper; grey levels, and px of the image or of the zoomed one.
+Tests hold each function against that of its name in ``tests/support/by_numpy/profiles.py``, but :func:`worth` against
+``weigh``.
 """
 
 from __future__ import annotations
@@ -9,15 +10,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
-from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.compiled import compiled
 from gripmon.model.pixels import BLUE, GREEN, RED
-
-if COMPILES:
-    from llvmlite import ir
-    from numba.core import types
-    from numba.extending import intrinsic
 
 SHARPNESS = -0.75
 """Slope of the interpolating cubic one pixel away: OpenCV's, which keeps steps as steep as they are."""
@@ -47,7 +47,10 @@ _at = np.uintp
 
 @compiled
 def read_profiles(image: Any, map_x: Any, map_y: Any) -> Any:
-    """``profiles.read_profiles`` of an image (h, w, 1 or 3) at maps (r, n, s)."""
+    """Grey levels (n, s): an image (h, w, 1 or 3), blue first, interpolated at maps (r, n, s), mean over r.  By cubic
+    convolution with the slope :data:`SHARPNESS` (Keys 1981), which no step rounds; beyond the image everything is as at
+    its border.  What is not a number is read there, too.
+    """
     rows, count, samples = map_x.shape
     profiles = np.empty((count, samples))
     taps = rows * samples
@@ -160,7 +163,7 @@ def _write_four_sums(
     return four_numbers(patch, at, width, above, here, below, under), write
 
 
-if COMPILES:
+if not getattr(numba.config, "DISABLE_JIT", False):  # else for a debugger: everything here runs as Python
     _four_sums = intrinsic(_write_four_sums)  # type: ignore[assignment]
 
 
@@ -176,7 +179,9 @@ def _interpolate(patch: Any, base: Any, width: int, across: Any, down: Any, grey
 
 @compiled
 def low_third_difference(profiles: Any) -> float:
-    """``profiles.low_third_difference``."""
+    """The lowest tenth of the sizes of third differences at whole pixels, of every third profile of half pixels (n, s),
+    grey levels; 0 without any, NaN where it isn't a number.
+    """
     count, samples = profiles.shape
     third = np.empty(((count + 2) // 3) * ((samples + 1) // 2))
     found, finite = 0, 0
@@ -221,7 +226,14 @@ def find_candidates(
     profiles: Any, ok: Any, taps: Any, step_px: float, threshold: float, peak_noise: float, near: int, far: int,
     full_scale: float,
 ) -> Any:  # fmt: skip
-    """``profiles.find_candidates``: sample, offset, step, sigma, width and how surely it is cut off, each (k,)."""
+    """Local extrema of the response of profiles (n, s) that are ``ok`` (n,) to the derivative of Gaussian ``taps``
+    (t,): sample, offset, step, sigma, width and how surely it is cut off, each (k,), as in ``profiles.Candidates``.
+
+    A peak h above the ``threshold`` with neighbours l and r lies by the parabola through the three logarithms 0.5 (ln l
+    - ln r) / (ln l + ln r - 2 ln h) samples of ``step_px`` on.  Its standard deviation is ``peak_noise`` / h, or what
+    unrest ``near`` to ``far`` samples beside it, going on under it, would shift it by: the larger.  Its width is the
+    root of h over its curvature, 2 h - l - r.  A flat top is no peak of anything but rounding.
+    """
     count, samples = profiles.shape
     margin, responses = len(taps) // 2, samples - len(taps) + 1
     sample = np.empty(count * responses // 2 + 1, np.intp)
@@ -275,7 +287,10 @@ def find_candidates(
 
 @compiled
 def _unrest(change: Any, at: int, near: int, far: int) -> float:
-    """``profiles._unrest`` of one candidate from the squared ``change`` of the response from sample to sample."""
+    """Root mean square change of the response from sample to sample around a candidate, but not at it, from the squares
+    ``change`` (r,).  What lies beside an edge, texture and noise alike, would go on under the edge, where it shifts the
+    peak.
+    """
     last = len(change) - 1
     a, b, c, d = max(at - far, 0), max(at - near, 0), min(at + near, last), min(at + far, last)
     total = 0.0
@@ -288,7 +303,13 @@ def _unrest(change: Any, at: int, near: int, far: int) -> float:
 
 @compiled
 def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: float) -> float:
-    """``saturation.doubt`` of one edge."""
+    """From 0 for an edge that is surely whole to 1 for one whose bright side, ``side`` (-1 or 1) of its ``place`` in
+    profile ``n``, is surely cut off: there is grey of ``level`` within :data:`SURELY` to :data:`HARDLY` widths.
+
+    Overexposure cuts the upper part of a blurred step off; what is left is steepest nearer to the dark side, by up to
+    most of the edge's width.  By how much can't be told from the rest of the profile without knowing the lens's blur
+    exactly, so that such edges only get a larger standard deviation.
+    """
     start = int(np.rint(place))
     for step in range(int(HARDLY * width) + 2):
         k = start + side * step
@@ -316,7 +337,14 @@ def worth(
     sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
     independence: Any, point_floor_px: float, edge_floor_px: float,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
-    """What ``profiles.Edgels`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
+    """What ``profiles.Edgels`` holds of the candidates: weight (k,), 1/px², spread and what a cut-off side adds to it
+    (e,), px.
+
+    A weight is one over the variance and that of the floor, and 0 where the ``polarity`` (e,) disagrees; profiles that
+    see the same pixels share what these are worth, ``independence`` (e,).  A whole edge is off by its bevel and a share
+    of the edges' median width; and by :data:`SATURATION_SHIFT_WIDTHS` of that where its bright side is cut off, high
+    steps counting more: they are the outline's, low ones texture beside it.
+    """
     count, edges = len(sample), len(bevel_px)
     weight = np.empty(count)
     energy, cut_off_energy = np.zeros(edges), np.zeros(edges)

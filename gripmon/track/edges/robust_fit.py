@@ -9,31 +9,16 @@ px.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
-from gripmon.model.compiled import COMPILES
-from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array
 from gripmon.track.edges import kernel
-from gripmon.track.edges.kernel import (
-    CONVERGED_SQUARED_STEP,
-    FEWEST_AGREEING,
-    FEWEST_EDGES,
-    FEWEST_SPREAD,
-    INNER_PX,
-    INNER_SIGMAS,
-    LARGEST_SPREAD,
-    LARGEST_SPREAD_PX,
-    SMALLEST_SPREAD_PX,
-    SMALLEST_STIFFNESS,
-    WIDTH_DECAY,
-)
+from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import Edgels
 
@@ -102,17 +87,6 @@ class Prior:
     information: Array
 
 
-class Fit(NamedTuple):
-    """Where a robust fit ended, before it is judged; fields as in :class:`RobustFit`."""
-
-    xi: Array
-    weight: Array
-    residual_px: Array
-    information: Array
-    spread_px: float
-    stiffness: float
-
-
 @dataclass(frozen=True, slots=True)
 class RobustFit:
     """The common motion of the edge candidates.
@@ -145,8 +119,6 @@ def fit_irls(
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
-    if not COMPILES:
-        return fit_irls_with_numpy(edgels, prior, start, settings, width_px)
     candidates, prediction = edgels.candidates, edgels.prediction
     solved, fitted = kernel.fit(
         candidates.sample,
@@ -170,37 +142,6 @@ def fit_irls(
     if not solved:
         raise FloatingPointError(NOT_SOLVED)
     return RobustFit(*fitted)
-
-
-def fit_irls_with_numpy(
-    edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings, width_px: float | None = None
-) -> RobustFit:
-    """:func:`fit_irls` where nothing compiles, and what the compiled one is held against."""
-    candidates, prediction = edgels.candidates, edgels.prediction
-    width = settings.start_width_px if width_px is None else width_px
-    shared = edgels.edge_spread_px**2
-    xi, spread, spread_px = start, 1.0, LARGEST_SPREAD_PX
-    near = _near(edgels, start, max(width, TUKEY * LARGEST_SPREAD_PX))
-    rounds = ROUNDS if width_px is None else _ROUNDS_AGAIN
-    for round_ in range(rounds):
-        if round_:
-            width *= WIDTH_DECAY
-            spread, spread_px = _spread(near.residual(xi), near.sigma, settings.start_width_px)
-        residual = near.residual(xi)
-        reach = np.minimum(np.hypot(width, (TUKEY * spread) * near.sigma), max(width, TUKEY * spread_px))
-        weight = _biweight(residual, reach)
-        weight *= near.weight
-        # All points of an edge together are worth no more than one with the spread that they share.
-        weight /= (1.0 + shared * np.bincount(near.edge, weight, len(shared)))[near.edge]
-        step, information = _step(near.jacobian, residual, weight, prior.mean - xi, prior.information)
-        xi = xi + step
-        if round_ >= rounds - 3 and float(step @ information @ step) < CONVERGED_SQUARED_STEP:
-            break
-    stiffness = _stiffness(weight, near.residual(xi), reach)
-    every = np.zeros(len(candidates.sample))
-    every[near.place] = weight
-    residual = candidates.offset_px - xi @ prediction.jacobian_by_unknown[:, candidates.sample]
-    return _judge(edgels, Fit(xi, every, residual, information, spread_px, stiffness), settings)
 
 
 def refit_visible(
@@ -250,59 +191,6 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
     return starts
 
 
-class _Near(NamedTuple):
-    """The candidates that may belong to a fit: ``place`` (j,) among all, and what the fit needs of them."""
-
-    place: NDArray[np.intp]
-    jacobian: Array
-    offset: Array
-    sigma: Array
-    weight: Array
-    edge: NDArray[np.intp]
-
-    def residual(self, xi: Array) -> Array:
-        return np.asarray(self.offset - xi @ self.jacobian)
-
-
-def _near(edgels: Edgels, start: Array, reach_px: float) -> _Near:
-    """Candidates with a weight within ``reach_px`` of where ``start`` puts the edges."""
-    candidates, prediction = edgels.candidates, edgels.prediction
-    moved = prediction.jacobian @ start
-    far = np.abs(candidates.offset_px - moved[candidates.sample])
-    index = np.flatnonzero((far < reach_px) & (edgels.weight > 0.0))
-    sample, weight = candidates.sample[index], edgels.weight[index]
-    return _Near(
-        index,
-        prediction.jacobian_by_unknown[:, sample],
-        candidates.offset_px[index],
-        1.0 / np.sqrt(weight),
-        weight,
-        prediction.layout.edge[sample],
-    )
-
-
-def _biweight(residual: Array, reach: Array) -> Array:
-    """Tukey's weights (1 - (r / reach)²)², zero beyond the reach."""
-    weight = residual / reach
-    np.square(weight, out=weight)
-    np.subtract(1.0, weight, out=weight)
-    np.maximum(weight, 0.0, out=weight)
-    np.square(weight, out=weight)
-    return weight
-
-
-def _step(jacobian: Array, residual: Array, weight: Array, to_prior: Array, prior: Array) -> tuple[Array, Array]:
-    """One weighted Gauss-Newton step: (m,) step, (m, m) information of the points."""
-    weighted = jacobian * weight
-    information = weighted @ jacobian.T
-    normal = information.copy()
-    normal.flat[:: len(normal) + 1] += prior
-    _, step, failed = dposv(normal, weighted @ residual + prior * to_prior)
-    if failed:
-        raise FloatingPointError(NOT_SOLVED)
-    return step, information
-
-
 def prior_information(jaw_sigma_m: float | None) -> Array:
     """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
 
@@ -311,76 +199,3 @@ def prior_information(jaw_sigma_m: float | None) -> Array:
     """
     pose = [1.0 / 0.1**2] * 3 + [1.0] * 3
     return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
-
-
-def _stiffness(weight: Array, residual: Array, reach: Array) -> float:
-    """How much the biweight's pull really grows with the residuals, over what its weights say: the mean of its
-    derivative, (1 - u²) (1 - 5 u²), over that of (1 - u²)².
-
-    0.83 for normal residuals; less where many points lie half way out and pull the less the farther they go.
-    """
-    inside = np.flatnonzero(weight)
-    square = np.minimum((residual[inside] / reach[inside]) ** 2, 1.0)
-    base = weight[inside] / np.maximum((1.0 - square) ** 2, 1e-6)
-    pull, growth = (1.0 - square) ** 2, (1.0 - square) * (1.0 - 5.0 * square)
-    total = float(base @ pull)
-    return max(float(base @ growth) / total, SMALLEST_STIFFNESS) if total > 0.0 else 1.0
-
-
-def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
-    """Robust size of the residuals that may belong to the fit, 1.4826 times their median: over their standard
-    deviations, at least 1, and in px.
-    """
-    size = np.abs(residual)
-    near = np.flatnonzero(size < np.minimum(width, INNER_SIGMAS * sigma + INNER_PX))
-    if len(near) < FEWEST_SPREAD:
-        return 1.0, LARGEST_SPREAD_PX
-    size = size[near]
-    middle = len(size) // 2
-    spread_px = 1.4826 * float(np.partition(size, middle)[middle])
-    spread = 1.4826 * float(np.partition(size / sigma[near], middle)[middle])
-    return min(max(spread, 1.0), LARGEST_SPREAD), min(max(spread_px, SMALLEST_SPREAD_PX), LARGEST_SPREAD_PX)
-
-
-def _judge(edgels: Edgels, fit: Fit, settings: RobustFitSettings) -> RobustFit:
-    """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate
-    anyway.
-    """
-    candidates, prediction, residual = edgels.candidates, edgels.prediction, fit.residual_px
-    active = None if edgels.weight.all() else edgels.weight > 0.0
-    edges = len(prediction.line_origin)
-    gate_px = GATE_PX * candidates.zoom
-    edge_of = prediction.layout.edge
-    sample = candidates.sample if active is None else candidates.sample[active]
-    close = sample[np.abs(residual if active is None else residual[active]) < gate_px]
-    supported = np.zeros(len(edge_of), dtype=bool)
-    supported[close] = True
-    profiles, some = prediction.profiles, prediction.some_profiles
-    agreeing = np.bincount(edge_of, supported, edges)
-    others = np.bincount(edge_of[sample], minlength=edges) - np.bincount(edge_of[close], minlength=edges)
-    # Edge responses end before the profiles do: what was found tells how far candidates reach.
-    reach_px = max(float(np.abs(candidates.offset_px).max(initial=0.0)), settings.start_width_px)
-    chance = 1.0 - np.exp(others * (-gate_px / max(reach_px - gate_px, 0.5)) / some)
-    # Profiles that see the same pixels agree by the same chance.
-    variance = profiles * chance * (1.0 - chance) / prediction.independence
-    needed = profiles * chance + settings.support_sigmas * np.sqrt(variance)
-    share = agreeing / some
-    seen = (agreeing >= FEWEST_AGREEING) & (agreeing > needed) & (share >= settings.support_share)
-    # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
-    pair = prediction.pair
-    believed = 0.0
-    if prediction.pairs and np.count_nonzero(seen) >= FEWEST_EDGES:
-        agreeing_pairs = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
-        believed = int(np.count_nonzero(agreeing_pairs)) / prediction.pairs
-    return RobustFit(
-        fit.xi,
-        fit.weight,
-        residual,
-        fit.information,
-        fit.spread_px,
-        fit.stiffness,
-        supported,
-        share,
-        seen,
-        believed,
-    )

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from gripmon.model.compiled import COMPILES
 from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
@@ -30,8 +29,6 @@ def warm_up() -> float:
 
     Other images are compiled for, once on a machine, when the first of them comes.
     """
-    if not COMPILES:
-        return 0.0
     begin_s = time.perf_counter()
     prediction, settings = _of_one_edge(), RobustFitSettings()
     for shape in ((9, 9), (9, 9, 3)):

@@ -1,9 +1,9 @@
 """The arithmetic of a frame's protection level, compiled: fits under h hypotheses, alone and with the anchor, the bank
 of filters behind the anchor, and the root of the sum over the hypotheses' tails.
 
-The same by NumPy stands in :mod:`~gripmon.track.integrity.plain`, function by function; what they are for, in
-:mod:`~gripmon.track.integrity.separation`.  Where rounding leaves a covariance that isn't positive definite ``False``
-comes first of what is returned: then NumPy's is taken.
+h hypotheses, v edges, f parts of the gripper, m unknowns of which the first n are asked for, g averages; lengths in m
+and rad.  What they are for stands in :mod:`~gripmon.track.integrity.separation`.  Tests hold each against the function
+of its name in ``tests/support/by_numpy/integrity.py``.
 """
 
 from __future__ import annotations
@@ -57,9 +57,27 @@ def _invert(root: Array, inverse: Array, upper: Array) -> None:
 
 
 @compiled
-def _square(root: Array, values: Array, white: Array) -> float:
-    """Normalised square of ``values`` (m,) by the root of their covariance; ``white`` (m,) is overwritten."""
+def _inverse(matrix: Array, inverse: Array, root: Array, between: Array) -> None:
+    """``inverse`` of a symmetric matrix, (m, m) each: by Cholesky's root, by elimination where rounding has left none.
+    LinAlgError for a singular one.
+    """
+    if _root(matrix, root):
+        _invert(root, inverse, between)
+    else:
+        inverse[:] = np.linalg.inv(matrix)
+
+
+@compiled
+def _square(covariance: Array, values: Array, root: Array, white: Array) -> float:
+    """Normalised square v' C^-1 v of ``values`` (m,) by their covariance (m, m), as :func:`_inverse` has it; ``root``
+    and ``white`` (m,) are overwritten.
+    """
     total = 0.0
+    if not _root(covariance, root):
+        white[:] = np.linalg.solve(covariance, values)
+        for i in range(len(white)):
+            total += values[i] * white[i]
+        return total
     for i in range(len(root)):
         rest = values[i]
         for k in range(i):
@@ -81,8 +99,8 @@ def add_up(
     known: Array,
     known_pull: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Sums over the kept edges and what is known besides: pull (h, m), normal matrix and spread (h, m, m), and pulls by
-    the model (h, f, m).
+    """Sums over the kept edges, ``keep`` (h, v) of 0 and 1, and what is known besides: pull (h, m), normal matrix and
+    spread (h, m, m), and pulls by the model (h, f, m), each edge's by its ``finger`` (v,).
     """
     count, (edges, m) = len(keep), pull.shape
     sums, normal, spread = known_pull.copy(), known.copy(), known.copy()
@@ -104,19 +122,15 @@ def add_up(
 
 
 @compiled
-def separate(
-    sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int
-) -> tuple[bool, Array, Array, Array]:
-    """The fits from their sums, n = ``unknowns`` of the first: shift (h, n), covariance (h, n, n), and error by the
-    model (h, f, n).
+def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int) -> tuple[Array, Array, Array]:
+    """The fits from their sums, N^-1 of the normal matrices N being the first n = ``unknowns`` rows of their inverses:
+    shift N^-1 pull (h, n), covariance N^-1 spread N^-1 (h, n, n), and error by the model N^-1 of_model (h, f, n).
     """
     (count, m), n, fingers = sums.shape, unknowns, of_model.shape[1]
     shift, covariance, off = np.zeros((count, n)), np.empty((count, n, n)), np.zeros((count, fingers, n))
     root, inverse, between = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
     for h in range(count):
-        if not _root(normal[h], root):
-            return False, shift, covariance, off
-        _invert(root, inverse, between)
+        _inverse(normal[h], inverse, root, between)
         for i in range(n):
             for j in range(m):
                 shift[h, i] += inverse[i, j] * sums[h, j]
@@ -131,21 +145,19 @@ def separate(
                 for k in range(m):
                     total += between[i, k] * inverse[j, k]
                 covariance[h, i, j] = covariance[h, j, i] = total
-    return True, shift, covariance, off
+    return shift, covariance, off
 
 
 @compiled
 def with_pose(
     sums: Array, normal: Array, spread: Array, of_model: Array, at: Array, covariance: Array, off: Array
-) -> tuple[bool, Array, Array, Array, Array]:
-    """The sums with a pose that is known besides: ``at`` (6,), its ``covariance`` (6, 6), ``off`` (f or 1, 6) by the
-    model.
+) -> tuple[Array, Array, Array, Array]:
+    """The sums with a pose that is known besides: ``at`` (6,), its ``covariance`` C (6, 6), ``off`` (f or 1, 6) by the
+    model.  C^-1 at, C^-1 and C^-1 off are added to the pulls, to the matrices, and to the pulls by the model.
     """
     sums, normal, spread, of_model = sums.copy(), normal.copy(), spread.copy(), of_model.copy()
     root, information, between = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    if not _root(covariance, root):
-        return False, sums, normal, spread, of_model
-    _invert(root, information, between)
+    _inverse(covariance, information, root, between)
     for i in range(6):
         pull = 0.0
         for j in range(6):
@@ -161,20 +173,18 @@ def with_pose(
                 pull += off[min(f, len(off) - 1), j] * information[j, i]
             for h in range(len(sums)):
                 of_model[h, f, i] += pull
-    return True, sums, normal, spread, of_model
+    return sums, normal, spread, of_model
 
 
 @compiled
-def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[bool, Array]:
+def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> Array:
     """Normalised squares (h,) of shifts (h, 6) from ``at`` (6,), by ``times`` the covariances (h, 6, 6) and ``more``
     (6, 6).
     """
     out, root, white = np.empty(len(shift)), np.empty((6, 6)), np.empty(6)
     for h in range(len(shift)):
-        if not _root(times * covariance[h] + more, root):
-            return False, out
-        out[h] = _square(root, shift[h] - at, white)
-    return True, out
+        out[h] = _square(times * covariance[h] + more, shift[h] - at, root, white)
+    return out
 
 
 @compiled
@@ -192,19 +202,17 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
-) -> tuple[bool, tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
     """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
     besides, and the normalised squares (h,) of the former's distance from that.
     """
     sums, normal, spread, of_model = add_up(
         pull, information, middle, model, finger, fingers, keep, known, known_pull
     )  # fmt: skip
-    rooted, shift, own, by_model = separate(sums, normal, spread, of_model, 6)
-    known_pose, sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
-    solved, shift_with, own_with, by_model_with = separate(sums, normal, spread, of_model, 6)
-    comparable, out = squares(shift, at, own, times, covariance)
-    found = rooted and known_pose and solved and comparable
-    return found, (shift, own, by_model), (shift_with, own_with, by_model_with), out
+    alone = separate(sums, normal, spread, of_model, 6)
+    sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
+    together = separate(sums, normal, spread, of_model, 6)
+    return alone, together, squares(alone[0], at, alone[1], times, covariance)
 
 
 @compiled
@@ -303,8 +311,13 @@ def levels(
     guide: Ints,
     step: float,
 ) -> tuple[float, float, int]:
-    """Protection levels of position and of rotation, and the number of the hypothesis that the position's owes most to;
-    -1 where all together are less probable than the risk.
+    """Protection levels of position and of rotation, m and rad, and the number of the hypothesis that the position's
+    owes most to; -1 where all together are less probable than the risk.
+
+    The levels are where the sum over the hypotheses of ``prior`` (h,) times the tail beyond level - ``away`` (2, h) is
+    ``risk``, found between bounds by halving their ratio's logarithm down to a factor ``near``; the larger end counts.
+    Those of less than an equal share of the risk take their ``prior`` off it.  ``squares`` to ``step``: the tables of
+    :mod:`~gripmon.track.integrity.quantiles`.
     """
     share, left, count = risk / len(prior), risk, 0
     for h in range(len(prior)):
@@ -324,6 +337,7 @@ def levels(
             s, f = sigma[part, h], factor[part, h]
             least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
             most[part] = max(most[part], away[part, h] + s * _radius(equally, f, squares, spacing))
+    # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
     for part in range(2):
         least[part] = max(least[part], 1e-3 * most[part])
     while most[0] > near * least[0] or most[1] > near * least[1]:
@@ -351,9 +365,11 @@ def levels(
 @compiled
 def follow(
     mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
-) -> tuple[bool, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """One more measurement for each of g Kalman filters: their means (g, 6), covariances (g, 6, 6) and errors by the
-    model (g, f, 6) after it, and the traces of their gains (g,).
+    model (g, f, 6) after it, and the traces of their gains (g,).  With P = covariance + creep and K = P (P + R)^-1
+    these are mean + K (shift - mean), (1 - K) P and off + K (of_model - off); R is ``of_frame``, ``creep`` (6,)
+    variances.
     """
     count = len(mean)
     new_mean, new_covariance, new_off, taken = mean.copy(), np.empty((count, 6, 6)), off.copy(), np.zeros(count)
@@ -364,9 +380,7 @@ def follow(
             for j in range(6):
                 before[i, j] = covariance[g, i, j] + (creep[i] if i == j else 0.0)
                 both[i, j] = before[i, j] + of_frame[g, i, j]
-        if not _root(both, root):
-            return False, mean, covariance, off, taken
-        _invert(root, inverse, between)
+        _inverse(both, inverse, root, between)
         for i in range(6):
             for j in range(6):
                 total = 0.0
@@ -386,7 +400,7 @@ def follow(
         for i in range(6):
             for j in range(6):
                 new_covariance[g, i, j] = 0.5 * (between[i, j] + between[j, i])
-    return True, new_mean, new_covariance, new_off, taken
+    return new_mean, new_covariance, new_off, taken
 
 
 @compiled
@@ -401,7 +415,7 @@ def telling(
     of_model: Array,
     rows: Ints,
     limit: float,
-) -> tuple[bool, Array, Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Of g averages, from ``at`` (6,) and after a way with the variances ``wander`` (6,), and the fits of a frame that
     are their ``rows`` (g,) the ones that know more, but the frame where they differ by more than a normalised square of
     ``limit``: shift (g, 6), covariance (g, 6, 6) and error by the model (g, f, 6).  A negative row is none.
@@ -414,10 +428,8 @@ def telling(
         h = rows[g]
         if h < 0:
             continue
-        if not _root(of_frame[h] + spread[g], root):
-            return False, away, spread, error
         own = of_frame[h, 0, 0] + of_frame[h, 1, 1] + of_frame[h, 2, 2]
         surer = own < spread[g, 0, 0] + spread[g, 1, 1] + spread[g, 2, 2]
-        if surer or _square(root, shift[h] - away[g], white) > limit:
+        if surer or _square(of_frame[h] + spread[g], shift[h] - away[g], root, white) > limit:
             away[g], spread[g], error[g] = shift[h], of_frame[h], of_model[h]
-    return True, away, spread, error
+    return away, spread, error

@@ -52,13 +52,6 @@ class Tails(NamedTuple):
         three = np.interp(-log_risk, -_LOG_RISK, SQUARES[1])
         return np.asarray(self.sigma * np.sqrt(np.minimum(one, three)))
 
-    def beyond(self, radius: Array) -> Array:
-        """Probabilities of lengths above ``radius``; 1 for a negative one."""
-        square = np.square(np.maximum(radius, 0.0) / self.sigma)
-        one = np.interp(square, SQUARES[0], _LOG_RISK) + self.factor
-        three = np.interp(square, SQUARES[1], _LOG_RISK)
-        return np.asarray(10.0 ** np.minimum(one, three))
-
 
 def bounds(covariance: Array, risk: Array) -> Array:
     """(n,) radii that normal errors with the covariances (n, 3, 3) exceed with the probabilities ``risk`` (n,)."""

@@ -8,22 +8,20 @@ user algorithm", 2015):
 
     sum over k of p_k P(|x_0 - x_k| + |e_k| > PL) = r,   e_k normal with the covariance of x_k
 
-The arithmetic is compiled (:mod:`~gripmon.track.integrity.kernel`), or NumPy's where nothing compiles.
+The arithmetic stands in :mod:`~gripmon.track.integrity.kernel`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
-from gripmon.track.integrity import kernel, plain
+from gripmon.track.integrity import kernel
 from gripmon.track.integrity.quantiles import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
 
 LEVEL_TOLERANCE_RATIO = 1.02
@@ -68,13 +66,12 @@ class Sums(NamedTuple):
         each edge pulls (v, m) where its part of the gripper is off, which part (v,) that is, and how many there are;
         ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
         """
-        add_up = kernel.add_up if COMPILES else plain.add_up
         pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
-        return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
+        return cls(*kernel.add_up(pull, information, middle, *model, keep, known, known_pull))
 
     def fits(self, unknowns: int = 6) -> Separation:
         """The fits' first ``unknowns``.  Where nothing determines a direction, ``known`` must: LinAlgError else."""
-        return Separation(*_first_that_can(kernel.separate, plain.separate, *self, unknowns))
+        return Separation(*kernel.separate(*self, unknowns))
 
 
 def with_and_without(
@@ -96,7 +93,7 @@ def with_and_without(
     """
     pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
     of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
-    alone, together, squares = _first_that_can(kernel.with_and_without, plain.with_and_without, *of)
+    alone, together, squares = kernel.with_and_without(*of)
     return Separation(*alone), Separation(*together), squares
 
 
@@ -104,7 +101,7 @@ def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separ
     """A bank of g Kalman filters, the same average once under each hypothesis, after one more measurement, the pose
     having crept by the variances ``creep`` (6,) since the one before; and the traces (g,) of the gains.
     """
-    *after, gains = _first_that_can(kernel.follow, plain.follow, *averages, *frame, creep)
+    *after, gains = kernel.follow(*averages, *frame, creep)
     return Separation(*after), gains
 
 
@@ -115,17 +112,7 @@ def telling(
     with the variances ``wander`` (6,), or the frame's fit ``rows`` (g,); but the frame's where they differ by more than
     a normalised square of ``limit``.  A negative row is no fit.
     """
-    of = *averages, at, wander, *frame, rows, limit
-    return Separation(*_first_that_can(kernel.telling, plain.telling, *of))
-
-
-def _first_that_can(compiled: Callable[..., Any], by_numpy: Callable[..., Any], *of: Any) -> Sequence[Array]:
-    """What the compiled function gives; NumPy's where nothing compiles, or a matrix isn't positive definite."""
-    if COMPILES:
-        found, *result = compiled(*of)
-        if found:
-            return result
-    return by_numpy(*of)[1:]
+    return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +132,7 @@ class Doubts:
 
         ``inflation``: factor on standard deviations with which a normal distribution bounds the tails of real errors.
         """
-        away, sigma, factor = (kernel.tails if COMPILES else plain.tails)(*fits, inflation)
+        away, sigma, factor = kernel.tails(*fits, inflation)
         return cls(name, prior, away, Tails(sigma, factor))
 
     def among(self, chosen: NDArray[np.bool_]) -> Doubts:
@@ -171,11 +158,10 @@ class Doubts:
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        of = self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO
-        if COMPILES:
-            position, rotation, number = kernel.levels(*of, SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP)
-        else:
-            position, rotation, number = plain.levels(*of)
+        tables = SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP
+        position, rotation, number = kernel.levels(
+            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, *tables
+        )
         return position, rotation, self.name[number] if number >= 0 else ""
 
 

@@ -10,19 +10,17 @@ for little.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.compiled import COMPILES
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import BLUE, GREEN, RED
 from gripmon.model.poses import to_record
 from gripmon.model.records import Array, Image, LookPixels
-from gripmon.track.look import kernel, plain
+from gripmon.track.look import kernel
 from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.blocks import BLOCK_PX, INNER, blocks_in, gradients, jacobian_of, most_telling
 from gripmon.track.look.placed import LINEAR_PX, Placed, motion_between, moved
@@ -60,8 +58,6 @@ gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is le
 RENEWED = 0.5
 """Correlation of a block with what it was first, below which it shows something else."""
 
-ARITHMETIC: ModuleType = kernel if COMPILES else plain
-
 _KINDS = ("<u2", "<f4", "<f4", "<f4", "<f4", "<u2")
 """How places, means, variances, first means, counts and unlike frames are kept."""
 
@@ -80,8 +76,8 @@ class LookMotion:
 class LookAlignment:
     """Learns and measures the pixels of one gripper in one camera.  A pure function of the frames so far."""
 
-    def __init__(self, camera: Camera, gripper: Gripper, by: ModuleType = ARITHMETIC):
-        self._camera, self._gripper, self._by = camera, gripper, by
+    def __init__(self, camera: Camera, gripper: Gripper):
+        self._camera, self._gripper = camera, gripper
         self.forget()
 
     def forget(self) -> None:
@@ -126,7 +122,7 @@ class LookAlignment:
             return
         assert self._learnt is not None
         motion = self._learnt.motion_to(cam_T_grip, jaw_opening_m)
-        values = self._by.read(*grey, self._learnt.base_px, self._learnt.flow, motion)
+        values = kernel.read(*grey, self._learnt.base_px, self._learnt.flow, motion)
         self._add(values)
         if self.views >= FEWEST_VIEWS and (self.views - FEWEST_VIEWS) % CHOOSE_EVERY == 0:
             self._choose()
@@ -205,8 +201,8 @@ class LookAlignment:
         here[6] += known_m
         try:
             for _ in range(READINGS):
-                values = self._by.read(*grey, self._measured.base_px, self._measured.flow, here)
-                step, information, pulls, share, scatter = self._by.align(
+                values = kernel.read(*grey, self._measured.base_px, self._measured.flow, here)
+                step, information, pulls, share, scatter = kernel.align(
                     values, self._mean_in, self._weight_in, self._jacobian, prior
                 )
                 here = here + step
@@ -247,7 +243,7 @@ class LookAlignment:
             return False
         every = Placed(self._camera, self._gripper, points_grip_m, places[:, 2].astype(np.intp))
         every.motion_to(cam_T_grip, jaw_opening_m)
-        values = self._by.read(*grey, every.base_px, every.flow, np.zeros(7))
+        values = kernel.read(*grey, every.base_px, every.flow, np.zeros(7))
         values = np.nan_to_num(values)
         jacobian = jacobian_of(values, every.flow, np.ones_like(values))
         best = most_telling(jacobian, np.ones((len(places), INNER.size)), LEARNT_BLOCKS)
@@ -340,8 +336,6 @@ class LookAlignment:
 
 def warm_up() -> None:
     """Compile, or load, what grey and colour images of eight bits need."""
-    if not COMPILES:
-        return
     nothing = np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 7)), np.zeros(7)
     for shape in ((8, 8), (8, 8, 3)):
         values = kernel.read(*_channels(np.zeros(shape, dtype=np.uint8)), *nothing)

@@ -1,7 +1,8 @@
 """Reading the gripper's learned pixels in an image and fitting its motion to them, compiled.
 
-The same by NumPy stands in :mod:`~gripmon.track.look.plain`, function by function; what the quantities are for, in
-:mod:`~gripmon.track.look.alignment`.
+p patches of n pixels; grey levels, motions in m and rad with the opening as seventh.  What they are for stands in
+:mod:`~gripmon.track.look.alignment`.  Tests hold each function against that of its name in
+``tests/support/by_numpy/look.py``.
 """
 
 from __future__ import annotations
@@ -134,7 +135,9 @@ def _pull(of_motion: Array, off: Array) -> float:
 def align(
     values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array
 ) -> tuple[Array, Array, Array, Array, float]:
-    """The motion (7,) of the learned pixels that shows best in ``values`` (p, n), robustly.
+    """The motion (7,) of the learned pixels that shows best in ``values`` (p, n): iteratively re-weighted least squares
+    with Tukey's weight, each patch having its own gain and offset of light, taken out of the residuals with the present
+    weights.
 
     ``mean`` (p, n) as learnt; ``weight`` (p, n) one over the variances, 0 for what doesn't count; ``jacobian``
     (p, 7, n) by how much a motion changes what is seen where the gripper was, less what light could; ``prior`` (7,)

@@ -1,4 +1,4 @@
-"""What :mod:`~gripmon.track.look.kernel` compiles, by NumPy: says why, and is what a test holds it against."""
+"""What ``track.look.kernel`` compiles, function by function, by NumPy."""
 
 from __future__ import annotations
 

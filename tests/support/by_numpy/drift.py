@@ -1,6 +1,4 @@
-"""What :mod:`~gripmon.judge.drift.kernel` does, function by function, by NumPy: what it is tested against, and what
-does the work where nothing compiles.
-"""
+"""What ``judge.drift.kernel`` compiles, function by function, by NumPy."""
 
 from __future__ import annotations
 
@@ -43,8 +41,8 @@ def least_squares(whitening: Array, shift: Array, tolerated: Array, sweeps: int)
     return best
 
 
-def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int) -> tuple[bool, float]:
-    return True, float(least_squares(whitening_of(covariance), shift, tolerated, sweeps))
+def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int) -> float:
+    return float(least_squares(whitening_of(covariance), shift, tolerated, sweeps))
 
 
 def _report(reported: Array, covariance: Array, memory: float) -> Array:
@@ -139,7 +137,7 @@ def learn(
 
 def covariances(reported: Array, of_difference: Array, learnt: Array, times: Array, rare: Ints) -> tuple[Array, Array]:
     """(..., k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones, where the
-    variance of what was seen counts ``times`` (..., k, s); the rest as in :func:`refresh`.
+    variance of what was seen counts ``times`` (..., k, s); the rest as in ``kernel.refresh``.
     """
     parts = 0.25 * of_difference
     parts[-1] *= 2.0  # beyond the longest, windows count as independent
@@ -176,7 +174,7 @@ def refresh(
     learnt_whitening: Array,
     to_reported: Array,
     from_reported: Array,
-) -> bool:
+) -> None:
     from_reported[:] = np.linalg.cholesky(reported)
     to_reported[:] = np.linalg.inv(from_reported)
     of_mean, of_differences = covariances(reported, of_difference, learnt, times, rare)
@@ -188,4 +186,3 @@ def refresh(
     of_both = np.stack([of_mean[::2], of_differences[::2]])  # (2 statistics, assumed and learnt, k, s, 6, 6)
     whitening[:] = whitening_of(np.where(known[..., None, None], of_both[:, 1], of_both[:, 0]))
     learnt_whitening[:] = whitening_of(of_difference)
-    return True

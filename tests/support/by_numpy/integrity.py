@@ -1,6 +1,4 @@
-"""What :mod:`~gripmon.track.integrity.kernel` does, function by function, by NumPy: what it is tested against, and what
-does the work where nothing compiles.
-"""
+"""What ``track.integrity.kernel`` compiles, function by function, by NumPy."""
 
 from __future__ import annotations
 
@@ -8,7 +6,7 @@ import numpy as np
 
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
-from gripmon.track.integrity.quantiles import Tails
+from gripmon.track.integrity.quantiles import _LOG_RISK, SQUARES, Tails
 
 
 def add_up(
@@ -28,29 +26,27 @@ def add_up(
     return keep @ pull + known_pull, normal, spread, np.einsum("hv,fvi->hfi", keep, own[:, :, None] * model)
 
 
-def separate(
-    sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int
-) -> tuple[bool, Array, Array, Array]:
+def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int) -> tuple[Array, Array, Array]:
     inverse = np.linalg.inv(normal)[:, :unknowns]
     covariance = inverse @ spread @ inverse.transpose(0, 2, 1)
-    return True, np.einsum("hij,hj->hi", inverse, sums), covariance, np.einsum("hij,hfj->hfi", inverse, of_model)
+    return np.einsum("hij,hj->hi", inverse, sums), covariance, np.einsum("hij,hfj->hfi", inverse, of_model)
 
 
 def with_pose(
     sums: Array, normal: Array, spread: Array, of_model: Array, at: Array, covariance: Array, off: Array
-) -> tuple[bool, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     sums, normal, spread, of_model = sums.copy(), normal.copy(), spread.copy(), of_model.copy()
     information = np.linalg.inv(covariance)
     sums[:, :6] += information @ at
     normal[:, :6, :6] += information
     spread[:, :6, :6] += information
     of_model[:, :, :6] += off @ information
-    return True, sums, normal, spread, of_model
+    return sums, normal, spread, of_model
 
 
-def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[bool, Array]:
+def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[Array]:
     away = shift - at
-    return True, np.einsum("hi,hi->h", away, np.linalg.solve(times * covariance + more, away[:, :, None])[:, :, 0])
+    return np.einsum("hi,hi->h", away, np.linalg.solve(times * covariance + more, away[:, :, None])[:, :, 0])
 
 
 def with_and_without(
@@ -67,11 +63,11 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
-) -> tuple[bool, tuple[Array, ...], tuple[Array, ...], Array]:
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
     sums = add_up(pull, information, middle, model, finger, fingers, keep, known, known_pull)
-    alone = separate(*sums, 6)[1:]
-    together = separate(*with_pose(*sums, at, covariance, off)[1:], 6)[1:]
-    return True, alone, together, squares(alone[0], at, alone[1], times, covariance)[1]
+    alone = separate(*sums, 6)
+    together = separate(*with_pose(*sums, at, covariance, off), 6)
+    return alone, together, squares(alone[0], at, alone[1], times, covariance)
 
 
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
@@ -81,8 +77,16 @@ def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) ->
     return np.sqrt(np.einsum("hpi,hpi->ph", parts, parts)), *Tails.of(blocks)
 
 
+def beyond(tails: Tails, radius: Array) -> Array:
+    """Probabilities of lengths above ``radius``; 1 for a negative one."""
+    square = np.square(np.maximum(radius, 0.0) / tails.sigma)
+    one = np.interp(square, SQUARES[0], _LOG_RISK) + tails.factor
+    three = np.interp(square, SQUARES[1], _LOG_RISK)
+    return np.asarray(10.0 ** np.minimum(one, three))
+
+
 def levels(
-    prior: Array, away: Array, sigma: Array, factor: Array, risk: float, near: float
+    prior: Array, away: Array, sigma: Array, factor: Array, risk: float, near: float, *_tables: object
 ) -> tuple[float, float, int]:
     share = risk / max(len(prior), 1)
     counted = np.flatnonzero(prior > share)
@@ -96,21 +100,21 @@ def levels(
     least = np.maximum(least, 1e-3 * most)
     while (most > near * least).any():
         middle = np.sqrt(least * most)
-        enough = (prior * tails.beyond(middle[:, None] - away)).sum(axis=1) <= left
+        enough = (prior * beyond(tails, middle[:, None] - away)).sum(axis=1) <= left
         least, most = np.where(enough, least, middle), np.where(enough, middle, most)
-    owed = prior * tails.beyond(most[:, None] - away)[0]
+    owed = prior * beyond(tails, most[:, None] - away)[0]
     return float(most[0]), float(most[1]), int(counted[np.argmax(owed)])
 
 
 def follow(
     mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
-) -> tuple[bool, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     before = covariance + np.diag(creep)
     gain = np.linalg.solve(before + of_frame, before).transpose(0, 2, 1)
     mean = mean + np.einsum("gij,gj->gi", gain, shift - mean)
     off = off + np.einsum("gij,gfj->gfi", gain, of_model - off)
     left = before - gain @ before
-    return True, mean, 0.5 * (left + left.transpose(0, 2, 1)), off, np.einsum("gii->g", gain)
+    return mean, 0.5 * (left + left.transpose(0, 2, 1)), off, np.einsum("gii->g", gain)
 
 
 def telling(
@@ -124,15 +128,14 @@ def telling(
     of_model: Array,
     rows: Ints,
     limit: float,
-) -> tuple[bool, Array, Array, Array]:
+) -> tuple[Array, Array, Array]:
     mean, covariance = mean - at, covariance + np.diag(wander)
     shift, of_frame, of_model = shift[rows], of_frame[rows], of_model[rows]
-    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 1.0, np.zeros((6, 6)))[1] > limit
+    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 1.0, np.zeros((6, 6))) > limit
     frame |= np.einsum("gii->g", of_frame[:, :3, :3]) < np.einsum("gii->g", covariance[:, :3, :3])
     frame &= rows >= 0
     each = frame[:, None, None]
     return (
-        True,
         np.where(frame[:, None], shift, mean),
         np.where(each, of_frame, covariance),
         np.where(each, of_model, off),

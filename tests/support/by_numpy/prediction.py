@@ -1,6 +1,4 @@
-"""The geometry of a prediction by NumPy: what tests hold ``prediction_kernel`` against, function by function, and what
-runs where nothing compiles.
-"""
+"""What ``track.edges.prediction_kernel`` compiles, function by function, by NumPy."""
 
 from __future__ import annotations
 
