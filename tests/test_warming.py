@@ -80,7 +80,7 @@ print(len(double.signatures), double._cache.__class__.__name__)
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(tmp_path: Path, kept: bool):
-    """A service without a home on a read-only system: neither NUMBA_CACHE_DIR nor any other folder can be written to."""
+    """A service without a home on a read-only system: no folder can be written to, whatever NUMBA_CACHE_DIR says."""
     (tmp_path / "doubled.py").write_text(DOUBLED)
     (tmp_path / "__pycache__").touch()  # no folder, and none can be made in its place
     (nowhere := tmp_path / "file").touch()

@@ -57,7 +57,7 @@ def fit(
     mean: Any, prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float,
     support_sigmas: float, support_share: float,
 ) -> Any:  # fmt: skip
-    """What ``robust_fit.fit_irls`` says: whether it could be solved, then the fields of ``RobustFit`` in their order."""
+    """``robust_fit.fit_irls``: whether it could be solved, then the fields of ``RobustFit`` in their order."""
     count = len(start)
     near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
     unknowns, wanted, held = np.zeros(SIZE), np.zeros(SIZE), np.ones(SIZE)
