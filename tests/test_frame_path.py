@@ -19,7 +19,7 @@ from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor
-from gripmon.record.write import NullRecorder
+from gripmon.record.write import Recorder
 from gripmon.simulate import Scenario, Simulator
 
 COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames
@@ -70,7 +70,7 @@ def test_the_way_of_a_frame_gets_no_longer():
     try:
         monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
         run(
-            monitor, counted, counted, NullRecorder(), settings.daemon,
+            monitor, counted, counted, Recorder(), settings.daemon,
             robot=settings.robot, camera=settings.camera_name,
         )  # fmt: skip
     finally:

@@ -40,7 +40,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.record.write import NullRecorder, RecordingSettings, open_recorder
+from gripmon.record.write import Recorder, RecordingSettings, open_recorder
 
 COUNT = 24
 JUMP = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
@@ -346,7 +346,7 @@ def test_disabled_recording_touches_nothing(tmp_path: Path) -> None:
         reference=REFERENCE,
         directory=tmp_path / "none",
     )
-    assert isinstance(writer, NullRecorder)
+    assert type(writer) is Recorder
     writer.offer(frame(0), record(0), lambda: None)
     writer.close()
     assert not (tmp_path / "none").exists()

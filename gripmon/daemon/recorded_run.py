@@ -22,7 +22,7 @@ from gripmon.record.compared import ComparedRecorder
 from gripmon.record.keeping import keep_whole
 from gripmon.record.read import RecordedFrames, SeveralRunsError, UnusableError, recording_files
 from gripmon.record.recorder import make_scene
-from gripmon.record.write import NullRecorder, Recorder, open_recorder
+from gripmon.record.write import Recorder, open_recorder
 
 RECORDING_PATIENCE_S = 30.0
 """Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""
@@ -171,7 +171,7 @@ def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
     what was there before stays then.
     """
     if path is None:
-        yield NullRecorder()
+        yield Recorder()
         return
     # One file, whatever its length.
     settings = msgspec.structs.replace(

@@ -45,7 +45,7 @@ from gripmon.model.records import (
     unmeasured_record,
 )
 from gripmon.record.read import recordings_below
-from gripmon.record.write import NullRecorder, Recorder
+from gripmon.record.write import Recorder
 
 _log = logging.getLogger(__name__)
 _LATENCY_BIN = 0.02  # natural logarithm
@@ -83,7 +83,7 @@ def replay(
         with open_source(source) as opened:
             yield from replay(opened, config, recorder, past, warn)
         return
-    recorder = NullRecorder() if recorder is None else recorder
+    recorder = Recorder() if recorder is None else recorder
     monitor = Monitor(config, past.state)
     waiting = deque(past.commands)
     revision = monitor.reference.revision
@@ -171,7 +171,7 @@ class FrameReplay:
         self, source: Source, config: Config, recorded: RecordedRun | None, warn: Callable[[str], None]
     ) -> None:
         self._source, self._config, self._recorded, self._warn = source, config, recorded, warn
-        self._recorder: Recorder = NullRecorder()
+        self._recorder: Recorder = Recorder()
         self._counts = Counts()
         self.length = len(source) if isinstance(source, Sized) else None
 

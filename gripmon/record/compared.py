@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gripmon.model.errors import one_line
-from gripmon.model.records import Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord
+from gripmon.model.records import Frame, FrameRecord, Limits
 from gripmon.record.columns import (
     APPLICATION_ID,
     AXIS,
@@ -27,7 +27,7 @@ from gripmon.record.columns import (
     two_columns,
 )
 from gripmon.record.read import RecordedFrames
-from gripmon.record.recorder import Events, Notes, NullRecorder, Scene, Trace, pack_trace
+from gripmon.record.recorder import Events, Notes, Recorder, Scene, Trace, pack_trace
 from gripmon.record.rows import CurveWriter, RowWriter
 from gripmon.record.scene import rig_view, wrist_image_view
 from gripmon.record.worker import measured_picture
@@ -53,13 +53,15 @@ class _Beside(Sender):
         super().columns(f"{RECORDED}/{path}", stamps_ns, seqs, columns)
 
 
-class ComparedRecorder(NullRecorder):
+class ComparedRecorder(Recorder):
     """A recorder for a replay: takes each frame with what ``source``, which gave it last, has recorded of it.
 
     The replay is the recording, with all its entities; what was recorded lies beside it below ``recorded``, with the
     same names.  It writes in the caller's thread: a replay can wait.  The daemon's own alerts and state messages aren't
     in it.
     """
+
+    failure: str | None = None
 
     def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
         """``recorded_limits`` are drawn beside the replay's; None where they are unknown.  OSError as for a file."""
@@ -95,16 +97,10 @@ class ComparedRecorder(NullRecorder):
         if len(self._rows) >= _BATCH_ROWS:
             self._write()
 
-    def reference(self, reference: ReferenceRecord) -> None:
-        """A new reference of the replay."""
-        self._events += Events(references=[reference])
-
-    def command(self, command: RecordedCommand) -> None:
-        """A command, and what became of it now."""
-        self._events += Events(commands=[command])
+    def happened(self, events: Events) -> None:
+        self._events += events
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Finish the file."""
         self._write()
         if self.failure is not None:
             return

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -131,8 +131,9 @@ class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
 
 
-class Recorder(Protocol):
-    """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.
+class Recorder:
+    """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.  This one
+    records nothing.
 
     A wrist camera's loop has frames to offer and references, a second camera's has spots.  ``dropped`` are frames that
     are not in the recording, ``images_dropped`` images that others lack; ``failure`` says why nothing is being written,
@@ -141,13 +142,20 @@ class Recorder(Protocol):
     """
 
     @property
-    def dropped(self) -> int: ...
+    def dropped(self) -> int:
+        return 0
+
     @property
-    def images_dropped(self) -> int: ...
+    def images_dropped(self) -> int:
+        return 0
+
     @property
-    def has_room(self) -> bool: ...
+    def has_room(self) -> bool:
+        return True
+
     @property
-    def failure(self) -> str | None: ...
+    def failure(self) -> str | None:
+        return None
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
@@ -155,27 +163,26 @@ class Recorder(Protocol):
     def spot(self, record: SpotRecord, image: Image | None) -> None:
         """What became of a pulse, with the image in which its spot was looked for."""
 
-    def alert(self, alert: AlertRecord) -> None: ...
-    def reference(self, reference: ReferenceRecord) -> None: ...
-    def command(self, command: RecordedCommand) -> None: ...
-    def state(self, state: StateRecord) -> None: ...
-    def close(self, timeout_s: float = 2.0) -> None: ...
+    def happened(self, events: Events) -> None:
+        """What there is beside the frames."""
 
+    def alert(self, alert: AlertRecord) -> None:
+        """One that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
+        self.happened(Events(alerts=[alert]))
 
-class NullRecorder:
-    """Records nothing."""
+    def reference(self, reference: ReferenceRecord) -> None:
+        """A new one; the first was given at the start."""
+        self.happened(Events(references=[reference]))
 
-    dropped = images_dropped = 0
-    has_room = True
-    failure: str | None = None
+    def command(self, command: RecordedCommand) -> None:
+        """A command, and what became of it."""
+        self.happened(Events(commands=[command]))
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None: ...
-    def spot(self, record: SpotRecord, image: Image | None) -> None: ...
-    def alert(self, alert: AlertRecord) -> None: ...
-    def reference(self, reference: ReferenceRecord) -> None: ...
-    def command(self, command: RecordedCommand) -> None: ...
-    def state(self, state: StateRecord) -> None: ...
-    def close(self, timeout_s: float = 2.0) -> None: ...
+    def state(self, state: StateRecord) -> None:
+        self.happened(Events(states=[state]))
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,18 +18,15 @@ from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
-    AlertRecord,
     Frame,
     FrameRecord,
     Image,
     MeasurementTrace,
     MonitorNotes,
-    RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
     SpotRecord,
     State,
-    StateRecord,
     Verdict,
 )
 from gripmon.record.process import Health, ImageRing, WorkerProcess
@@ -38,7 +35,6 @@ from gripmon.record.recorder import (
     FrameNote,
     ImageNote,
     Notes,
-    NullRecorder,
     Recorder,
     RecordingSettings,
     Scene,
@@ -51,7 +47,6 @@ from gripmon.record.recorder import (
 
 __all__ = [
     "Notes",
-    "NullRecorder",
     "ProcessRecorder",
     "Recorder",
     "RecordingSettings",
@@ -90,7 +85,7 @@ class _Waiting(NamedTuple):
     lost: bool = False
 
 
-class ProcessRecorder:
+class ProcessRecorder(Recorder):
     """Records through a process of its own.
 
     ``offer`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
@@ -203,24 +198,10 @@ class ProcessRecorder:
             item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, due, lost)
         self._frames.append(item)
 
-    def alert(self, alert: AlertRecord) -> None:
-        """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
-        self._events.append(Events(alerts=[alert]))
-
-    def reference(self, reference: ReferenceRecord) -> None:
-        """Record a new reference; the first one was given at the start."""
-        self._events.append(Events(references=[reference]))
-
-    def command(self, command: RecordedCommand) -> None:
-        """Record a command and what became of it."""
-        self._events.append(Events(commands=[command]))
-
-    def state(self, state: StateRecord) -> None:
-        """Record a state message."""
-        self._events.append(Events(states=[state]))
+    def happened(self, events: Events) -> None:
+        self._events.append(events)
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
         if self._closing.is_set():
             return
         self._close_before = time.monotonic() + timeout_s
@@ -412,7 +393,7 @@ def open_recorder(
     made.
     """
     if not settings.enabled and view is None:
-        return NullRecorder()
+        return Recorder()
     where = Path(settings.directory) if directory is None else directory
     if settings.enabled:
         where.mkdir(parents=True, exist_ok=True)

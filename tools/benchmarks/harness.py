@@ -25,7 +25,7 @@ from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, State, StateRecord, Verdict
 from gripmon.monitor import Monitor, warm_up
-from gripmon.record.write import NullRecorder, Recorder
+from gripmon.record.write import Recorder
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)
@@ -165,7 +165,7 @@ def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder:
         Monitor(config.camera, config.gripper, settings.monitor, config.reference),
         source,
         _TimedPublisher(publisher, source),
-        NullRecorder() if recorder is None else recorder,
+        Recorder() if recorder is None else recorder,
         settings.daemon,
         robot=settings.robot,
         camera=settings.camera_name,
