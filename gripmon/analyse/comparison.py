@@ -10,6 +10,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from gripmon.analyse.content import count
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
 from gripmon.model.units import in_mm
 from gripmon.simulate import FrameTruth
@@ -37,6 +38,10 @@ class Distribution(msgspec.Struct, frozen=True):
     p95: float | None
     max: float | None
 
+    def cells(self) -> str:
+        """Of a table in columns of 8 characters."""
+        return "".join("       —" if v is None else f"{v:8.4f}" for v in (self.mean, self.p95, self.max))
+
 
 class TcpErrors(msgspec.Struct, frozen=True):
     """Errors of the TCP's position in the camera frame, mm, across and along the optical axis."""
@@ -44,6 +49,10 @@ class TcpErrors(msgspec.Struct, frozen=True):
     frames: int
     across_mm: Distribution
     along_mm: Distribution
+
+    def row(self, name: str) -> str:
+        """Of :meth:`Comparison.table`."""
+        return f"{name:<38}{self.frames:>6} {self.across_mm.cells()}  {self.along_mm.cells()}"
 
 
 class EventReport(msgspec.Struct, frozen=True):
@@ -64,6 +73,17 @@ class EventReport(msgspec.Struct, frozen=True):
     noticed_after_s: float | None
     alerts: tuple[str, ...]
 
+    def text(self) -> str:
+        """How far off the TCP was, and what was noticed."""
+        moved = f"TCP up to {self.largest_tcp_shift_mm:.2f} mm off"
+        if self.noticed_after_s is None:
+            noticed = "rightly no alarm" if self.harmless else "NOT NOTICED"
+        else:
+            noticed = f"{'FALSE ALARM' if self.harmless else 'noticed'} after {self.noticed_after_s:.2f} s"
+        if self.alerts:
+            noticed += f": {', '.join(dict.fromkeys(self.alerts))}"
+        return f"{self.event:<10} {moved}; {self.valid} of {self.frames} frames valid; {noticed}"
+
 
 class Comparison(msgspec.Struct, frozen=True):
     """Everything about a run on simulated frames."""
@@ -74,6 +94,17 @@ class Comparison(msgspec.Struct, frozen=True):
     after_correction: TcpErrors
     smoothed: TcpErrors
     events: tuple[EventReport, ...]
+
+    def table(self) -> list[str]:
+        """The errors, with and without correction, of the whole and in each event."""
+        return [
+            f"{'TCP error against truth (mm)':<38}      across the optical axis           along it",
+            f"{'':<38}{'frames':>6}{'mean':>9}{'95 %':>8}{'max':>8}{'mean':>10}{'95 %':>8}{'max':>8}",
+            self.without_correction.row("without correction"),
+            self.after_correction.row("after correction"),
+            *(e.after_correction.row(f"  {e.event} at {e.start_s:.1f} to {e.end_s:.1f} s") for e in self.events),
+            self.smoothed.row("after correction, smoothed"),
+        ]
 
 
 class _Pair(NamedTuple):
@@ -226,9 +257,9 @@ class Differences:
             return f"all {self.frames} as they were recorded, every number the same"
         alerts = self._alerts_now.against(self._alerts_then)
         judged = [
-            f"{_counted(count)} with another {what} (the first: {self._first[what]})"
-            for what, count in (("verdict", self._verdicts), ("state", self._states))
-            if count
+            f"{count(number, 'frame')} with another {what} (the first: {self._first[what]})"
+            for what, number in (("verdict", self._verdicts), ("state", self._states))
+            if number
         ]
         if alerts:
             judged = [*(judged or ["verdicts and states as recorded"]), f"alerts differ: {alerts}"]
@@ -272,7 +303,3 @@ class _AlertChanges:
                 texts.append(f"{what} at frame {now_seq}, recorded at {then_seq}")
         more = len(texts) - _MOST_SHOWN
         return ", ".join(texts[:_MOST_SHOWN]) + (f" and {more} more" if more > 0 else "")
-
-
-def _counted(count: int) -> str:
-    return f"{count} frame{'s' if count > 1 else ''}"

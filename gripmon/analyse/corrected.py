@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
+from gripmon.analyse.content import clock_time, count
 from gripmon.analyse.correction import BLOCK_S, SOURCES, Correction, correct, sample
 from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
 from gripmon.analyse.smoothing import MID_S, SLOW_S
 from gripmon.model.errors import NoResultError
-from gripmon.model.records import Origin, Transform
-from gripmon.record.read import FrameTable, Recording
+from gripmon.model.records import Array, Origin, Transform
+from gripmon.record.recordings import Recording
+from gripmon.record.table import FrameTable
 
 BETWEEN = "between"
 """Source of an instant that is no frame's."""
@@ -39,6 +41,26 @@ class CorrectedRun:
     def name(self) -> str:
         """See :func:`name_of`."""
         return name_of(self.recording)
+
+    def summary(self) -> str:
+        """For a person: how many frames, how certain, and each change of the pose on a line of its own."""
+        made = self.correction
+        sigma_um = 1e6 * float(np.median(_tcp_sigma_m(made.covariance)))
+        points = count(len(made.change_points), "change point")
+        lines = [f"{self.name}: {len(made.stamp_ns)} frames, {points}, TCP to {sigma_um:.1f} µm (1σ)"]
+        for point in made.change_points:
+            size_mm = 1e3 * float(np.linalg.norm(point.size[:3]))
+            turn_deg = np.degrees(float(np.linalg.norm(point.size[3:])))
+            spread_ms = 1e-6 * (point.latest_ns - point.earliest_ns)
+            seq = int(self.recording.frames.seq[point.index])
+            when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
+            lines.append(f"  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°")
+        return "\n".join(lines)
+
+
+def _tcp_sigma_m(covariance: Array) -> Array:
+    """(n,) of the TCP's position, all directions together, from (n, 6, 6)."""
+    return np.asarray(np.sqrt(np.einsum("nii->ni", covariance)[:, :3].sum(axis=1)))
 
 
 def name_of(recording: Recording) -> str:
@@ -163,7 +185,7 @@ def _columns(each: CorrectedRun) -> dict[str, Any]:
         "stamp_ns": stamp_ns,
         "segment": segment,
         "source": source,
-        "sigma_tcp_m": np.sqrt(np.einsum("nii->ni", covariance)[:, :3].sum(axis=1)),
+        "sigma_tcp_m": _tcp_sigma_m(covariance),
         "translation_m": poses[:, :3, 3],
         "rotation_xyzw": Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True),
         "covariance": covariance.reshape(-1, 36),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,6 +49,43 @@ class PlaneCalibration:
     def rms_px(self) -> float:
         """Root mean square residual in the images, u and v each."""
         return float(np.sqrt(np.mean(np.square(np.concatenate([i.residuals_px for i in self.images])))))
+
+    def table(self) -> list[str]:
+        """For a person: a row for each image."""
+        width = max(len(image.sighting.name) for image in self.images)
+        compared = any(image.tilt_rad is not None for image in self.images)
+        apart = "  tilt about x, y          gap" if compared else ""
+        head = f"{'image':<{width}}  plate points     rms  corners  residual{apart}"
+        return [head, *(_row(image, width) for image in self.images)]
+
+    def summary(self) -> list[str]:
+        """For a person: pose, lengths where they were inferred, and how certain they are."""
+        lines = []
+        if self.consistency_p is not None:
+            lines = [f"the images agree with each other: probability {self.consistency_p:.2g} of differing as much"]
+        sigma = (self.covariance.diagonal() ** 0.5).tolist()
+        x, y, z = (1e3 * self.cam_T_grip[:3, 3]).tolist()
+        sx, sy, sz = (1e3 * value for value in sigma[:3])
+        rx, ry, rz = (math.degrees(value) for value in sigma[3:])
+        lines.append(f"TCP in the camera frame  {x:.3f} {y:.3f} {z:.3f} mm  +- {sx:.4f} {sy:.4f} {sz:.4f} mm")
+        lines.append(f"rotation about x, y, z   +- {rx:.4f} {ry:.4f} {rz:.4f} degrees")
+        if len(self.lengths_covariance):
+            sides, errors = 2e3 * self.corners_m[3, :2], 1e3 * self.lengths_covariance.diagonal()[:2] ** 0.5
+            apart, along = (f"{side:.3f} +- {error:.4f} mm" for side, error in zip(sides, errors, strict=True))
+            lines.append(f"fingertips {apart} apart, innermost edges {along} long")
+        return lines
+
+
+def _row(image: Coincidence, width: int) -> str:
+    used, left_out = int(image.plate.used[0].sum()), int((~image.plate.used[0]).sum())
+    points = f"{used}" + (f" (-{left_out})" if left_out else "")
+    residual_mm = 1e3 * float((image.residuals_m**2).mean() ** 0.5)
+    apart = ""
+    if image.tilt_rad is not None and image.gap_m is not None:
+        tilt = [math.degrees(angle) for angle in image.tilt_rad.tolist()]
+        apart = f"  {tilt[0]:+.3f} {tilt[1]:+.3f} degrees   {1e3 * image.gap_m:+.4f} mm"
+    rms_px, corners = image.plate.rms_px, len(image.corners.names)
+    return f"{image.sighting.name:<{width}}  {points:>12} {rms_px:4.2f} px  {corners:7d} {residual_mm:6.4f} mm{apart}"
 
 
 def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:

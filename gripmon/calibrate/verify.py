@@ -6,6 +6,7 @@ sum of their covariances, so that differences then look less significant than th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -166,6 +167,18 @@ class Verdict:
             difference = {"kind": "camera", **parts, "largest_sigma_px": found.largest_sigma_px if known else None}
         within = {"within_tolerance": self.within, "same": self.same, "level": self.level}
         return {**difference, **within, "warnings": list(self.warnings)}
+
+    def summary(self, *, given: bool) -> list[str]:
+        """For a person, the verdict last; ``given``: with a tolerance."""
+        apart, level = self.difference, f"at a level of {self.level:g}"
+        lines = _hand_eye_lines(apart) if isinstance(apart, HandEyeDifference) else _camera_lines(apart)
+        if self.same and self.within:
+            verdict = "same: within the tolerance" if given else "same: the difference is negligible"
+        elif not self.same and apart.p_value is None:
+            verdict = "different: beyond the tolerance"
+        else:
+            verdict = f"same (not told apart {level})" if self.same else f"different ({level})"
+        return [*lines, *(f"warning: {warning}" for warning in self.warnings), verdict]
 
 
 def verify(
@@ -338,3 +351,39 @@ def _turned(camera: Camera, xy: Array, apart_px: Array) -> tuple[Array, Array]:
     matrix = (by_point @ by_turn).reshape(-1, 3)
     turn: Array = np.linalg.lstsq(matrix, apart_px.ravel(), rcond=None)[0]
     return turn, apart_px - (matrix @ turn).reshape(-1, 2)
+
+
+def _hand_eye_lines(found: HandEyeDifference) -> list[str]:
+    shift_mm = 1e3 * math.hypot(*found.position_m.tolist())
+    turn_deg = math.degrees(math.hypot(*found.rotation_rad.tolist()))
+    lines = ["second less first, camera axes    " + "".join(f"{axis:<19}" for axis in "xyz").rstrip()]
+    rows = (
+        ("TCP (mm)", 1e3 * found.position_m, 1e3 * found.position_sigma_m),
+        ("rotation (deg)", found.rotation_rad * 180.0 / math.pi, found.rotation_sigma_rad * 180.0 / math.pi),
+    )
+    for name, values, sigmas in rows:
+        cells = "".join(f"{v:+9.4f} ± {s:<7.4f}" for v, s in zip(values.tolist(), sigmas.tolist(), strict=True))
+        lines.append(f"{name:<28}{cells}".rstrip())
+    turn = f"{turn_deg:.4f} degrees ({_probability(found.rotation_p)})"
+    lines.append(f"together {shift_mm:.4f} mm at the TCP ({_probability(found.position_p)}), {turn}")
+    lines.append(f"chi-square {found.chi2:.2f} of 6 degrees of freedom: {_probability(found.p_value)} by chance")
+    return lines
+
+
+def _probability(probability: float) -> str:
+    return "probability below 1e-9" if probability < 1e-9 else f"probability {probability:.2g}"
+
+
+def _camera_lines(found: CameraDifference) -> list[str]:
+    u, v = found.at_px.tolist()
+    sigma = "" if found.p_value is None else f" ± {found.largest_sigma_px:.3f}"
+    degrees = ", ".join(f"{math.degrees(turn):+.4f}" for turn in found.turn_rad.tolist())
+    lines = [
+        f"largest difference {found.largest_px:.3f}{sigma} px, at ({u:.0f}, {v:.0f}); rms {found.rms_px:.3f} px",
+        f"a hand/eye calibration absorbs a turn by ({degrees}) degrees: {found.largest_turned_px:.3f} px are left",
+    ]
+    if found.p_value is not None:
+        lines.append(f"{_probability(found.p_value)} by chance")
+    if found.compared < 1.0:
+        lines.append(f"compared where both lenses map the image: {100.0 * found.compared:.0f} %")
+    return lines

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
     REQUIRED,
@@ -125,25 +126,27 @@ def _plan_lines(planned: Plan | None) -> list[str]:
     return [f"camera's position known to {1e3 * now[0]:.2f} mm, {more}; {turn}"]
 
 
+def _shown(values: Iterable[float], names: Iterable[str], sigmas: Mapping[str, float]) -> str:
+    """Lengths with their standard deviations, mm."""
+    return ", ".join(f"{1e3 * v:.2f} ± {1e3 * sigmas[f'{name}_m']:.2f}" for v, name in zip(values, names, strict=True))
+
+
+def _turned(names: Iterable[str], sigmas: Mapping[str, float]) -> str:
+    """Standard deviations of angles."""
+    return ", ".join(f"± {math.degrees(sigmas[f'{name}_rad']):.3f}" for name in names) + " deg"
+
+
 def _laser_lines(written: LaserCalibration) -> list[str]:
-    residuals, sigmas = written.residuals, written.sigmas
-
-    def shown(values: Any, keys: list[str]) -> str:
-        return ", ".join(f"{1e3 * v:.2f} ± {1e3 * sigmas[k]:.2f}" for v, k in zip(values, keys, strict=True))
-
-    def turned(keys: list[str]) -> str:
-        return "± " + ", ± ".join(f"{math.degrees(sigmas[key]):.3f}" for key in keys) + " deg"
-
-    position = [f"base_T_cam.{axis}_m" for axis in "xyz"]
+    residuals, sigmas, camera = written.residuals, written.sigmas, written.base_T_cam.translation_m
     spots = f"{residuals.used} of {residuals.spots} spots at {residuals.orientations} orientations"
     return [
         f"{spots}, RMS {residuals.rms_px:.3f} px; seed {written.provenance.seed}",
         *(f"  left out: {name}" for name in residuals.outliers),
         *(f"  {line}" for line in written.warnings),
-        f"camera in the base   {shown(written.base_T_cam.translation_m, position)} mm",
-        f"camera's rotation    {turned([f'base_T_cam.r{axis}_rad' for axis in 'xyz'])}",
-        f"plane from camera    {shown([written.plane.distance_cam_m], ['plane.distance_m'])} mm",
-        f"plane and beam tilt  {turned([f'{what}_rad' for what in _TILTS])}",
+        f"camera in the base   {_shown(camera, [f'base_T_cam.{axis}' for axis in 'xyz'], sigmas)} mm",
+        f"camera's rotation    {_turned([f'base_T_cam.r{axis}' for axis in 'xyz'], sigmas)}",
+        f"plane from camera    {_shown([written.plane.distance_cam_m], ['plane.distance'], sigmas)} mm",
+        f"plane and beam tilt  {_turned(_TILTS, sigmas)}",
     ]
 
 
@@ -192,10 +195,6 @@ def _robot_world_lines(written: RobotWorldCalibration) -> list[str]:
         *(f"  left out: {name}" for name in residuals.outliers),
     ]
     for name, transform in list(written.transforms.items())[:2]:
-        shown = ", ".join(
-            f"{1e3 * value:.2f} ± {1e3 * sigmas[f'{name}.{axis}_m']:.2f}"
-            for value, axis in zip(transform.translation_m, "xyz", strict=True)
-        )
-        turned = ", ".join(f"± {math.degrees(sigmas[f'{name}.r{axis}_rad']):.3f}" for axis in "xyz")
-        lines.append(f"{name:14s} {shown} mm; {turned} deg")
+        shown = _shown(transform.translation_m, [f"{name}.{axis}" for axis in "xyz"], sigmas)
+        lines.append(f"{name:14s} {shown} mm; {_turned([f'{name}.r{axis}' for axis in 'xyz'], sigmas)}")
     return lines

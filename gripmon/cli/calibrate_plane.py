@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import math
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, jaw_opening, jaw_range, note, progress_bar
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.plane import Coincidence
-    from gripmon.calibrate.plane_average import PlaneCalibration
     from gripmon.teach.hand_eye import HandEyeOnPlate
 
 _OPTIONS = """
@@ -99,10 +95,8 @@ def plane(arguments: Arguments) -> None:
     arguments.save("out", found.document(made, provenance))
     note(f"warning: {warning}" for warning in found.fit.warnings)
     notes = [*given.notes, *found.notes]
-    if arguments.json:
-        print(json.dumps({**found.values(), "notes": notes, "written": [str(path) for path in written]}, indent=2))
-    else:
-        print("\n".join([*_lines(found, notes), *(f"written: {path}" for path in written)]))
+    values = {**found.values(), "notes": notes, "written": [str(path) for path in written]}
+    arguments.answer(values, [*_lines(found, notes), *(f"written: {path}" for path in written)])
     arguments.save("picture", found.picture)
 
 
@@ -130,43 +124,10 @@ def _check_options(arguments: Arguments) -> None:
 
 def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:
     """What a person should know."""
-    fit = found.fit
-    width = max(len(image.sighting.name) for image in fit.images)
-    compared = any(image.tilt_rad is not None for image in fit.images)
-    apart = "  tilt about x, y          gap" if compared else ""
-    lines = [f"{'image':<{width}}  plate points     rms  corners  residual{apart}"]
-    lines += [_image_line(image, width) for image in fit.images]
-    lines += [f"note: {note}" for note in notes]
+    lines = [*found.fit.table(), *(f"note: {note}" for note in notes)]
     lines += [
         f"note: {image.coincidence.sighting.name}: {name} not measured: {reason}"
         for image in found.images
         for name, reason in image.missing.items()
     ]
-    if fit.consistency_p is not None:
-        lines.append(f"the images agree with each other: probability {fit.consistency_p:.2g} of differing as much")
-    sigma = (fit.covariance.diagonal() ** 0.5).tolist()
-    x, y, z = (1e3 * fit.cam_T_grip[:3, 3]).tolist()
-    sx, sy, sz = (1e3 * value for value in sigma[:3])
-    rx, ry, rz = (math.degrees(value) for value in sigma[3:])
-    lines.append(f"TCP in the camera frame  {x:.3f} {y:.3f} {z:.3f} mm  +- {sx:.4f} {sy:.4f} {sz:.4f} mm")
-    lines.append(f"rotation about x, y, z   +- {rx:.4f} {ry:.4f} {rz:.4f} degrees")
-    return [*lines, *([_lengths_line(fit)] if found.inferred else [])]
-
-
-def _image_line(image: Coincidence, width: int) -> str:
-    used, left_out = int(image.plate.used[0].sum()), int((~image.plate.used[0]).sum())
-    points = f"{used}" + (f" (-{left_out})" if left_out else "")
-    residual_mm = 1e3 * float((image.residuals_m**2).mean() ** 0.5)
-    apart = ""
-    if image.tilt_rad is not None and image.gap_m is not None:
-        tilt = [math.degrees(angle) for angle in image.tilt_rad.tolist()]
-        apart = f"  {tilt[0]:+.3f} {tilt[1]:+.3f} degrees   {1e3 * image.gap_m:+.4f} mm"
-    rms_px, corners = image.plate.rms_px, len(image.corners.names)
-    return f"{image.sighting.name:<{width}}  {points:>12} {rms_px:4.2f} px  {corners:7d} {residual_mm:6.4f} mm{apart}"
-
-
-def _lengths_line(result: PlaneCalibration) -> str:
-    sides = 2e3 * result.corners_m[3, :2]
-    sigma = 1e3 * result.lengths_covariance.diagonal()[:2] ** 0.5
-    apart, along = (f"{side:.3f} +- {error:.4f} mm" for side, error in zip(sides, sigma, strict=True))
-    return f"fingertips {apart} apart, innermost edges {along} long"
+    return lines + found.fit.summary()

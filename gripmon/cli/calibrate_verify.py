@@ -14,7 +14,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.verify import Calibrated, CameraDifference, HandEyeDifference, Verdict
+    from gripmon.calibrate.verify import Calibrated
 
 DEFAULT_LEVEL = 0.01
 
@@ -66,26 +66,23 @@ def verify(arguments: Arguments) -> int:
     share, such as the camera, makes differences look less significant than they are.
     """
     from gripmon.calibrate.api import verify
-    from gripmon.calibrate.verify import HandEyeDifference
     from gripmon.daemon.calibrations import read_calibrated
 
-    mm, deg, px = arguments.tolerance_mm, arguments.tolerance_deg, arguments.tolerance_px
-    if (mm is None) is not (deg is None):
+    tolerance_m, tolerance_rad = arguments.metres("tolerance_mm"), arguments.radians("tolerance_deg")
+    if (tolerance_m is None) is not (tolerance_rad is None):
         raise InputError("--tolerance-mm and --tolerance-deg: one without the other; both or none")
     first = read_calibrated(Path(arguments.a))
     second, doubts = _second(first, arguments)
     found = verify(
-        first, second, level=arguments.level, tolerance_m=None if mm is None else 1e-3 * mm,
-        tolerance_rad=None if deg is None else math.radians(deg), tolerance_px=px,
+        first, second, level=arguments.level, tolerance_m=tolerance_m, tolerance_rad=tolerance_rad,
+        tolerance_px=arguments.tolerance_px,
     )  # fmt: skip
     found = replace(found, warnings=(*doubts, *found.warnings))
-    given = mm is not None or px is not None
+    given = tolerance_m is not None or arguments.tolerance_px is not None
     if arguments.json:
         print(json.dumps(found.values() | {"within_tolerance": found.within if given else None}))
     else:
-        apart = found.difference
-        lines = _hand_eye_lines(apart) if isinstance(apart, HandEyeDifference) else _camera_lines(apart)
-        print("\n".join([*lines, *(f"warning: {w}" for w in found.warnings), _verdict(found, given=given)]))
+        print("\n".join(found.summary(given=given)))
     return EXIT_DONE if found.same else EXIT_FAILED
 
 
@@ -102,48 +99,3 @@ def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(Path(names[0])), ()
-
-
-def _verdict(found: Verdict, *, given: bool) -> str:
-    if found.same and found.within:
-        return "same: within the tolerance" if given else "same: the difference is negligible"
-    if not found.same and found.difference.p_value is None:
-        return "different: beyond the tolerance"
-    level = f"at a level of {found.level:g}"
-    return f"same (not told apart {level})" if found.same else f"different ({level})"
-
-
-def _hand_eye_lines(found: HandEyeDifference) -> list[str]:
-    shift_mm = 1e3 * math.hypot(*found.position_m.tolist())
-    turn_deg = math.degrees(math.hypot(*found.rotation_rad.tolist()))
-    lines = ["second less first, camera axes    " + "".join(f"{axis:<19}" for axis in "xyz").rstrip()]
-    rows = (
-        ("TCP (mm)", 1e3 * found.position_m, 1e3 * found.position_sigma_m),
-        ("rotation (deg)", found.rotation_rad * 180.0 / math.pi, found.rotation_sigma_rad * 180.0 / math.pi),
-    )
-    for name, values, sigmas in rows:
-        cells = "".join(f"{v:+9.4f} ± {s:<7.4f}" for v, s in zip(values.tolist(), sigmas.tolist(), strict=True))
-        lines.append(f"{name:<28}{cells}".rstrip())
-    turn = f"{turn_deg:.4f} degrees ({_chance(found.rotation_p)})"
-    lines.append(f"together {shift_mm:.4f} mm at the TCP ({_chance(found.position_p)}), {turn}")
-    lines.append(f"chi-square {found.chi2:.2f} of 6 degrees of freedom: {_chance(found.p_value)} by chance")
-    return lines
-
-
-def _chance(probability: float) -> str:
-    return "probability below 1e-9" if probability < 1e-9 else f"probability {probability:.2g}"
-
-
-def _camera_lines(found: CameraDifference) -> list[str]:
-    u, v = found.at_px.tolist()
-    sigma = "" if found.p_value is None else f" ± {found.largest_sigma_px:.3f}"
-    degrees = ", ".join(f"{math.degrees(turn):+.4f}" for turn in found.turn_rad.tolist())
-    lines = [
-        f"largest difference {found.largest_px:.3f}{sigma} px, at ({u:.0f}, {v:.0f}); rms {found.rms_px:.3f} px",
-        f"a hand/eye calibration absorbs a turn by ({degrees}) degrees: {found.largest_turned_px:.3f} px are left",
-    ]
-    if found.p_value is not None:
-        lines.append(f"{_chance(found.p_value)} by chance")
-    if found.compared < 1.0:
-        lines.append(f"compared where both lenses map the image: {100.0 * found.compared:.0f} %")
-    return lines

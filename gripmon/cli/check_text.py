@@ -10,7 +10,8 @@ from gripmon.model.units import in_degrees, in_mm
 
 if TYPE_CHECKING:
     from gripmon.daemon import forecast_values as forecasts
-    from gripmon.daemon.findings import Finding, Joined, Surroundings
+    from gripmon.daemon.findings import Finding, Surroundings
+    from gripmon.io.wire import Joining
 
 _POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
 _JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given
@@ -265,7 +266,7 @@ def surrounding_lines(around: Surroundings) -> list[str]:
     return [f"{name:<10} {text}" for name, text in sections.items()]
 
 
-def _zenoh_line(keys: str | None, session: Joined | None) -> str:
+def _zenoh_line(keys: str | None, session: Joining | None) -> str:
     if session is None:
         return "off"
     parts = [f"{keys}, {session.mode}"]

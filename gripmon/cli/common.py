@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import math
 import re
 import shlex
@@ -148,6 +149,20 @@ class Arguments(argparse.Namespace):
         for name in names:
             if getattr(self, name) not in (None, False):
                 raise InputError(f"{_option(name)}: {why}")
+
+    def answer(self, values: Mapping[str, Any], lines: Iterable[str]) -> None:
+        """Print the result: one JSON object with ``--json``, else lines for a person."""
+        print(json.dumps(values, indent=2) if self.json else "\n".join(lines))
+
+    def metres(self, name: str) -> float | None:
+        """What an option in millimetres says; None where it wasn't given."""
+        value_mm = getattr(self, name)
+        return None if value_mm is None else 1e-3 * float(value_mm)
+
+    def radians(self, name: str) -> float | None:
+        """What an option in degrees says; None where it wasn't given."""
+        value_deg = getattr(self, name)
+        return None if value_deg is None else math.radians(value_deg)
 
     def network(self) -> dict[str, Any]:
         """``--connect`` and ``--zenoh-config``, as the clients take them."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number, progress_bar, whole_number
 from gripmon.model.errors import InputError
@@ -77,8 +76,8 @@ def dataset(arguments: Arguments) -> int:
             workers=arguments.workers,
             address=arguments.address,
             level=arguments.level or 0.01,
-            tolerance_m=1e-3 * (arguments.tolerance_mm or 0.0),
-            tolerance_rad=math.radians(arguments.tolerance_deg or 0.0),
+            tolerance_m=arguments.metres("tolerance_mm") or 0.0,
+            tolerance_rad=arguments.radians("tolerance_deg") or 0.0,
             annotate=arguments.annotate,
             grippers=arguments.gripper or (),
             step=step,

@@ -25,7 +25,6 @@ from gripmon.model.errors import InputError
 from gripmon.model.stopping import signals_exit
 
 if TYPE_CHECKING:
-    from gripmon.analyse.comparison import Distribution, EventReport, TcpErrors
     from gripmon.daemon.simulated import DemoSummary, Latency
 
 _SHORTEST_S = 4.0
@@ -90,14 +89,9 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
     return "\n".join(
         [
             "",
-            f"{'TCP error against truth (mm)':<38}      across the optical axis           along it",
-            f"{'':<38}{'frames':>6}{'mean':>9}{'95 %':>8}{'max':>8}{'mean':>10}{'95 %':>8}{'max':>8}",
-            _error_row("without correction", comparison.without_correction),
-            _error_row("after correction", comparison.after_correction),
-            *(_error_row(f"  {_span(event)}", event.after_correction) for event in comparison.events),
-            _error_row("after correction, smoothed", comparison.smoothed),
+            *comparison.table(),
             "",
-            *(_event_line(event) for event in comparison.events),
+            *(event.text() for event in comparison.events),
             "",
             f"frames     {summary.frames} ({verdicts}), {summary.frames_dropped} dropped",
             f"Zenoh      {summary.transforms_received} transforms received",
@@ -130,26 +124,3 @@ def _latency_line(latency_ms: Latency) -> str:
     if latency_ms.median is None:
         return "—"
     return f"{latency_ms.median:.2f} ms median, {latency_ms.p99:.2f} ms 99 %"
-
-
-def _span(event: EventReport) -> str:
-    return f"{event.event} at {event.start_s:.1f} to {event.end_s:.1f} s"
-
-
-def _error_row(name: str, errors: TcpErrors) -> str:
-    return f"{name:<38}{errors.frames:>6} {_cells(errors.across_mm)}  {_cells(errors.along_mm)}"
-
-
-def _cells(values: Distribution) -> str:
-    return "".join("       —" if v is None else f"{v:8.4f}" for v in (values.mean, values.p95, values.max))
-
-
-def _event_line(event: EventReport) -> str:
-    moved = f"TCP up to {event.largest_tcp_shift_mm:.2f} mm off"
-    if event.noticed_after_s is None:
-        noticed = "rightly no alarm" if event.harmless else "NOT NOTICED"
-    else:
-        noticed = f"{'FALSE ALARM' if event.harmless else 'noticed'} after {event.noticed_after_s:.2f} s"
-    if event.alerts:
-        noticed += f": {', '.join(dict.fromkeys(event.alerts))}"
-    return f"{event.event:<10} {moved}; {event.valid} of {event.frames} frames valid; {noticed}"

@@ -120,11 +120,17 @@ def as_data(status: MonitorStatus) -> dict[str, Any]:
     return values | {"state_age_s": round(status.state_age_s, 3)}
 
 
+def local_time(stamp_ns: int) -> datetime.datetime | None:
+    """A stamp's local time; None for one from the network that is none."""
+    try:
+        return datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
 def clock(stamp_ns: int) -> str:
     """Local time of day with the date if that isn't today's; a stamp from the network may also be none."""
-    try:
-        when = datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
-    except (OverflowError, ValueError, OSError):
+    if (when := local_time(stamp_ns)) is None:
         return "at no time"
     today = when.date() == datetime.datetime.now().astimezone().date()
     return when.strftime("%H:%M:%S" if today else "%Y-%m-%d %H:%M:%S")

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
-from typing import TYPE_CHECKING, Any
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, positive_number, progress_bar
-
-if TYPE_CHECKING:
-    from gripmon.teach.from_images import GripperFromImages
 
 _OPTIONS = """
 IMAGE...                image file, or folder with images
@@ -94,19 +89,6 @@ def from_images(arguments: Arguments) -> None:
     arguments.save("reference_out", lambda: found.document(provenance))
     arguments.save("picture", found.picture)
     outputs = arguments.out, arguments.reference_out, arguments.picture
-    values = {**found.values(), "written": [str(path) for path in outputs if path is not None]}
-    print(json.dumps(values, indent=2) if arguments.json else "\n".join(_lines(found, values)))
-
-
-def _lines(found: GripperFromImages, values: dict[str, Any]) -> list[str]:
-    """What a person should know."""
-    lines = [f"left out: {file}: {why}" for file, why in found.left_out.items()]
-    for name, finger in values["fingers"].items():
-        corners, edges, inner = finger["corners"], finger["edges"], finger["inner_edges"]
-        lines.append(f"{name}: {edges} edges of its outline, {inner} inner ones, {corners} corners")
-    lines.append(f"outline known to {found.outline_sigma_px:.3f} px (median), by {found.images} images")
-    x, y, z = (1e3 * value for value in values["cam_T_grip"]["translation_m"])
-    sx, sy, sz = (1e3 * found.covariance[k, k] ** 0.5 for k in range(3))
-    lines.append(f"TCP in the camera frame  {x:.2f} {y:.2f} {z:.2f} mm  +- {sx:.2f} {sy:.2f} {sz:.2f} mm")
-    lines += [f"note: {note}" for note in found.notes]
-    return [*lines, *(f"written: {path}" for path in values["written"])]
+    written = [str(path) for path in outputs if path is not None]
+    lines = [*found.summary(), *(f"written: {path}" for path in written)]
+    arguments.answer({**found.values(), "written": written}, lines)

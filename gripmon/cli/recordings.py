@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
     REQUIRED,
@@ -21,9 +19,6 @@ from gripmon.cli.common import (
 )
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
-
-if TYPE_CHECKING:
-    from gripmon.analyse.api import CorrectedRun
 
 _REPORT_OPTIONS = """
 RECORDING...     .rrd files, folders of them with all below, or estimates.jsonl
@@ -105,10 +100,9 @@ def report(arguments: Arguments) -> None:
     arguments.check_outputs("out", *(() if to_stdout else ("json",)))
     from gripmon.analyse.api import report
 
-    limit_m = None if arguments.limit_mm is None else 1e-3 * arguments.limit_mm
-    limit_rad = None if arguments.limit_deg is None else math.radians(arguments.limit_deg)
+    limits = {"limit_m": arguments.metres("limit_mm"), "limit_rad": arguments.radians("limit_deg")}
     with reading_bar() as progress:
-        found = report(arguments.recording, limit_m=limit_m, limit_rad=limit_rad, progress=progress)
+        found = report(arguments.recording, **limits, progress=progress)
     note(f"report: {fault}" for fault in found.faults)
     if to_stdout:
         print(found.json().decode())
@@ -169,7 +163,7 @@ def correct(arguments: Arguments) -> None:
 
     done = correct(arguments.recording, arguments.out, stamps=arguments.stamps, progress=progress_bar)
     note(f"correct: {fault}" for fault in done.faults)
-    print("\n".join([*map(_corrected, done.runs), *(f"written: {path}" for path in done.written)]))
+    print("\n".join([*(run.summary() for run in done.runs), *(f"written: {path}" for path in done.written)]))
 
 
 @Command("view", "recordings in rerun's viewer, native or in a browser", _VIEW_OPTIONS, _VIEW_EXAMPLES, port=port)
@@ -178,17 +172,10 @@ def view(arguments: Arguments) -> int:
     on this machine, whose address is printed.  The files of one run appear as one recording.  It ends
     with Ctrl-C, or when the window is closed, and leaves nothing running.
     """
-    from gripmon.record.read import is_rrd, recording_files
+    from gripmon.record.read import rrd_files
     from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
 
-    files = recording_files(arguments.recording)
-    for path in files:
-        try:
-            wrong = "" if is_rrd(path) else "isn't a recording; an .rrd file of gripmon's"
-        except OSError as error:
-            wrong = f"can't be read ({error.strerror})"
-        if wrong:
-            raise InputError(f"{path}: {wrong}")
+    files = rrd_files(arguments.recording)
     if arguments.port is not None and not is_free(arguments.port):
         raise InputError(f"--port {arguments.port}: is in use on 127.0.0.1; another port, or none for any")
     try:
@@ -203,23 +190,3 @@ def view(arguments: Arguments) -> int:
     except ViewerError as error:
         raise NoResultError(f"view: {error}") from None
     return EXIT_DONE
-
-
-def _corrected(each: CorrectedRun) -> str:
-    import numpy as np
-
-    from gripmon.analyse.content import clock_time
-
-    correction = each.correction
-    sigma_um = 1e6 * float(np.median(np.sqrt(np.einsum("nii->ni", correction.covariance)[:, :3].sum(axis=1))))
-    count = len(correction.change_points)
-    points = f"{count} change point{'s' * (count != 1)}"
-    text = f"{each.name}: {len(correction.stamp_ns)} frames, {points}, TCP to {sigma_um:.1f} µm (1σ)"
-    for point in correction.change_points:
-        size_mm = 1e3 * float(np.linalg.norm(point.size[:3]))
-        turn_deg = np.degrees(float(np.linalg.norm(point.size[3:])))
-        spread_ms = 1e-6 * (point.latest_ns - point.earliest_ns)
-        seq = int(each.recording.frames.seq[point.index])
-        when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
-        text += f"\n  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°"
-    return text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import sys
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from gripmon.cli.common import (
     make_directory,
     positive_number,
 )
-from gripmon.cli.fleet_table import printable
+from gripmon.cli.fleet_table import local_time, printable
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
@@ -143,12 +142,10 @@ def _table(state: MonitorState) -> list[str]:
 
 
 def _line(reference: ReferenceRecord) -> str:
-    try:
-        when = datetime.datetime.fromtimestamp(1e-9 * reference.stamp_ns).astimezone().isoformat(" ", "seconds")
-    except (OverflowError, ValueError, OSError):  # it came from the network
-        when = "at no time"
+    when = local_time(reference.stamp_ns)
+    said = "at no time" if when is None else when.isoformat(" ", "seconds")
     origin = f"restores {reference.restores}" if reference.restores else f"by {reference.accepted_by}"
     step = ""
     if reference.inputs is not None:
         step = f", moved by {1e3 * reference.inputs.step_m:.3f} mm, cause {reference.cause.value}"
-    return f"{reference.revision:5d}  {reference.reference_id}  {when if reference.stamp_ns else '-'}  {origin}{step}"
+    return f"{reference.revision:5d}  {reference.reference_id}  {said if reference.stamp_ns else '-'}  {origin}{step}"

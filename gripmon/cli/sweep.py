@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import Arguments, progress_bar, two_numbers
@@ -63,7 +63,7 @@ def run(arguments: Arguments) -> int:
     grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
     with progress_bar(len(grid), "mount") as step:
         swept = sweep(config, grid, place_px, travel_m, step)
-    print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(_as_text(swept)))
+    arguments.answer(as_plain(swept), _as_text(swept))
     if arguments.picture is not None:
         drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
         arguments.save("picture", encoded(drawn, arguments.picture.suffix))
@@ -177,14 +177,8 @@ def _number(value: float, factor: float, digits: int) -> str:
 
 def _failing(ranked: list[Trial]) -> list[str]:
     """The commonest first reasons."""
-    counts: dict[str, int] = {}
-    for trial in ranked:
-        if trial.faults:
-            counts[trial.faults[0].kind] = counts.get(trial.faults[0].kind, 0) + 1
-    commonest = sorted(counts.items(), key=lambda item: -item[1])[:_REASONS_SHOWN]
-    return [
-        f"{'others' if k == 0 else '':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(commonest)
-    ]
+    kinds = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
+    return [f"{'' if k else 'others':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(kinds)]
 
 
 def _to_copy(best: Trial) -> list[str]:

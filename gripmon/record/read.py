@@ -19,25 +19,7 @@ from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 from gripmon.record.container import MAGIC, RrdFile, UnreadableFileError
 from gripmon.record.contents import Contents, LineFile, read_contents, read_lines
-from gripmon.record.recordings import Picture, Recording, Shot, decode_image
-from gripmon.record.table import FrameTable
-
-__all__ = [
-    "Collection",
-    "FrameTable",
-    "Picture",
-    "RecordedFrames",
-    "Recording",
-    "SeveralRunsError",
-    "Shot",
-    "UnusableError",
-    "decode_image",
-    "is_rrd",
-    "needed_recordings",
-    "open_recordings",
-    "recording_files",
-    "recordings_below",
-]
+from gripmon.record.recordings import Recording, Shot, decode_image
 
 Progress = Callable[[int, int], None]
 _SUFFIX, _LINES_SUFFIX = ".rrd", ".jsonl"
@@ -117,6 +99,19 @@ def is_rrd(path: Path) -> bool:
     """Whether a file begins as rerun's do.  OSError where it can't be read."""
     with path.open("rb") as file:
         return os.read(file.fileno(), len(MAGIC)) == MAGIC
+
+
+def rrd_files(paths: Sequence[Path]) -> list[Path]:
+    """The same where each has to be one of rerun's."""
+    files = recording_files(paths)
+    for path in files:
+        try:
+            wrong = "" if is_rrd(path) else "isn't a recording; an .rrd file of gripmon's"
+        except OSError as error:
+            wrong = f"can't be read ({error.strerror})"
+        if wrong:
+            raise InputError(f"{path}: {wrong}")
+    return files
 
 
 def recordings_below(folder: Path) -> list[Path]:

@@ -89,6 +89,18 @@ class GripperFromImages:
             "notes": self.notes,
         }
 
+    def summary(self) -> list[str]:
+        """What a person should know."""
+        lines = [f"left out: {file}: {why}" for file, why in self.left_out.items()]
+        for name, finger in self.values()["fingers"].items():
+            corners, edges, inner = finger["corners"], finger["edges"], finger["inner_edges"]
+            lines.append(f"{name}: {edges} edges of its outline, {inner} inner ones, {corners} corners")
+        lines.append(f"outline known to {self.outline_sigma_px:.3f} px (median), by {self.images} images")
+        x, y, z = (1e3 * value for value in self.cam_T_grip[:3, 3].tolist())
+        sx, sy, sz = (1e3 * self.covariance[k, k] ** 0.5 for k in range(3))
+        lines.append(f"TCP in the camera frame  {x:.2f} {y:.2f} {z:.2f} mm  +- {sx:.2f} {sy:.2f} {sz:.2f} mm")
+        return [*lines, *(f"note: {note}" for note in self.notes)]
+
     def document(self, provenance: Provenance) -> HandEyeCalibration:
         """The reference, as a file has it."""
         pixel_m = float(self.cam_T_grip[2, 3]) / self.lens.fx_px
