@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Unpack
 
 import msgspec
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
-from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import Loop
+from gripmon.daemon.neighbours import JawFeed
+from gripmon.daemon.snapshots import Newest
+from gripmon.daemon.supervised import Beside, Loop
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish import Publisher
+from gripmon.io.publish.publisher import Publisher
 from gripmon.io.sources import Source
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
-    Alert,
     Command,
     CommandReply,
     Frame,
@@ -29,7 +28,8 @@ from gripmon.model.records import (
     withheld,
 )
 from gripmon.model.stopping import StopRequest
-from gripmon.record.write import Recorder
+from gripmon.monitor import Monitor
+from gripmon.record.recorder import Recorder
 
 KEEP_LAST_EVERY_S = 60.0
 """How old the last transform that is kept may be; references and alerts are kept when they change."""
@@ -40,27 +40,19 @@ class Daemon(Loop):
 
     def __init__(
         self,
-        monitor: MonitorLike,
+        monitor: Monitor,
         source: Source,
         publisher: Publisher,
         recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
         *,
-        robot: str,
-        camera: str,
         estimates: EstimatesFile,
         jaw: JawFeed | None = None,
         keeper: StateKeeper | None = None,
-        commands: CommandFeed | None = None,
-        snapshots: Snapshots | None = None,
-        reports: Reports | None = None,
-        notices: Sequence[Alert] = (),
+        **beside: Unpack[Beside],
     ) -> None:
-        super().__init__(
-            source, publisher, recorder, settings, stop,
-            robot=robot, camera=camera, commands=commands, snapshots=snapshots, reports=reports, notices=notices,
-        )  # fmt: skip
+        super().__init__(source, publisher, recorder, settings, stop, **beside)
         self._monitor = monitor
         self._publisher = publisher
         self._estimates = estimates

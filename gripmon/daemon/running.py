@@ -13,22 +13,25 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Unpack
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.loop import Daemon
-from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFeed, Reports
+from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.snapshots import Snapshots
+from gripmon.daemon.supervised import Beside
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
+from gripmon.io.publish.inputs import ZenohPulses
+from gripmon.io.publish.publisher import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
 from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
-from gripmon.model.records import Alert, FrameRecord, Outlines
+from gripmon.model.records import FrameRecord, Outlines
 from gripmon.model.stopping import StopRequest, signals_request
-from gripmon.record.write import Recorder
+from gripmon.monitor import Monitor
+from gripmon.record.recorder import Recorder
 
 _UNHURRIED_S = 10.0  # for the recording, when no one asked for a stop
 _SHORTEST_CLOSE_S = 0.5
@@ -36,23 +39,19 @@ _SWITCH_INTERVAL_S = 0.0005
 
 
 def run(
-    monitor: MonitorLike,
+    monitor: Monitor,
     source: Source,
     publisher: Publisher,
     recorder: Recorder,
     settings: DaemonSettings,
     *,
-    robot: str,
-    camera: str,
     estimates: Path | None = None,
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
-    commands: CommandFeed | None = None,
-    reports: Reports | None = None,
-    notices: Sequence[Alert] = (),
     duration_s: float | None = None,
     stop: StopRequest | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
+    **beside: Unpack[Beside],
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
@@ -66,16 +65,11 @@ def run(
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
     """
-    with _closing(source, publisher, recorder, settings, estimates, stop, keeper, outlines) as opened:
-        own = _faults(jaw, recorder, opened.lines, keeper)
-        reports = reports or Reports()
-        daemon = Daemon(
-            monitor, source, publisher, recorder, settings, opened.stop,
-            robot=robot, camera=camera, estimates=opened.lines, jaw=jaw, keeper=keeper, commands=commands,
-            snapshots=opened.snapshots, reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
-        )  # fmt: skip
-        with _steady_interpreter():
-            return daemon.run(duration_s)
+    stop = stop or StopRequest()
+    with _closing(source, publisher, recorder, settings, estimates, stop, beside, jaw, keeper, outlines) as lines:
+        return Daemon(
+            monitor, source, publisher, recorder, settings, stop, estimates=lines, jaw=jaw, keeper=keeper, **beside
+        ).run(duration_s)
 
 
 def run_second(
@@ -85,41 +79,24 @@ def run_second(
     recorder: Recorder,
     settings: DaemonSettings,
     *,
-    robot: str,
-    camera: str,
     lines: Path | None = None,
     table: Sequence[ReportedPulse] = (),
-    feed: PulseFeed | None = None,
+    feed: ZenohPulses | None = None,
     no_spot_alert_after_s: float | None = None,
-    commands: CommandFeed | None = None,
-    reports: Reports | None = None,
-    notices: Sequence[Alert] = (),
     duration_s: float | None = None,
     stop: StopRequest | None = None,
+    **beside: Unpack[Beside],
 ) -> int:
     """The same for a second camera: see :class:`SecondCamera`.  ``lines`` is a file that gets one JSON line a pulse.
 
     Returns the exit code: also 3 if there were pulses and none showed its spot.
     """
-    with _closing(source, publisher, recorder, settings, lines, stop) as opened:
-        own = _faults(None, recorder, opened.lines, None)
-        reports = reports or Reports()
-        daemon = SecondCamera(
-            pulsed, source, publisher, recorder, settings, opened.stop,
-            robot=robot, camera=camera, lines=opened.lines, table=table, feed=feed,
-            no_spot_alert_after_s=no_spot_alert_after_s, commands=commands, snapshots=opened.snapshots,
-            reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
-        )  # fmt: skip
-        with _steady_interpreter():
-            return daemon.run(duration_s)
-
-
-class _Opened(NamedTuple):
-    """What a loop has for as long as it runs."""
-
-    stop: StopRequest
-    lines: EstimatesFile
-    snapshots: Snapshots
+    stop = stop or StopRequest()
+    with _closing(source, publisher, recorder, settings, lines, stop, beside) as file:
+        return SecondCamera(
+            pulsed, source, publisher, recorder, settings, stop,
+            lines=file, table=table, feed=feed, no_spot_alert_after_s=no_spot_alert_after_s, **beside,
+        ).run(duration_s)  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -129,12 +106,16 @@ def _closing(
     recorder: Recorder,
     settings: DaemonSettings,
     lines: Path | None,
-    stop: StopRequest | None,
+    stop: StopRequest,
+    beside: Beside,
+    jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
-) -> Iterator[_Opened]:
-    """Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that."""
-    stop = stop or StopRequest()
+) -> Iterator[EstimatesFile]:
+    """The file for lines; ``beside`` gets what is wrong with all of these to report, and what makes snapshots.
+
+    Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that.
+    """
     with signals_request(stop), contextlib.ExitStack() as closing:
         # All of these run, the last one first.
         if keeper is not None:
@@ -143,17 +124,14 @@ def _closing(
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(source.close)
         file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
-        snapshots = closing.enter_context(contextlib.closing(Snapshots(outlines)))
-        yield _Opened(stop, file, snapshots)
-
-
-def _faults(
-    jaw: JawFeed | None, recorder: Recorder, lines: EstimatesFile, keeper: StateKeeper | None
-) -> list[Callable[[], str | None]]:
-    """Whom to ask what is wrong, in the order in which it is said."""
-    faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
-    faults += [lambda: recorder.failure, lambda: lines.failure]
-    return faults if keeper is None else [*faults, lambda: keeper.failure]
+        beside["snapshots"] = closing.enter_context(contextlib.closing(Snapshots(outlines)))
+        faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
+        faults += [lambda: recorder.failure, lambda: file.failure]
+        faults += [] if keeper is None else [lambda: keeper.failure]
+        reports = beside.get("reports") or Reports()
+        beside["reports"] = replace(reports, faults=(*faults, *reports.faults))
+        with _steady_interpreter():
+            yield file
 
 
 def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:

@@ -6,15 +6,16 @@ import logging
 import math
 import time
 from collections.abc import Iterable, Sequence
+from typing import Unpack
 
 import msgspec
 
 from gripmon.daemon.estimates import EstimatesFile
-from gripmon.daemon.neighbours import CommandFeed, PulseFeed, Reports
-from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import Loop
+from gripmon.daemon.snapshots import Newest
+from gripmon.daemon.supervised import Beside, Loop
 from gripmon.daemon.watch import DaemonSettings, Judged
-from gripmon.io.publish import SpotPublisher
+from gripmon.io.publish.inputs import ZenohPulses
+from gripmon.io.publish.publisher import SpotPublisher
 from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.matching import ReportedPulse, Shown
@@ -37,7 +38,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import Recorder
+from gripmon.record.recorder import Recorder
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
@@ -61,25 +62,17 @@ class SecondCamera(Loop):
         settings: DaemonSettings,
         stop: StopRequest,
         *,
-        robot: str,
-        camera: str,
         lines: EstimatesFile,
         table: Sequence[ReportedPulse] = (),
-        feed: PulseFeed | None = None,
+        feed: ZenohPulses | None = None,
         no_spot_alert_after_s: float | None = None,
-        commands: CommandFeed | None = None,
-        snapshots: Snapshots | None = None,
-        reports: Reports | None = None,
-        notices: Sequence[Alert] = (),
+        **beside: Unpack[Beside],
     ) -> None:
         """``table``: all pulses of recorded frames; ``feed``: where they come from otherwise.
 
         ``no_spot_alert_after_s``: without a spot that is believed for so long there is an alert; None: never.
         """
-        super().__init__(
-            source, publisher, recorder, settings, stop,
-            robot=robot, camera=camera, commands=commands, snapshots=snapshots, reports=reports, notices=notices,
-        )  # fmt: skip
+        super().__init__(source, publisher, recorder, settings, stop, **beside)
         self._pulsed = pulsed
         self._publisher, self._lines = publisher, lines
         self._table, self._feed = table, feed

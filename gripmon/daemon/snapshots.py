@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.daemon.neighbours import Asked
+from gripmon.io.publish.commands import PendingCommand
 from gripmon.io.publish.presence import CLOSE_WITHIN_S
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
@@ -51,7 +51,7 @@ class Newest(NamedTuple):
 
 
 class _Job(NamedTuple):
-    asked: Asked
+    asked: PendingCommand
     reply: CommandReply
     newest: Newest
     asked_s: float
@@ -65,7 +65,7 @@ class Snapshots:
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
 
-    def answer(self, asked: Asked, reply: CommandReply, newest: Newest | None) -> None:
+    def answer(self, asked: PendingCommand, reply: CommandReply, newest: Newest | None) -> None:
         """Send the reply with the newest frame and its record, soon; without one it is refused."""
         if newest is None:
             asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))

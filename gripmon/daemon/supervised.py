@@ -8,17 +8,18 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, Required, TypedDict, TypeVar
 
 import msgspec
 
 from gripmon import __version__
-from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
+from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
-from gripmon.io.publish import StatePublisher
+from gripmon.io.publish.commands import PendingCommand, ZenohCommands
 from gripmon.io.publish.presence import in_words
+from gripmon.io.publish.publisher import StatePublisher
 from gripmon.io.sources import Source, Waiting
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
@@ -42,7 +43,8 @@ from gripmon.model.records import (
     accepting,
 )
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.write import ROOM_POLL_S, Recorder
+from gripmon.record.recorder import Recorder
+from gripmon.record.write import ROOM_POLL_S
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -52,6 +54,17 @@ _RESTS_FOR = 3.0
 """After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
+
+
+class Beside(TypedDict, total=False):
+    """Keywords of every :class:`Loop`."""
+
+    robot: Required[str]
+    camera: Required[str]
+    commands: ZenohCommands | None
+    snapshots: Snapshots | None
+    reports: Reports | None
+    notices: Sequence[Alert]
 
 
 class Loop(ABC):
@@ -70,7 +83,7 @@ class Loop(ABC):
         *,
         robot: str,
         camera: str,
-        commands: CommandFeed | None = None,
+        commands: ZenohCommands | None = None,
         snapshots: Snapshots | None = None,
         reports: Reports | None = None,
         notices: Sequence[Alert] = (),
@@ -195,7 +208,7 @@ class Loop(ABC):
         now_s = time.monotonic()
         self._next_command_s = now_s + _RESTS_FOR * (now_s - begun_s)
 
-    def _carry_out_and_answer(self, asked: Asked) -> None:
+    def _carry_out_and_answer(self, asked: PendingCommand) -> None:
         command, answer = asked.command, None
         stamp_ns = time.time_ns()
         try:
