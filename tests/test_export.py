@@ -34,7 +34,7 @@ from gripmon.model.records import (
 )
 from gripmon.model.records.recorded import Meta, RecordedCommand
 from gripmon.record.export import ROWS_A_GROUP, SCHEMAS, Exporter
-from gripmon.record.read import FrameTable
+from gripmon.record.table import FrameTable
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
 DUCKDB, POLARS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

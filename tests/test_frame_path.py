@@ -14,12 +14,12 @@ from support.loopback import free_endpoint
 import gripmon
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.running import run
-from gripmon.io.publish import ZenohPublisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor
-from gripmon.record.write import Recorder
+from gripmon.record.recorder import Recorder
 from gripmon.simulate import Scenario, Simulator
 
 COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames

@@ -12,8 +12,14 @@ import pytest
 import zenoh
 from support.loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.io.publish import ZenohJaw
-from gripmon.io.publish.inputs import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints
+from gripmon.io.publish.inputs import (
+    MOST_REPORTS,
+    DecodeOpening,
+    Reported,
+    StampedOpenings,
+    ZenohJaw,
+    opening_of_joints,
+)
 from gripmon.io.ros2.names import subscription_key
 from gripmon.io.ros2.node import JOINT_STATE, JointOpening, type_hash, typestore
 from gripmon.io.wire import Link, PublishSettings, link

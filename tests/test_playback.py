@@ -26,7 +26,9 @@ from support.playback_runs import (
 from support.recorded import REFERENCE, frame, image, record, trace, wait_until
 
 from gripmon.model.records import to_json
-from gripmon.record.read import FrameTable, Recording, decode_image, open_recordings, recordings_below
+from gripmon.record.read import open_recordings, recordings_below
+from gripmon.record.recordings import Recording, decode_image
+from gripmon.record.table import FrameTable
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,9 @@ from support.playback_runs import (
 from support.recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
 
 from gripmon.model.records import FrameRecord, State, Verdict, to_json
-from gripmon.record.read import Collection, FrameTable, Recording, open_recordings
+from gripmon.record.read import Collection, open_recordings
+from gripmon.record.recordings import Recording
+from gripmon.record.table import FrameTable
 
 
 @pytest.fixture(scope="module")

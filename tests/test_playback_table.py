@@ -12,8 +12,8 @@ from support.recorded import record
 
 from gripmon.model.geometry import from_record
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
-from gripmon.record.read import FrameTable, open_recordings
-from gripmon.record.table import TableBuilder
+from gripmon.record.read import open_recordings
+from gripmon.record.table import FrameTable, TableBuilder
 
 
 @pytest.fixture(scope="module")

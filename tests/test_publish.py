@@ -22,7 +22,7 @@ from support.loopback import (
 )
 from support.published import Published
 
-from gripmon.io.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
+from gripmon.io.publish.publisher import NullPublisher, Publisher, SpotPublisher, StatePublisher
 from gripmon.io.wire import Keys, PublishError, PublishSettings
 from gripmon.model.records import Verdict
 

@@ -40,7 +40,8 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.record.write import Recorder, RecordingSettings, open_recorder
+from gripmon.record.recorder import Recorder, RecordingSettings
+from gripmon.record.write import open_recorder
 
 COUNT = 24
 JUMP = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")

@@ -32,8 +32,8 @@ from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cau
 from gripmon.record.columns import Picture, Row
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import Moments, PictureRing, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
-from gripmon.record.recorder import make_scene
-from gripmon.record.write import ProcessRecorder, RecordingSettings
+from gripmon.record.recorder import RecordingSettings, make_scene
+from gripmon.record.write import ProcessRecorder
 
 BUMP = Alert(
     AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved by 4.5 mm", AlertEvent.RAISED, "1-abc", since_ns=1

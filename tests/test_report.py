@@ -30,7 +30,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.model.records.recorded import RecordedFile
-from gripmon.record.read import Picture
+from gripmon.record.recordings import Picture
 
 SECOND_NS = 1_000_000_000
 

@@ -23,7 +23,7 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish import Publishers
+from gripmon.io.publish.publisher import Publishers
 from gripmon.io.ros2.names import Layout, NodeName, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.wire import Link, PublishSettings

@@ -24,7 +24,8 @@ from support.sample_messages import SAMPLES, payload
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.daemon.fleet_page import FleetSite, Order
-from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
+from gripmon.io.publish.inputs import ZenohPulses
+from gripmon.io.publish.publisher import ZenohSpotPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.io.wire.session import load_file
 from gripmon.model.records import CommandName, CommandReply

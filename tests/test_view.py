@@ -29,7 +29,8 @@ from support.network_daemon import ENVIRONMENT
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.record.write import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
+from gripmon.record.recorder import RecordingSettings, ViewSettings
+from gripmon.record.write import ProcessRecorder, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"
 MAGENTA = (255, 0, 255)

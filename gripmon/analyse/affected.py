@@ -20,7 +20,8 @@ from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS, Track, displacement
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Array
-from gripmon.record.read import FrameTable, Recording
+from gripmon.record.recordings import Recording
+from gripmon.record.table import FrameTable
 
 _MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
 _RELIEF = 0.8  # of the limit, below which it is over

@@ -31,7 +31,8 @@ from gripmon.analyse.summary import headline, paragraph
 from gripmon.analyse.track import SECOND_NS, Clock, Track, curves_of, displacement, make_track, straightened
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import AlertKind, Array, ReferenceRecord, StateRecord, Verdict
-from gripmon.record.read import FrameTable, Recording
+from gripmon.record.recordings import Recording
+from gripmon.record.table import FrameTable
 
 _END_FRAMES = 15
 _OVERLAY_FRAMES = 6

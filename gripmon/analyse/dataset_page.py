@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Sequence
-from importlib import resources
 from typing import Any
 
 import numpy as np
 
-from gripmon.analyse.content import count, degrees, millimetres, percent
+from gripmon.analyse.content import count
 from gripmon.analyse.dataset import Journal, Line, Written, matrices, moved
+from gripmon.analyse.page import rendered
 from gripmon.model.records import Verdict
 
 _MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
@@ -20,7 +20,6 @@ _MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
 
 def page(written: Written, journal: Journal, name: str) -> bytes:
     """The whole page, UTF-8, without need of a network."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
     from gripmon.analyse.plots import as_json, mountings_figure
@@ -33,13 +32,9 @@ def page(written: Written, journal: Journal, name: str) -> bytes:
         camera: as_json(mountings_figure(*_points(written, camera)))
         for camera in sorted({line.camera for line, m in zip(lines, written.mountings, strict=True) if m >= 0})
     }
-    files = resources.files("gripmon.analyse") / "web"
-    environment = Environment(
-        loader=PackageLoader("gripmon.analyse", "web"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    environment.globals.update({"millimetres": millimetres, "degrees": degrees, "percent": percent, "count": count})
     failed = Counter(line.fault.partition(";")[0] for line in lines if line.fault is not None)
-    text = environment.get_template("dataset.html.j2").render(
+    return rendered(
+        "dataset.html.j2",
         name=name,
         summary=_summary(written, episodes),
         mountings=_mountings(written),
@@ -48,14 +43,12 @@ def page(written: Written, journal: Journal, name: str) -> bytes:
         most_rows=_MOST_ROWS,
         figures=figures,
         plotly=get_plotlyjs() if figures else "",
-        style=(files / "style.css").read_text("utf-8"),
     )
-    return text.encode("utf-8", "replace")
 
 
 def _summary(written: Written, episodes: dict[str, list[Line]]) -> str:
     good = [any(s.stretch and s.stretch.verdict == Verdict.VALID for s in each) for each in episodes.values()]
-    went = sum(_moved(each) for each in episodes.values())
+    went = sum(moved([s.stretch for s in each if s.stretch is not None]) for each in episodes.values())
     cameras = {line.camera for line in written.lines}
     pairs = {(line.camera, int(m)) for line, m in zip(written.lines, written.mountings, strict=True) if m >= 0}
     return (
@@ -63,10 +56,6 @@ def _summary(written: Written, episodes: dict[str, list[Line]]) -> str:
         f"may be used, {len(good) - sum(good) or 'none'} without one; {count(len(pairs), 'mounting')}; "
         f"the camera moved in {went or 'none'} of them."
     )
-
-
-def _moved(lines: Sequence[Line]) -> bool:
-    return moved([line.stretch for line in lines if line.stretch is not None])
 
 
 def _badness(lines: Sequence[Line]) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from gripmon.analyse.events import MOTIONS, AlertHistory, TimedAlert, explained,
 from gripmon.analyse.track import SECOND_NS, Track, displacement
 from gripmon.analyse.vectors import MIN_FRAMES
 from gripmon.model.records import AlertKind, Array, Severity
-from gripmon.record.read import Recording
+from gripmon.record.recordings import Recording
 
 _SIDE_FRAMES = 15  # that a level is the median of
 _SETTLED = 0.95

@@ -36,11 +36,12 @@ from gripmon.analyse.content import (
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.summary import CAUSES, cause_words
 from gripmon.model.records import AlertKind, CauseWeight, LookNote, Origin
-from gripmon.record.read import Picture
+from gripmon.record.recordings import Picture
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all alerts
 _MOST_ROWS = 400
 _AROUND_S = 3.0
+_WEB = resources.files("gripmon.analyse") / "web"
 _RANK = {"error": 2, "warning": 1, "info": 0}
 
 
@@ -49,7 +50,6 @@ def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] 
 
     ``analysed`` belongs to ``report``'s recordings, in their order: pictures come from there.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
     from gripmon.analyse.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
@@ -67,16 +67,8 @@ def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] 
         for event in _cards(each.report.events):
             shown[n, event.number] = _pictures(each, event)
         step()
-    environment = Environment(
-        loader=PackageLoader("gripmon.analyse", "web"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    environment.globals.update({function.__name__.removeprefix("_"): function for function in _FUNCTIONS})
-    environment.filters["units"] = _with_units
-    files = resources.files("gripmon.analyse") / "web"
-    text = environment.get_template("report.html.j2").render(
+    return rendered(
+        "report.html.j2",
         report=report,
         title=_title(report),
         overview=len(analysed) > 1,
@@ -87,10 +79,21 @@ def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] 
         has_pictures=lambda n: any(any(each) for (k, _), each in shown.items() if k == n),
         most_rows=_MOST_ROWS,
         plotly=get_plotlyjs(),
-        style=(files / "style.css").read_text("utf-8"),
-        script=(files / "page.js").read_text("utf-8"),
+        script=(_WEB / "page.js").read_text("utf-8"),
     )
-    return text.encode("utf-8", "replace")
+
+
+def rendered(template: str, **values: Any) -> bytes:
+    """A page by its template, UTF-8, with the functions and the style that all of them have."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("gripmon.analyse", "web"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    environment.globals.update({function.__name__.removeprefix("_"): function for function in _FUNCTIONS})
+    environment.filters["units"] = _with_units
+    style = (_WEB / "style.css").read_text("utf-8")
+    return environment.get_template(template).render(style=style, **values).encode("utf-8", "replace")
 
 
 def _title(report: Report) -> str:
@@ -254,16 +257,13 @@ def cut_alike(
     if not there:
         return tuple(None for _ in pictures)
     height, width = there[0].image.shape[:2]
-    box = _box([points for picture in there for points in _points(picture)], width, height)
+    shown = (points for p in there for points in (*p.predicted_edges, p.edges_used, _corners(p)))
+    box = _box(list(shown), width, height)
     first = pictures[0]
     outline = () if first is None else tuple(first.picture.predicted_edges)
     return tuple(
         None if each is None else _shown(each, box, () if each is first else outline, look) for each in pictures
     )
-
-
-def _points(picture: Picture) -> list[Points]:
-    return [*picture.predicted_edges, picture.edges_used, _corners(picture)]
 
 
 def _corners(picture: Picture) -> Points:

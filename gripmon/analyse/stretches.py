@@ -19,7 +19,7 @@ from gripmon.analyse.vectors import to_vectors
 from gripmon.calibrate.verify import CHANCE, compare_hand_eye, mean_of_one_scene
 from gripmon.model.geometry import to_record
 from gripmon.model.records import Alert, Array, Verdict
-from gripmon.record.read import FrameTable
+from gripmon.record.table import FrameTable
 
 _NUMBER = re.compile(r"\d[\d.e+-]*")
 Bools = NDArray[np.bool_]

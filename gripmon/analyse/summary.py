@@ -166,7 +166,8 @@ def _lost(report: RecordingReport) -> str:
     if running.gaps:
         parts.append(f"{count(running.gaps, 'pause')} without frames, the longest {duration(running.longest_gap_s)}")
     if not parts:
-        return "Nothing was lost: every frame has a valid transform." if _all_valid(report) else ""
+        all_valid = [share.name for share in running.verdicts] == ["valid"]
+        return "Nothing was lost: every frame has a valid transform." if all_valid else ""
     return f"Lost: {_and(parts)}."
 
 
@@ -175,10 +176,6 @@ def _why_missing(report: RecordingReport) -> str:
     known = ((report.running.monitor_dropped, "the monitor"), (report.running.recording_dropped, "the recorder"))
     reasons = [f"{who} was too busy for {number}" for number, who in known if number]
     return f"{are} ({_and(reasons)})" if reasons else are
-
-
-def _all_valid(report: RecordingReport) -> bool:
-    return [share.name for share in report.running.verdicts] == ["valid"]
 
 
 def _and(parts: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from gripmon.analyse.content import COVERAGE, Curve, Displacement, clock_time
 from gripmon.model.records import Array, ReferenceRecord
 
 if TYPE_CHECKING:
-    from gripmon.record.read import FrameTable
+    from gripmon.record.table import FrameTable
 
 
 _BASE_FRAMES = 20

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.smoothing import Bools, Ints, Smoothed
+from gripmon.analyse.smoothing import Bools, Ints, Smoothed, mean_squares, step_of
 from gripmon.model.geometry import skew
 from gripmon.model.records import Array
 
@@ -45,9 +45,7 @@ class Run:
     @property
     def frame_s(self) -> float:
         """Usual interval of the frames that were measured."""
-        steps = np.diff(self.time_s[self.usable])
-        steps = steps[steps > 0.0]
-        return float(np.median(steps)) if len(steps) else 1.0
+        return step_of(self.time_s[self.usable])
 
 
 def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bools) -> Run:
@@ -206,18 +204,14 @@ class Blocks:
         if self._size == 1:
             return np.zeros(6)
         number = np.repeat(np.arange(len(self._at)), self._count.astype(int))
-        off = (self._y - self.mean[number]) ** 2
+        off = self._y - self.mean[number]
         full = self._count[number] == self._size
-        off = off[full] if full.any() else off
-        inside = off <= np.quantile(off, 0.98, axis=0)
-        return np.asarray((off * inside).sum(axis=0) / inside.sum(axis=0) / 0.8735)
+        return mean_squares(off[full] if full.any() else off, trimmed=True)
 
 
 def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
     """Times with more of them in long gaps, and before the first and after the last block; where the blocks are."""
-    steps = np.diff(time_s)
-    steps = steps[steps > 0.0]
-    usual = float(np.median(steps)) if len(steps) else 1.0
+    usual = step_of(time_s)
     extra = []
     edges = np.concatenate([[min(run.time_s[0], time_s[0])], time_s, [max(run.time_s[-1], time_s[-1])]])
     for begin, end in pairwise(edges.tolist()):

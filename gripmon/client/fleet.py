@@ -21,14 +21,13 @@ from gripmon.client.asking import Asker, NotCarriedOut
 from gripmon.client.network import (
     Listener,
     MonitorName,
-    in_zenohs_thread,
     monitor_name,
     named_as_arguments,
     reader_settings,
     start_of,
     where_of,
 )
-from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
+from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, in_zenohs_thread
 from gripmon.model.records import (
     AlertRecord,
     CommandName,

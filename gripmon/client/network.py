@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple, Self, TypeVar
 
-import zenoh
-
 from gripmon.io.wire import PublishError, PublishSettings
 
 _ARGUMENTS = {"zenoh_config": "zenoh_config_file"}
@@ -44,11 +42,6 @@ def monitor_name(key: object) -> MonitorName:
     """Who a message on this key, ``gripmon/<robot>/<camera>/…``, is from."""
     _, robot, camera, *_ = str(key).split("/")
     return MonitorName(robot, camera)
-
-
-def in_zenohs_thread(take: Callable[[_T], None]) -> zenoh.handlers.Callback[_T]:
-    """A callback in Zenoh's own threads: one of Python's would keep a program that forgot ``close()`` from ending."""
-    return zenoh.handlers.Callback(take, indirect=False)
 
 
 def reader_settings(connect: str | Sequence[str], zenoh_config_file: str | None) -> PublishSettings:

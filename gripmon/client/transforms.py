@@ -13,16 +13,9 @@ from typing import Self
 import zenoh
 
 from gripmon.client.inbox import Entry, Inbox, Sent
-from gripmon.client.network import (
-    Listener,
-    in_zenohs_thread,
-    monitor_name,
-    named_as_arguments,
-    reader_settings,
-    start_of,
-)
+from gripmon.client.network import Listener, monitor_name, named_as_arguments, reader_settings, start_of
 from gripmon.client.reading import NotUsable, Policy, Reading, judge
-from gripmon.io.wire import CLOCK_PARAMETER, DEFAULT_ENDPOINT, Keys, Link, steady_ns
+from gripmon.io.wire import CLOCK_PARAMETER, DEFAULT_ENDPOINT, Keys, Link, in_zenohs_thread, steady_ns
 from gripmon.model.records import ClockReading, MessageRefused, Verdict, from_json
 
 ASK_EVERY_S = 1.0

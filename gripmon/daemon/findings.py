@@ -29,7 +29,7 @@ from gripmon.daemon.forecast_values import (
 )
 from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
-from gripmon.io.wire import Keys
+from gripmon.io.wire import Joining, Keys
 from gripmon.laser.report import expectation
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.teach.accuracy import UNTOLD_BEVEL_M
@@ -50,15 +50,6 @@ class Finding(NamedTuple):
     text: str
 
 
-class Joined(msgspec.Struct, frozen=True):
-    """How the monitor would join the network; ``file``: the one of Zenoh's that says so."""
-
-    mode: str
-    listen: tuple[str, ...]
-    connect: tuple[str, ...]
-    file: str | None
-
-
 class SourceReport(msgspec.Struct, frozen=True):
     """Whether frames can come from the source now (``reachable`` None: only starting it would show); ``odd``: what is
     strange about it.
@@ -76,7 +67,7 @@ class Surroundings(msgspec.Struct, frozen=True):
     keys: str | None
     recording: str | None
     metrics: str | None
-    zenoh: Joined | None
+    zenoh: Joining | None
     source: SourceReport
 
 
@@ -99,7 +90,9 @@ class Checked:
     def findings(self) -> list[Finding]:
         """What to know of the configuration before it runs."""
         about = _of_wrist(self.forecast) if self.forecast is not None else _of_second(self.second or {})
-        found = [_source(self.around.source), *about, _network(self.around.keys)]
+        keys = self.around.keys
+        network = Finding("OK", "network", "off" if keys is None else f"Zenoh keys {keys}…")
+        found = [_source(self.around.source), *about, network]
         return [each for each in found if each is not None]
 
 
@@ -123,15 +116,12 @@ def _look_around(config: Config | SecondConfig) -> Surroundings:
     can be read.
     """
     settings, metrics = config.settings, config.settings.metrics
-    joining, joined = check_network(config), None
-    if joining is not None:
-        file = None if joining.file is None else str(joining.file)
-        joined = Joined(joining.mode, joining.listen, joining.connect, file)
+    joining = check_network(config)
     return Surroundings(
         keys=f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         recording=settings.recording.directory if settings.recording.enabled else None,
         metrics=f"http://{metrics.address}:{metrics.port}/metrics" if metrics.enabled else None,
-        zenoh=joined,
+        zenoh=joining,
         source=_source_report(config),
     )
 
@@ -294,11 +284,11 @@ def past_limit(certainty: OpeningCertainty) -> str | None:
         elif past:
             spans.append([opening_m, opening_m])
         before = past
-    return " and ".join(_span(1e3 * low, 1e3 * high) for low, high in spans) or None
-
-
-def _span(low_mm: float, high_mm: float) -> str:
-    return f"at {low_mm:.1f} mm" if low_mm == high_mm else f"from {low_mm:.1f} to {high_mm:.1f} mm"
+    texts = (
+        f"at {1e3 * low:.1f} mm" if low == high else f"from {1e3 * low:.1f} to {1e3 * high:.1f} mm"
+        for low, high in spans
+    )
+    return " and ".join(texts) or None
 
 
 def _recalibration(values: RecalibrationForecast) -> Finding:
@@ -306,10 +296,6 @@ def _recalibration(values: RecalibrationForecast) -> Finding:
         text = f"the reference can't be measured again from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
     return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
-
-
-def _network(keys: str | None) -> Finding:
-    return Finding("OK", "network", "off" if keys is None else f"Zenoh keys {keys}…")
 
 
 def _millimetres(value_m: float) -> str:

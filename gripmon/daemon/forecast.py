@@ -295,7 +295,7 @@ def _in_view(config: Config) -> InView:
 
 def _freedom(config: Config, rig: Rig) -> CameraFreedom:
     free = freedom(rig, config.cam_T_grip, config.jaw_opening_m)
-    amounts: Any = [tuple(map(_or_none, pair)) for pair in free.limits.tolist()]
+    amounts: Any = [tuple(None if math.isnan(v) else v for v in pair) for pair in free.limits.tolist()]
     return CameraFreedom(
         shift_m=dict(zip(_AXES, amounts[:3], strict=True)),
         turn_rad=dict(zip(_AXES, amounts[3:], strict=True)),
@@ -329,7 +329,3 @@ def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
             alert_limit_rad=policy.alert_limit_rad,
         ),
     )
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value

@@ -11,20 +11,17 @@ from typing import Any, Generic, TypeVar
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_network
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
-from gripmon.io.publish import (
+from gripmon.io.publish.commands import ZenohCommands
+from gripmon.io.publish.inputs import ZenohJaw, ZenohPulses, opening_of_joints
+from gripmon.io.publish.presence import Presence, in_words
+from gripmon.io.publish.publisher import (
     NullPublisher,
-    Presence,
     Publisher,
     Publishers,
     SpotPublisher,
-    ZenohCommands,
-    ZenohJaw,
     ZenohPublisher,
-    ZenohPulses,
     ZenohSpotPublisher,
 )
-from gripmon.io.publish.inputs import opening_of_joints
-from gripmon.io.publish.presence import in_words
 from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
 from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
 from gripmon.io.ros2.publisher import Ros2Publisher

@@ -21,8 +21,8 @@ from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.compared import ComparedRecorder
 from gripmon.record.keeping import keep_whole
 from gripmon.record.read import RecordedFrames, SeveralRunsError, UnusableError, recording_files
-from gripmon.record.recorder import make_scene
-from gripmon.record.write import Recorder, open_recorder
+from gripmon.record.recorder import Recorder, make_scene
+from gripmon.record.write import open_recorder
 
 RECORDING_PATIENCE_S = 30.0
 """Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""

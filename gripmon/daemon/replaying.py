@@ -45,7 +45,7 @@ from gripmon.model.records import (
     unmeasured_record,
 )
 from gripmon.record.read import recordings_below
-from gripmon.record.write import Recorder
+from gripmon.record.recorder import Recorder
 
 _log = logging.getLogger(__name__)
 _LATENCY_BIN = 0.02  # natural logarithm

@@ -30,8 +30,9 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
 from gripmon.monitor import warm_up
+from gripmon.record.recorder import Recorder, ViewSettings
 from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
-from gripmon.record.write import Recorder, ViewSettings, open_recorder
+from gripmon.record.write import open_recorder
 
 _log = logging.getLogger(__name__)
 

@@ -11,10 +11,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from gripmon.model.camera import LensSettings
 from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertRecord,
+    ArmPose,
     FrameRecord,
     Limits,
     Meta,
@@ -23,6 +25,7 @@ from gripmon.model.records import (
     SpotRecord,
     State,
     StateRecord,
+    Transform,
     Verdict,
     to_json,
 )
@@ -307,6 +310,21 @@ def _image_policy(settings: RecordingSettings) -> str:
     around_s = settings.around_alert_s
     around = f", all within {around_s:g} s of a warning or error" if around_s > 0.0 else ""
     return f"{kind}, {rate}{every}, one at every alert and change{around}"
+
+
+def pose_columns(poses: Sequence[Transform | ArmPose]) -> rr.ComponentColumnList:
+    return rr.Transform3D.columns(
+        translation=[pose.translation_m for pose in poses], quaternion=[pose.rotation_xyzw for pose in poses]
+    )
+
+
+def pinhole(lens: LensSettings, image_plane_m: float, **looks: Any) -> rr.Pinhole:
+    """A camera without its distortion, with its image so far before it."""
+    return rr.Pinhole(
+        resolution=[lens.width_px, lens.height_px], focal_length=[lens.fx_px, lens.fy_px],
+        principal_point=[lens.cx_px, lens.cy_px], camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=image_plane_m, **looks,
+    )  # fmt: skip
 
 
 AXIS = rrb.TimeAxis(link="LinkToGlobal")

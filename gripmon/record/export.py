@@ -31,8 +31,9 @@ from gripmon.model.atomic import opened_atomically, remove_leftovers
 from gripmon.model.errors import NoResultError
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import ReferenceRecord
-from gripmon.record.read import FrameTable, Recording, open_recordings, recording_files
-from gripmon.record.recordings import file_number
+from gripmon.record.read import open_recordings, recording_files
+from gripmon.record.recordings import Recording, file_number
+from gripmon.record.table import FrameTable
 
 UPPER = np.ravel_multi_index(np.triu_indices(6), (6, 6))
 _TRIANGLE = pa.list_(pa.float64(), len(UPPER))
@@ -372,7 +373,7 @@ def _dated(table: str, records: Iterable[Any], recording_id: str, file_number: i
         if "open_alerts" in row:
             row["open_alerts"] = len(row["open_alerts"])
         rows.append(row | {"time": record.stamp_ns, "recording_id": recording_id, "file_number": file_number})
-    return _table(table, rows)
+    return pa.Table.from_pylist(rows, SCHEMAS[table])
 
 
 def reference_row(reference: ReferenceRecord) -> pa.Table:
@@ -385,17 +386,7 @@ def reference_row(reference: ReferenceRecord) -> pa.Table:
     values = (*pose.translation_m, *pose.rotation_xyzw)
     row |= {f"cam_T_grip_{part}": value for part, value in zip(POSE_NAMES, values, strict=True)}
     row |= {"covariance": [reference.covariance[i] for i in UPPER]}
-    return _table("references", [row])
-
-
-def _table(table: str, rows: list[dict[str, Any]]) -> pa.Table:
-    schema = SCHEMAS[table]
-    columns = []
-    for field in schema:
-        values = [row.get(field.name) for row in rows]
-        array = pa.array(values, pa.int64()).cast(_TIME) if field.type == _TIME else pa.array(values, field.type)
-        columns.append(array)
-    return pa.table(columns, schema=schema)
+    return pa.Table.from_pylist([row], SCHEMAS["references"])
 
 
 def _values(record: msgspec.Struct) -> dict[str, Any]:

@@ -13,7 +13,19 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Transform, Verdict
-from gripmon.record.columns import APPLICATION_ID, AXIS, Palette, Row, Sender, image_view, log_view, plot, two_columns
+from gripmon.record.columns import (
+    APPLICATION_ID,
+    AXIS,
+    Palette,
+    Row,
+    Sender,
+    image_view,
+    log_view,
+    pinhole,
+    plot,
+    pose_columns,
+    two_columns,
+)
 from gripmon.record.recorder import Scene, TraceNote, pairs
 from gripmon.record.spots import spot_blueprint
 
@@ -31,7 +43,7 @@ _LOOK_AT_FRACTION = 0.64  # of the way from camera to TCP
 _CLOSE_UP_MM = (-0.3, 0.3)
 _STATISTIC_SHOWN = (0.0, 2.0)  # a collision is hundreds of times the threshold; what matters is where it crosses 1
 _Pixels = NDArray[np.float32]
-_NO_PIXELS: _Pixels = np.empty((0, 2), np.float32)
+_NOT_TRACED = TraceNote(b"", b"", b"", b"", [], b"")
 _NO_POINTS = np.empty((0, 3))
 
 
@@ -77,20 +89,20 @@ class OverlayWriter:
             self._draw(rows)
 
     def _draw(self, rows: Sequence[Row]) -> None:
-        traces = [row.trace for row in rows]
+        traces = [row.trace or _NOT_TRACED for row in rows]
         self._edges(rows, traces)
         self._points("edges/used", rows, [_edge_points(trace, used=True) for trace in traces])
         self._points("edges/refused", rows, [_edge_points(trace, used=False) for trace in traces])
         self._points("corners/predicted", rows, [_predicted_corners(trace) for trace in traces])
-        corners = [self._corners(row.record, row.trace) for row in rows]
+        corners = [self._corners(row.record, trace) for row, trace in zip(rows, traces, strict=True)]
         for kind, used in (("used", True), ("refused", False)):
             shown = [[corner for corner in some if corner.used == used] for some in corners]
             self._points(f"corners/{kind}", rows, [_pixels([c.uv_px for c in some]) for some in shown])
             places = [_pixels([c.label_px for c in some]) for some in shown]
             self._points(f"labels/{kind}", rows, places, [[c.label for c in some] for some in shown])
 
-    def _edges(self, rows: Sequence[Row], traces: Sequence[TraceNote | None]) -> None:
-        edges = [[] if trace is None else _predicted_edges(trace) for trace in traces]
+    def _edges(self, rows: Sequence[Row], traces: Sequence[TraceNote]) -> None:
+        edges = [_predicted_edges(trace) for trace in traces]
         strips = [strip for some in edges for strip in some]
         columns = rr.LineStrips2D.columns(strips=strips).partition([len(some) for some in edges])
         self._send.frames(f"{IMAGE}/edges/predicted", rows, columns)
@@ -103,9 +115,9 @@ class OverlayWriter:
         columns = rr.Points2D.columns(positions=positions, labels=flat).partition([len(p) for p in points])
         self._send.frames(f"{IMAGE}/{name}", rows, columns)
 
-    def _corners(self, record: FrameRecord, trace: TraceNote | None) -> list[_Corner]:
+    def _corners(self, record: FrameRecord, trace: TraceNote) -> list[_Corner]:
         """Corners with their labels; one that was not measured is shown where it was predicted, with the reason."""
-        predicted = _NO_PIXELS if trace is None else pairs(trace.predicted_corners_uv_px)
+        predicted = pairs(trace.predicted_corners_uv_px)
         where = {name: (float(u), float(v)) for name, (u, v) in zip(self._corner_ids, predicted, strict=False)}
         found = [(corner, corner.uv_px or where.get(corner.id)) for corner in record.corners]
         known = [(corner, uv_px) for corner, uv_px in found if uv_px is not None and np.isfinite(uv_px).all()]
@@ -137,9 +149,7 @@ def _pixels(points: Sequence[tuple[float, float]]) -> _Pixels:
     return np.array(points, np.float32).reshape(-1, 2)
 
 
-def _edge_points(trace: TraceNote | None, used: bool) -> _Pixels:
-    if trace is None:
-        return _NO_PIXELS
+def _edge_points(trace: TraceNote, used: bool) -> _Pixels:
     return pairs(trace.edge_uv_px)[np.frombuffer(trace.edge_used, np.uint8) == used]
 
 
@@ -149,9 +159,7 @@ def _predicted_edges(trace: TraceNote) -> list[_Pixels]:
     return [strip for strip in (s[np.isfinite(s).all(axis=1)] for s in strips) if len(strip) > 1]
 
 
-def _predicted_corners(trace: TraceNote | None) -> _Pixels:
-    if trace is None:
-        return _NO_PIXELS
+def _predicted_corners(trace: TraceNote) -> _Pixels:
     corners = pairs(trace.predicted_corners_uv_px)
     return corners[np.isfinite(corners).all(axis=1)]
 
@@ -167,15 +175,7 @@ class RigWriter:
         send.static("rig", rr.ViewCoordinates.RDF)
         send.static(
             "rig/camera",
-            rr.Pinhole(
-                resolution=[lens.width_px, lens.height_px],
-                focal_length=[lens.fx_px, lens.fy_px],
-                principal_point=[lens.cx_px, lens.cy_px],
-                image_plane_distance=_IMAGE_PLANE_FRACTION * distance_m,
-                camera_xyz=rr.ViewCoordinates.RDF,
-                color=Palette.IDLE,
-                line_width=0.3 * _LINE_M,
-            ),
+            pinhole(lens, _IMAGE_PLANE_FRACTION * distance_m, color=Palette.IDLE, line_width=0.3 * _LINE_M),
             rr.TransformAxes3D(_AXIS_M),
         )
         send.static("rig/gripper", rr.TransformAxes3D(_AXIS_M))
@@ -192,7 +192,7 @@ class RigWriter:
             posed = [row for row in rows if getattr(row.record, name) is not None]
             if posed:
                 poses: list[Transform] = [getattr(row.record, name) for row in posed]
-                self._send.frames(path, posed, _poses(poses))
+                self._send.frames(path, posed, pose_columns(poses))
         redrawn = [row for row in rows if self._looks_different(row)]
         if redrawn:
             self._write_fingers(redrawn)
@@ -202,7 +202,7 @@ class RigWriter:
 
     def write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> None:
         """Where the gripper was calibrated to be, from frame ``first`` on."""
-        self._send.columns("rig/reference", [first.stamp_ns], [first.seq], _poses([reference.cam_T_grip]))
+        self._send.columns("rig/reference", [first.stamp_ns], [first.seq], pose_columns([reference.cam_T_grip]))
 
     def _looks_different(self, row: Row) -> bool:
         """Whether the jaws moved or the verdict changed since the fingers were drawn last."""
@@ -269,12 +269,6 @@ class RigWriter:
         """(p, 3) in the gripper frame; a picture, so an opening outside the jaw's range shows the end of it."""
         gripper = self._gripper
         return gripper.points_grip_m(min(max(opening_m, gripper.jaw_min_m), gripper.jaw_max_m))
-
-
-def _poses(poses: Sequence[Transform]) -> rr.ComponentColumnList:
-    return rr.Transform3D.columns(
-        translation=[pose.translation_m for pose in poses], quaternion=[pose.rotation_xyzw for pose in poses]
-    )
 
 
 def _arrow(record: FrameRecord) -> tuple[Array, Array] | None:

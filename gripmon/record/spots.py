@@ -41,7 +41,9 @@ from gripmon.record.columns import (
     faded,
     image_view,
     log_view,
+    pinhole,
     plot,
+    pose_columns,
     two_columns,
 )
 from gripmon.record.recorder import Events, Scene
@@ -114,10 +116,7 @@ class SpotWriter(Writer):
         columns = rr.LineStrips2D.columns(strips=strips).partition([int(line is not None) for line in lines])
         self._send.frames(f"{IMAGE}/off", rows, columns)
         poses = [record.base_T_ee for record in records]
-        placed = rr.Transform3D.columns(
-            translation=[pose.translation_m for pose in poses], quaternion=[pose.rotation_xyzw for pose in poses]
-        )
-        self._send.frames("base/ee", rows, placed)
+        self._send.frames("base/ee", rows, pose_columns(poses))
         beams = [self._beam(record) for record in records]
         strips = [beam for beam in beams if beam is not None]
         columns = rr.LineStrips3D.columns(strips=strips).partition([int(beam is not None) for beam in beams])
@@ -164,12 +163,7 @@ def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> tuple[Ar
     base_T_cam = invert(setup.cam_T_base)
     turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
     send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
-    pinhole = rr.Pinhole(
-        resolution=[lens.width_px, lens.height_px], focal_length=[lens.fx_px, lens.fy_px],
-        principal_point=[lens.cx_px, lens.cy_px], camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=0.3 * setup.distance_m,
-    )  # fmt: skip
-    send.static(IMAGE, pinhole)
+    send.static(IMAGE, pinhole(lens, 0.3 * setup.distance_m))
     return turn, centre
 
 

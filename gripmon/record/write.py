@@ -45,17 +45,6 @@ from gripmon.record.recorder import (
     pack_trace,
 )
 
-__all__ = [
-    "Notes",
-    "ProcessRecorder",
-    "Recorder",
-    "RecordingSettings",
-    "Trace",
-    "ViewSettings",
-    "make_scene",
-    "open_recorder",
-]
-
 _log = logging.getLogger(__name__)
 
 HANDOVER_PERIOD_S = 0.05

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.io.publish import Presence, ZenohCommands, ZenohJaw, ZenohPublisher
+from gripmon.io.publish.commands import ZenohCommands
+from gripmon.io.publish.inputs import ZenohJaw
+from gripmon.io.publish.presence import Presence
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Keys, Link, PublishSettings
 
 

@@ -30,7 +30,8 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.record.write import ProcessRecorder, RecordingSettings, open_recorder
+from gripmon.record.recorder import RecordingSettings
+from gripmon.record.write import ProcessRecorder, open_recorder
 
 START_NS = 1_700_000_000_123_456_789
 OVERLAY = "rig/camera/image"

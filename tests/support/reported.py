@@ -28,7 +28,8 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.record.read import FrameTable, Picture
+from gripmon.record.recordings import Picture
+from gripmon.record.table import FrameTable
 from support import recorded
 
 FPS = 50
@@ -42,7 +43,7 @@ _DIFFERENT = 50
 
 @dataclass
 class Run:
-    """What :class:`gripmon.record.read.Recording` has."""
+    """What :class:`gripmon.record.recordings.Recording` has."""
 
     records: list[FrameRecord]
     robot: str = "arm"

@@ -24,7 +24,7 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.record.write import Notes, Trace
+from gripmon.record.recorder import Notes, Trace
 from support.loopback import frame_record, reference_record
 
 REFUSED = {

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from benchmarks.scene import FPS, Ring
 from gripmon.daemon.config import Config
 from gripmon.daemon.running import run
-from gripmon.io.publish import Publisher, ZenohPublisher
+from gripmon.io.publish.publisher import Publisher, ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, State, StateRecord, Verdict
 from gripmon.monitor import Monitor, warm_up
-from gripmon.record.write import Recorder
+from gripmon.record.recorder import Recorder
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)

@@ -16,7 +16,7 @@ from typing import Any
 import gripmon.monitor.core
 import gripmon.track.edges.settling
 from gripmon.daemon.loop import Daemon
-from gripmon.io.publish import ZenohPublisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.judge.drift import MotionWatch
 from gripmon.judge.policy import Policy
 from gripmon.judge.smoothing import PoseAverage

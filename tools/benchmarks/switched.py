@@ -9,7 +9,8 @@ import msgspec
 
 from gripmon.daemon.config import Config
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
-from gripmon.record.write import Notes, ProcessRecorder, Trace, open_recorder
+from gripmon.record.recorder import Notes, Trace
+from gripmon.record.write import ProcessRecorder, open_recorder
 
 
 class SwitchedRecorder:

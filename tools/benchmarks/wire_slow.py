@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.slow_link import SlowLink
 from benchmarks.wire_others import RouterProcess, free_endpoint
 from gripmon.client import Policy, TransformClient
-from gripmon.io.publish import ZenohPublisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.io.publish import ZenohPublisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import (
     Alert,

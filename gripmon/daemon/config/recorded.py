@@ -31,32 +31,35 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
     named = {"gripper": config.gripper_path, **config.calibrated.paths}
     if config.taught is not None and config.taught_path is not None:
         named["taught"] = config.taught_path
-    values: dict[str, Any] = msgspec.to_builtins(config.settings)
-    values = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
-    values["source"] = _NO_SOURCE
+    values = _plain(config)
     files: dict[str, RecordedFile] = {}
     for role, path in named.items():
         name = path.name if path.name not in (config.path.name, *files) else f"{role}-{path.name}"
         files[name] = _file(config.path, path)
         values[role] = name
-    files[config.path.name] = RecordedFile.of(as_yaml(values).encode())
-    return RecordedConfiguration(config.path.name, files, start)
+    return _recorded(config.path.name, files, values, start)
 
 
 def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
     """The same of a second camera, with its laser calibration."""
-    values: dict[str, Any] = msgspec.to_builtins(config.settings)
-    values = {key: value for key, value in values.items() if key not in _LEFT_OUT}
-    name = config.calibration_path.name
+    values, name = _plain(config), config.calibration_path.name
     name = name if name != config.path.name else f"laser-{name}"
-    values["source"] = _NO_SOURCE
     values["laser"] = {key: value for key, value in values["laser"].items() if value is not None}
     values["laser"] |= {"calibration": name, "pulses": "pulses-of-this-recording.csv"}
-    files = {
-        name: _file(config.path, config.calibration_path),
-        config.path.name: RecordedFile.of(as_yaml(values).encode()),
-    }
-    return RecordedConfiguration(config.path.name, files)
+    return _recorded(config.path.name, {name: _file(config.path, config.calibration_path)}, values)
+
+
+def _plain(config: Config | SecondConfig) -> dict[str, Any]:
+    """The sections that decisions rest on."""
+    values: dict[str, Any] = msgspec.to_builtins(config.settings)
+    kept = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
+    return kept | {"source": _NO_SOURCE}
+
+
+def _recorded(
+    name: str, files: dict[str, RecordedFile], values: dict[str, Any], start: MonitorState | None = None
+) -> RecordedConfiguration:
+    return RecordedConfiguration(name, {**files, name: RecordedFile.of(as_yaml(values).encode())}, start)
 
 
 def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:

@@ -18,7 +18,7 @@ from gripmon.laser.judgement import SpotWatchSettings
 from gripmon.laser.matching import PulseSettings
 from gripmon.model.camera import LensSettings
 from gripmon.monitor import MonitorSettings
-from gripmon.record.write import RecordingSettings, ViewSettings
+from gripmon.record.recorder import RecordingSettings, ViewSettings
 
 Name = Annotated[
     str,

@@ -191,8 +191,9 @@ def _fits_leaf(value: Any, node: mi.Type) -> bool:
     if isinstance(node, mi.NoneType):
         return value is None
     if isinstance(node, mi.StrType):
+        bounds = msgspec.Meta(min_length=node.min_length, max_length=node.max_length, pattern=node.pattern)
         try:
-            msgspec.convert(value, type=_constrained_text(node))
+            msgspec.convert(value, type=Annotated[str, bounds])
         except msgspec.ValidationError:
             return False
         return True
@@ -201,10 +202,6 @@ def _fits_leaf(value: Any, node: mi.Type) -> bool:
             return False
         return (isinstance(value, int) or isinstance(node, mi.FloatType)) and _in_bounds(value, node)
     return True  # msgspec itself is asked afterwards
-
-
-def _constrained_text(node: mi.StrType) -> Any:
-    return Annotated[str, msgspec.Meta(min_length=node.min_length, max_length=node.max_length, pattern=node.pattern)]
 
 
 def _in_bounds(value: float, node: mi.IntType | mi.FloatType) -> bool:

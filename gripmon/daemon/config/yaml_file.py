@@ -35,7 +35,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if value is None:
         raise ConfigError(path, "", "is empty", _SEE)
     if not isinstance(value, dict):
-        raise ConfigError(path, "", f"holds {_kind(value)}", _SEE)
+        kind = "a list" if isinstance(value, list) else f"a single value {value!r}"
+        raise ConfigError(path, "", f"holds {kind}", _SEE)
     return value
 
 
@@ -60,10 +61,6 @@ def read_document(path: Path, kind: type[_T]) -> _T:
     if schema != tag:
         raise ConfigError(path, "schema", f"is {schema!r}", tag)
     return read_settings(path, kind, values)
-
-
-def _kind(value: object) -> str:
-    return "a list" if isinstance(value, list) else f"a single value {value!r}"
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types

@@ -70,7 +70,11 @@ def measure_dataset(
     another configuration's results, an engine that isn't there.
     """
     config = config if isinstance(config, Config) else load_config(config, check_source=False)
-    configs = (config, *(_with_gripper(config, Path(path)) for path in grippers))
+    # What was taught is of the configuration's own gripper.
+    others = (
+        replace(config, gripper=read_gripper(path), gripper_path=path, taught=None) for path in map(Path, grippers)
+    )
+    configs = (config, *others)
     if len({one.gripper_path.stem for one in configs}) < len(configs):
         raise InputError("two files of one name, or the configuration's own again; each file once", "gripper")
     try:
@@ -106,11 +110,6 @@ def _configured(episode: Episode, config: Config) -> Episode:
     number = source.episode if isinstance(source, LeRobotSettings) else None
     settings = as_configured(source, config, source.camera, number)
     return msgspec.structs.replace(episode, source=settings)
-
-
-def _with_gripper(config: Config, path: Path) -> Config:
-    """What was taught is of the configuration's own gripper."""
-    return replace(config, gripper=read_gripper(path), gripper_path=path, taught=None)
 
 
 def _fingerprint(configs: Configs, lens: str) -> str:

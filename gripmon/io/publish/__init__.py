@@ -16,33 +16,3 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 "Late joiners get the last one" holds both ways that people ask: a plain ``get`` on the key (a queryable answers it),
 and an advanced subscriber with history (``zenoh.ext``).
 """
-
-from __future__ import annotations
-
-from gripmon.io.publish.commands import PendingCommand, ZenohCommands
-from gripmon.io.publish.inputs import ZenohJaw, ZenohPulses
-from gripmon.io.publish.presence import Presence
-from gripmon.io.publish.publisher import (
-    NullPublisher,
-    Publisher,
-    Publishers,
-    SpotPublisher,
-    StatePublisher,
-    ZenohPublisher,
-    ZenohSpotPublisher,
-)
-
-__all__ = [
-    "NullPublisher",
-    "PendingCommand",
-    "Presence",
-    "Publisher",
-    "Publishers",
-    "SpotPublisher",
-    "StatePublisher",
-    "ZenohCommands",
-    "ZenohJaw",
-    "ZenohPublisher",
-    "ZenohPulses",
-    "ZenohSpotPublisher",
-]

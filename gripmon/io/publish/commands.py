@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from gripmon.io.publish.presence import Answers, Presence, in_words, send_now
-from gripmon.io.wire import Keys, Link
+from gripmon.io.wire import Keys, Link, in_zenohs_thread
 from gripmon.io.wire.link import Malformed
 from gripmon.model.records import (
     Command,
@@ -145,8 +145,7 @@ class ZenohCommands:
         self._answers.close()
 
     def _attach(self, session: zenoh.Session) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        answer = zenoh.handlers.Callback(self._receive, indirect=False)
+        answer = in_zenohs_thread(self._receive)
         self._queryable = session.declare_queryable(self._keys["cmd/*"], answer, complete=True)
 
     def _receive(self, query: zenoh.Query) -> None:

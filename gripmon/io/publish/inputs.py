@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 
 from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state, opening_between
-from gripmon.io.wire import Link
+from gripmon.io.wire import Link, in_zenohs_thread
 from gripmon.io.wire.link import Malformed
 from gripmon.laser.matching import ReportedPulse, of_message
 from gripmon.model.errors import in_short
@@ -100,8 +100,7 @@ class _Input:
         return self._malformed.count
 
     def _attach(self, session: zenoh.Session) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._arrived, indirect=False))
+        self._subscriber = session.declare_subscriber(self._key, in_zenohs_thread(self._arrived))
 
     def _arrived(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import zenoh
 
-from gripmon.io.wire import Keys, Link
+from gripmon.io.wire import Keys, Link, in_zenohs_thread
 
 _log = logging.getLogger(__name__)
 
@@ -102,8 +102,8 @@ class Presence:
         return {_id_in(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def _attach(self, session: zenoh.Session) -> None:
-        take = zenoh.handlers.Callback(self._take, indirect=False)
-        self._declared = session.liveliness().declare_subscriber(self._keys["alive/*"], take, history=True)
+        take, tokens = in_zenohs_thread(self._take), session.liveliness()
+        self._declared = tokens.declare_subscriber(self._keys["alive/*"], take, history=True)
         self._session = session
 
     def _leave(self) -> None:

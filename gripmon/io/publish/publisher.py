@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from gripmon.io.publish.presence import Answers, Presence
-from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
+from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, in_zenohs_thread, steady_ns
 from gripmon.model.errors import one_line
 from gripmon.model.records import (
     AlertRecord,
@@ -207,9 +207,7 @@ class _LastValue:
         self._answers = answers
         self._last: bytes | None = None
         self._publisher = publisher
-        # Answered in Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        answer = zenoh.handlers.Callback(self._answer, indirect=False)
-        self._queryable = session.declare_queryable(key, answer, complete=True)
+        self._queryable = session.declare_queryable(key, in_zenohs_thread(self._answer), complete=True)
 
     def put(self, payload: bytes) -> None:
         self._last = payload

@@ -18,7 +18,7 @@ import numpy as np
 
 from gripmon.calibrate.formats import InterchangeError, read_ros
 from gripmon.io.ros2.node import JointOpening, Ros2Missing, typestore
-from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.base import SourceError, Stored
 from gripmon.io.sources.payload import PayloadError, raw_image
 from gripmon.io.sources.stored import (
     VideoDecoder,
@@ -183,7 +183,7 @@ def image_topics(types: dict[str, str]) -> list[str]:
     return sorted(topic for topic, name in types.items() if _kind(name) in _IMAGES)
 
 
-class BagSource:
+class BagSource(Stored):
     """Every image of a topic, in order of log time, with the stamp of its own header (the log's where that is empty),
     and the opening at that time.  Where the file is cut short the last frame has no image, and says so.
 
@@ -191,10 +191,6 @@ class BagSource:
     :class:`SourceError` for what can't be read, and for a topic or joints that aren't there, with the names of those
     that are.
     """
-
-    live = False
-    connected = True
-    dropped = 0
 
     def __init__(self, settings: BagSettings, relative_to: str = "") -> None:
         self._path = settings.path if "://" in settings.path else joined(relative_to, settings.path)

@@ -49,6 +49,14 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
+class Stored:
+    """What every source of recorded frames is: it waits for nobody, and nobody misses one of its frames."""
+
+    live = False
+    connected = True
+    dropped = 0
+
+
 READ_TIMEOUT_S = 0.5
 
 

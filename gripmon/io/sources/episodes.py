@@ -53,7 +53,8 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
     files = {
         path: one
         for path, one in files.items()
-        if not _hidden(path[len(inside) :]) and not path.endswith(ANNOTATION_SUFFIX)
+        if not any(part.startswith(".") for part in path[len(inside) :].split("/"))
+        and not path.endswith(ANNOTATION_SUFFIX)
     }
     if not files:
         raise SourceError(f"path: there is nothing in {root}; a folder or a URL with episodes")
@@ -75,10 +76,11 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
             taken.add(dataset)
             named = system.unstrip_protocol(dataset) if remote else dataset
             found += _of_lerobot(named, dataset[len(inside) :].strip("/"), cameras, _version([files[path]]))
-        elif posixpath.basename(path) == "metadata.yaml" and _rosbag2(folders[posixpath.dirname(path)]):
-            taken.add(posixpath.dirname(path))
+            continue
+        folder, name = posixpath.split(path)
+        if name == "metadata.yaml" and any(each.endswith((".db3", ".mcap")) for each in folders[folder]):
+            taken.add(folder)
             for camera in cameras or (None,):
-                folder = posixpath.dirname(path)
                 add(folder, BagSettings, folders[folder], camera=camera)
     for path in sorted(files):
         if any(path.startswith(f"{folder}/") for folder in taken):
@@ -90,7 +92,8 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         elif suffix in _VIDEOS and not remote:
             add(path, VideoSettings, [path])
     for folder, inner in folders.items():
-        if not remote and not any(f"{folder}/".startswith(f"{other}/") for other in taken) and _has_images(inner):
+        images = any(Path(path).suffix.lower() in IMAGE_SUFFIXES for path in inner)
+        if images and not remote and not any(f"{folder}/".startswith(f"{other}/") for other in taken):
             add(folder, FolderSettings, inner)
     if not found:
         right = "LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos"
@@ -119,18 +122,6 @@ def _of_lerobot(path: str, name: str, cameras: Sequence[str], version: str) -> l
 
 def _list(names: Sequence[str]) -> str:
     return ", ".join(names) or "none"
-
-
-def _hidden(path: str) -> bool:
-    return any(part.startswith(".") for part in path.split("/"))
-
-
-def _rosbag2(names: list[str]) -> bool:
-    return any(name.endswith((".db3", ".mcap")) for name in names)
-
-
-def _has_images(names: list[str]) -> bool:
-    return any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names)
 
 
 def _version(files: list[dict[str, Any]]) -> str:

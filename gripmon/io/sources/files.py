@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.base import SourceError, Stored
 from gripmon.model.images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from gripmon.model.images import natural_key as natural_key
 from gripmon.model.images import read_image as read_image
@@ -53,7 +53,7 @@ class TableRow:
     jaw_opening_m: float | None
 
 
-class FolderSource:
+class FolderSource(Stored):
     """Every image of a folder, in order: ``frame10.png`` comes after ``frame9.png``.
 
     With a table of time stamps it decides which frames there are: a file that it names and that is missing becomes a
@@ -61,10 +61,6 @@ class FolderSource:
     BGR, an alpha channel is left out, 16 bits and float stay what they are.  Truncated or foreign files become frames
     with a fault.
     """
-
-    live = False
-    connected = True
-    dropped = 0
 
     def __init__(self, settings: FolderSettings, relative_to: Path) -> None:
         self._folder = relative_to / settings.path
@@ -187,16 +183,12 @@ class VideoSettings(
     ) = None
 
 
-class VideoSource:
+class VideoSource(Stored):
     """Frames with the container's time stamps, counted from its beginning, as a container knows no Unix time.
 
     Containers round (Matroska to 1 ms).  A frame whose stamp doesn't rise becomes a frame with a fault: give ``fps``
     for files without usable stamps.  Images are BGR, also of grey videos.
     """
-
-    live = False
-    connected = True
-    dropped = 0
 
     def __init__(self, settings: VideoSettings, relative_to: Path) -> None:
         import cv2

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from gripmon.io.ros2.node import JointOpening
-from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.base import SourceError, Stored
 from gripmon.io.sources.stored import decoded_file, file_system, joined, needed, opened, there
 from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Frame, Image
@@ -118,7 +118,7 @@ def _episodes_of_3(path: str, info: dict[str, Any]) -> list[dict[str, Any]]:
 _PLACES = ("data/", "video")
 
 
-class LeRobotSource:
+class LeRobotSource(Stored):
     """Every frame of an episode, its stamp counted from the episode's beginning: the dataset knows no Unix time.  A
     frame that its video doesn't hold has no image, and says so.
 
@@ -126,9 +126,6 @@ class LeRobotSource:
     the names of those that are.
     """
 
-    live = False
-    connected = True
-    dropped = 0
     camera = None
     """A LeRobot dataset holds no camera calibration."""
 

@@ -18,7 +18,7 @@ from gripmon.io.sources.payload import (
     raw_image,
     read_note,
 )
-from gripmon.io.wire import Link
+from gripmon.io.wire import Link, in_zenohs_thread
 from gripmon.io.wire.link import Malformed
 from gripmon.io.wire.session import KEY_PATTERN
 from gripmon.model.images import JPEG, PNG
@@ -227,10 +227,7 @@ class NetworkCamera:
                 return  # the session was closed before
 
     def _attach(self, session: zenoh.Session) -> None:
-        import zenoh
-
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        self._subscriber = session.declare_subscriber(self.key, zenoh.handlers.Callback(self._receive, indirect=False))
+        self._subscriber = session.declare_subscriber(self.key, in_zenohs_thread(self._receive))
 
     def _receive(self, sample: zenoh.Sample) -> None:
         import zenoh

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from gripmon.io.sources.base import Source, SourceError
+from gripmon.io.sources.base import Source, SourceError, Stored
 from gripmon.model.errors import one_line
 from gripmon.model.records import Array, Frame
 
@@ -85,12 +85,8 @@ def _load_scenario(settings: SimulatedSettings, relative_to: Path) -> Scenario:
         ) from error
 
 
-class SimulatedSequence:
+class SimulatedSequence(Stored):
     """Every frame of a scenario in order, rendered when it is asked for; stamps are the scenario's."""
-
-    live = False
-    connected = True
-    dropped = 0
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator

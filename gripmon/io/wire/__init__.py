@@ -4,7 +4,7 @@ shares.
 
 from __future__ import annotations
 
-from gripmon.io.wire.link import Link, Router
+from gripmon.io.wire.link import Link, Router, in_zenohs_thread
 from gripmon.io.wire.session import (
     CLOCK_PARAMETER,
     DEFAULT_ENDPOINT,
@@ -33,6 +33,7 @@ __all__ = [
     "Router",
     "ZenohFileError",
     "check_name",
+    "in_zenohs_thread",
     "joining",
     "open_session",
     "steady_ns",

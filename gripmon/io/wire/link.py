@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from gripmon.io.wire.session import (
     PublishSettings,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 _LOOK_EVERY_S = 1.0
 
@@ -160,6 +161,13 @@ class Link:
             else:
                 session.close()
             return
+
+
+def in_zenohs_thread(take: Callable[[_T], None]) -> zenoh.handlers.Callback[_T]:
+    """A callback in Zenoh's own threads: one of Python's would keep a process that forgot ``close()`` from ending."""
+    import zenoh
+
+    return zenoh.handlers.Callback(take, indirect=False)
 
 
 _LOCATOR = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")

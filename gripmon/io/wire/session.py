@@ -9,7 +9,7 @@ import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
@@ -85,19 +85,19 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
     return config
 
 
-class Joining(NamedTuple):
+class Joining(msgspec.Struct, frozen=True):
     """How a session would join the network: its mode, its endpoints, and the file of Zenoh's that says so, if any."""
 
     mode: str
     listen: tuple[str, ...]
     connect: tuple[str, ...]
-    file: Path | None
+    file: str | None
 
 
 def joining(settings: PublishSettings, relative_to: Path = Path()) -> Joining:
     """What :func:`zenoh_config` comes to, without a session.  Raises :class:`PublishError`."""
     config = zenoh_config(settings, relative_to)
-    file = None if settings.zenoh_config is None else relative_to / settings.zenoh_config
+    file = None if settings.zenoh_config is None else str(relative_to / settings.zenoh_config)
     return Joining(str(said(config, "mode")), endpoints(config, "listen"), endpoints(config, "connect"), file)
 
 
