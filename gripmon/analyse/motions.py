@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from gripmon.analyse.affected import excess
 from gripmon.analyse.content import Displacement, Event, Limits, Moment, Onset
@@ -217,10 +216,9 @@ def robust_sigma(values: Array) -> Array:
     return 1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
 
 
-def frame_noise(track: Track, among: NDArray[np.intp] | None = None) -> Array:
+def frame_noise(track: Track) -> Array:
     """(6,) standard deviation from one measured frame to the next, over the square root of two; robust."""
-    values = track.against_first[np.flatnonzero(track.measured) if among is None else among]
-    return robust_sigma(np.diff(values, axis=0)) / np.sqrt(2.0)
+    return robust_sigma(np.diff(track.against_first[track.measured], axis=0)) / np.sqrt(2.0)
 
 
 def step_onset(track: Track, noticed_ns: int, not_before_ns: int, noise: Array) -> Onset | None:

@@ -62,13 +62,13 @@ class Stretch(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def stretches_of(
-    table: FrameTable, alerts: Sequence[tuple[int, Alert]], reasons: Sequence[str | None], level: float = CHANCE
+    table: FrameTable, alerts: Sequence[tuple[int, Alert]], reasons: Sequence[str | None]
 ) -> list[Stretch]:
     """The stretches of one episode, in order; ``alerts`` with their stamps (ns); ``reasons`` (n,): why frames weren't
     valid.
 
     The camera moved where the off-line smoother finds a change, and the transforms before and after it differ by
-    ``verify``'s test at ``level``; what doesn't differ is one stretch.  ValueError where too little was measured.
+    ``verify``'s test at :data:`CHANCE`; what doesn't differ is one stretch.  ValueError where too little was measured.
     """
     correction = correct_table(table, lambda: None)
     poses, measured = table.matrices(), ~table.refused & np.isfinite(table.cam_T_grip).all(axis=1)
@@ -76,13 +76,13 @@ def stretches_of(
     begins: list[int] = [0]
     motions: list[Motion | None] = [None]
     for point in correction.change_points:
-        motion = _motion(table, poses, valid, measured, point, begins[-1], _next(correction, point), alerts, level)
+        motion = _motion(table, poses, valid, measured, point, begins[-1], _next(correction, point), alerts)
         if motion is not None:
             begins.append(point.index)
             motions.append(motion)
     ends = [*begins[1:], len(table)]
     return [
-        _stretch(table, correction, poses, valid, measured, slice(begin, end), motion, reasons, level)
+        _stretch(table, correction, poses, valid, measured, slice(begin, end), motion, reasons)
         for begin, end, motion in zip(begins, ends, motions, strict=True)
     ]
 
@@ -107,14 +107,13 @@ def _motion(
     begin: int,
     end: int,
     alerts: Sequence[tuple[int, Alert]],
-    level: float,
 ) -> Motion | None:
     sides = [_used(valid, measured, slice(begin, point.index)), _used(valid, measured, slice(point.index, end))]
     if not all(len(side) for side in sides):
         return None
     (a, A), (b, B) = (mean_of_one_scene(list(poses[side]), list(table.covariance[side])) for side in sides)
     found = compare_hand_eye(a, A, b, B)
-    if found.p_value >= level:
+    if found.p_value >= CHANCE:
         return None
     x, y, z = found.position_m.tolist()
     told = [alert for stamp_ns, alert in alerts if point.earliest_ns <= stamp_ns <= int(table.stamp_ns[end - 1])]
@@ -140,7 +139,6 @@ def _stretch(
     part: slice,
     motion: Motion | None,
     reasons: Sequence[str | None],
-    level: float,
 ) -> Stretch:
     # Numbers differ from frame to frame, and so do what stands in brackets.
     why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in reasons[part] if reason)
@@ -172,7 +170,7 @@ def _stretch(
         protection_m=_largest(bounds[0]),
         protection_rad=_largest(bounds[1]),
         integrity_risk=_largest(table.integrity_risk[used]),
-        crept_m=float(np.linalg.norm(crept.position_m)) if crept.p_value < level else None,
+        crept_m=float(np.linalg.norm(crept.position_m)) if crept.p_value < CHANCE else None,
         **plain,
     )
 

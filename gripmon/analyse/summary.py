@@ -130,14 +130,14 @@ def _affected(report: RecordingReport) -> str:
     old = [a for a in report.affected if a.what == "old_calibration"]
     if not old:
         return ""
-    text = f"Work that relied on the initial calibration is affected {_listed(old, report)}"
+    text = f"Work that relied on the initial calibration is affected {_listed(old)}"
     stale = [a for a in report.affected if a.what == "stale_reference"]
     if stale:
-        text += f"; work that relied on the reference then in force, {_listed(stale, report)}"
+        text += f"; work that relied on the reference then in force, {_listed(stale)}"
     return text + "."
 
 
-def _listed(ranges: Sequence[AffectedRange], report: RecordingReport) -> str:
+def _listed(ranges: Sequence[AffectedRange]) -> str:
     worst = sorted(ranges, key=lambda a: a.start_ns - a.end_ns)[:_MAX_SHOWN]
     worst.sort(key=lambda a: a.start_ns)
     texts = []

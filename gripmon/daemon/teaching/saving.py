@@ -90,7 +90,7 @@ class FileSaving:
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
             texts["config"] = self._config(order, found, model is not None)
-        self._try_out(order, found, texts)
+        self._try_out(texts)
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
         follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
@@ -176,7 +176,7 @@ class FileSaving:
         """As a configuration in ``to``, or the folder written to, names it."""
         return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
 
-    def _try_out(self, order: SaveOrder, found: Evaluation, texts: Mapping[str, str]) -> None:
+    def _try_out(self, texts: Mapping[str, str]) -> None:
         """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
         if "config" not in texts:
             return

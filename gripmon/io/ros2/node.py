@@ -110,13 +110,7 @@ class Node:
         self._tokens = [session.liveliness().declare_token(token)]
 
     def publisher(
-        self,
-        topic: str,
-        type_name: str,
-        qos: Qos = DEFAULT_QOS,
-        *,
-        priority: zenoh.Priority | None = None,
-        express: bool = False,
+        self, topic: str, type_name: str, qos: Qos = DEFAULT_QOS, *, priority: zenoh.Priority | None = None
     ) -> TopicPublisher:
         """Publish on a topic (its full name).  A message that a congested link can't take is dropped, not waited for:
         so does ``rmw_zenoh`` with every history but keep all.  ``priority`` is Zenoh's ``DATA`` by default.
@@ -128,7 +122,6 @@ class Node:
             topic_key(self.domain_id, topic, type_name, type_hash(type_name)),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA if priority is None else priority,
-            express=express,
         )
         return TopicPublisher(publisher, type_name, gid_of(token))
 

@@ -87,7 +87,7 @@ def open_dataset(path: str) -> LeRobotDataset:
             info = json.load(file)
         version = str(info["codebase_version"])
         if version.startswith("v3."):
-            episodes = _episodes_of_3(path, info)
+            episodes = _episodes_of_3(path)
         elif version.startswith("v2."):
             with opened(joined(path, "meta/episodes.jsonl")) as file:
                 episodes = [json.loads(line) for line in file if line.strip()]
@@ -101,7 +101,7 @@ def open_dataset(path: str) -> LeRobotDataset:
     return LeRobotDataset(path, info, {int(row["episode_index"]): row for row in episodes})
 
 
-def _episodes_of_3(path: str, info: dict[str, Any]) -> list[dict[str, Any]]:
+def _episodes_of_3(path: str) -> list[dict[str, Any]]:
     from pyarrow import parquet
 
     system, inside = file_system(path)
