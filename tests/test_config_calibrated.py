@@ -13,7 +13,7 @@ import pytest
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config import ConfigError, is_second, load_config, load_second
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.judge.statefile import calibration_of
 from gripmon.model.geometry import to_record
@@ -90,6 +90,8 @@ def test_files_and_sections_say_the_same(folder: Path):
         ("gripper.yaml", lambda v: v["points"]["L_in_far"].update(xyz_m=[-0.0171, 0.008, 0.0]),
          "hand_eye.yaml: gripper: is two_box_fingers with other contents"),
         (HE, lambda v: v["gripper"].update(name="other", sha256="0" * 64), "gripper: is other, the"),
+        ("gripper.yaml", lambda v: v.update(name="renamed"), "gripper: is two_box_fingers, the configuration has "
+         "renamed, the same but for its name; name: two_box_fingers in the gripper file"),
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.0, 0.0, -0.1]),
          "hand_eye.yaml: cam_T_grip.translation_m: puts the TCP behind the camera"),
         (HE, lambda v: v.update(covariance=[0.0] * 36), "hand_eye.yaml: covariance: has a variance of zero"),
@@ -104,6 +106,31 @@ def test_what_doesnt_belong_together_is_one_clear_line(
     with pytest.raises(ConfigError) as caught:
         load_config(folder / "arm.yaml")
     assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("load", [load_config, is_second, load_second])
+@pytest.mark.parametrize(
+    ("file", "kind", "key"),
+    [
+        (CAM, "a file of gripmon calibrate intrinsics", "camera"),
+        (HE, "a file of gripmon calibrate plane", "reference"),
+        ("gripper.yaml", "a gripper file", "gripper"),
+    ],
+)
+def test_a_file_that_belongs_into_a_configuration_is_named_and_where(
+    folder: Path, load: Callable[[Path], object], file: str, kind: str, key: str
+):
+    with pytest.raises(ConfigError) as caught:
+        load(folder / file)
+    right = f"a configuration, such as gripmon teach writes; this file belongs there under {key}"
+    assert str(caught.value) == f"{folder / file}: is {kind}; {right}"
+
+
+def test_a_file_of_corners_or_of_the_set_up_is_no_configuration_either(tmp_path: Path):
+    for text, kind in (("corners: {a: [1, 2]}", "a file with corners"), ("accepted: {}", "what was said to gripmon")):
+        (tmp_path / "a.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=f"a.yaml: is {kind}"):
+            load_config(tmp_path / "a.yaml")
 
 
 def test_where_a_gripper_file_comes_from_changes_no_digest(folder: Path):

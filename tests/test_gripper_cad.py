@@ -268,12 +268,19 @@ def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, caps
     words = ("--unit", "mm", "--jaw-range", "0:0.06", "--camera", camera, "--view", "0.115:32", "--picture", picture)
     assert from_cad(*paths, *words, "--out", out) == 0
     printed = capsys.readouterr().out
-    assert "jaw: 0.0 to 60.0 mm, as drawn 34.0 mm" in printed and f"written: {out}" in printed
+    assert "jaw: 0.0 to 60.0 mm, as drawn 34.0 mm" in printed and f"written: {out} (the gripper g)" in printed
     gripper = load_gripper(out)
     assert any("round" in line for line in out.read_text().splitlines()) and gripper.jaw_max_m == 0.06
     assert picture.stat().st_size > 10_000
     assert from_cad(*paths, *words, "--out", out) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+def test_a_gripper_of_two_meshes_is_not_named_after_one_of_its_fingers(tmp_path: Path):
+    paths = write_meshes(box_meshes(sharp_gripper()), tmp_path)
+    for words, name in (((), "hand"), (("--name", "mine"), "mine")):
+        assert from_cad(*paths, "--unit", "mm", *words, "--out", tmp_path / "hand.yaml", "--force") == 0
+        assert load_gripper(tmp_path / "hand.yaml").name == name
 
 
 def test_without_trimesh_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -31,7 +31,7 @@ FILE...                 .stl, .obj, .ply, .cao: one a finger, or both in one; or
 --reference FILE.yaml   where the gripper stands before it: a file of gripmon calibrate plane, or a configuration
 | --view D:TILT         the same roughly: the TCP at distance D (m) in the image's middle, the camera at -y and tilted
                         by TILT (degrees) against z
---name NAME             the gripper's name (default: the file's)
+--name NAME             the gripper's name (default: FILE's; of several FILEs that of --out)
 --picture FILE.png      also draw the model in the view
 --force                 replace files that are there
 """
@@ -84,12 +84,13 @@ def from_cad(arguments: Arguments) -> None:
     missing = [path for path in arguments.file if not path.is_file()]
     if missing:
         raise InputError(f"{missing[0]}: there is no such file; a mesh, URDF or .cao")
+    name = arguments.name or (arguments.out.stem if len(arguments.file) > 1 else None)
     made = gripper_from_cad(
-        arguments.file, unit=arguments.unit, name=arguments.name, camera=camera, cam_T_grip=cam_T_grip,
+        arguments.file, unit=arguments.unit, name=name, camera=camera, cam_T_grip=cam_T_grip,
         jaw_range_m=arguments.jaw_range, jaw_opening_m=arguments.jaw_opening, joint=arguments.joint,
         frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
         provenance=provenance_of(arguments.command_line(), arguments.file), progress=progress_bar,
     )  # fmt: skip
     arguments.save("out", made.text().encode())
     arguments.save("picture", made.picture)
-    print("\n".join([*made.summary(), f"written: {arguments.out}"]))
+    print("\n".join([*made.summary(), f"written: {arguments.out} (the gripper {made.model.name})"]))

@@ -30,7 +30,7 @@ from gripmon.daemon.config.checks import (
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import read_configuration, read_settings, read_yaml
 from gripmon.io.ros2.names import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -138,7 +138,7 @@ def load_config(
     warning of settings that have been replaced, for files that can't be edited.
     """
     path = Path(path)
-    values = read_yaml(path)
+    values = read_configuration(path)
     if SECTION in values:
         right = "a wrist camera's configuration; gripmon run, check and replay take both"
         raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)

@@ -62,9 +62,13 @@ def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Grippe
     if hand_eye.camera != camera:
         return Fault("camera", "isn't the configuration's camera", "the hand/eye calibration made with the same camera")
     if hand_eye.gripper.sha256 != gripper_digest(gripper):
-        same = " with other contents" if hand_eye.gripper.name == gripper.name else ""
-        wrong = f"is {hand_eye.gripper.name}{same}, the configuration has {gripper.name}"
-        return Fault("gripper", wrong, "the hand/eye calibration made with the same gripper file")
+        name = hand_eye.gripper.name
+        same = " with other contents" if name == gripper.name else ""
+        wrong = f"is {name}{same}, the configuration has {gripper.name}"
+        right = "the hand/eye calibration made with the same gripper file; gripmon calibrate plane makes it again"
+        if hand_eye.gripper.sha256 == gripper_digest(gripper, name):
+            wrong, right = f"{wrong}, the same but for its name", f"name: {name} in the gripper file"
+        return Fault("gripper", wrong, right)
     return None
 
 

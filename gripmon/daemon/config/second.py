@@ -10,7 +10,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.daemon.config.checks import network_fault, source_fault
 from gripmon.daemon.config.settings import SecondSettings
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import read_configuration, read_document, read_settings
 from gripmon.io.sources import EpisodeSettings, FolderSettings, SimulatedSettings, VideoSettings
 from gripmon.laser.judgement import SpotWatchSettings
 from gripmon.laser.matching import PulseSettings, ReportedPulse, read_pulses
@@ -47,7 +47,7 @@ class SecondConfig:
 
 def is_second(path: Path) -> bool:
     """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that isn't YAML."""
-    return SECTION in read_yaml(path)
+    return SECTION in read_configuration(path)
 
 
 def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
@@ -55,7 +55,7 @@ def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
 
     ``check_source=False`` leaves out whether the source's files exist, and the pulses.
     """
-    values = read_yaml(path)
+    values = read_configuration(path)
     _refuse_wrist(path, values)
     settings = read_settings(path, SecondSettings, values)
     calibration_path = path.parent / settings.laser.calibration

@@ -48,7 +48,40 @@ def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = No
         raise ConfigError.of(path, error.fault) from None
 
 
-_LOOKS_LIKE = {"points": "a gripper file", "gripper": "a configuration", "corners": "a file with corners"}
+_LOOKS_LIKE = {
+    "edge_settings": "a taught model", "gripper": "a configuration", "points": "a gripper file",
+    "corners": "a file with corners", "accepted": "what was said to gripmon setup",
+}  # fmt: skip
+_SCHEMAS = {
+    "gripmon.camera_calibration": "a file of gripmon calibrate intrinsics",
+    "gripmon.hand_eye_calibration": "a file of gripmon calibrate plane",
+    "gripmon.robot_world_calibration": "a file of gripmon calibrate robot-world",
+    "gripmon.laser_calibration": "a file of gripmon calibrate laser",
+}
+_NAMED_UNDER = {
+    "a file of gripmon calibrate intrinsics": "camera", "a file of gripmon calibrate plane": "reference",
+    "a file of gripmon calibrate laser": "laser.calibration", "a gripper file": "gripper", "a taught model": "taught",
+}  # fmt: skip
+"""Keys of a configuration."""
+
+
+def read_configuration(path: Path) -> dict[str, Any]:
+    """The mapping in a configuration, a wrist camera's or a second camera's.  :class:`ConfigError`, also for another
+    file of ours, which it names.
+    """
+    values = read_yaml(path)
+    kind = _kind_of(values)
+    if kind is not None and kind != "a configuration":
+        right = "a configuration, such as gripmon teach writes"
+        right += f"; this file belongs there under {_NAMED_UNDER[kind]}" if kind in _NAMED_UNDER else ""
+        raise ConfigError(path, "", f"is {kind}", right)
+    return values
+
+
+def _kind_of(values: dict[str, Any]) -> str | None:
+    """Which file of ours this is, in words; None if it looks like none."""
+    known = _SCHEMAS.get(str(values.get("schema")).partition("/")[0])
+    return known or next((what for key, what in _LOOKS_LIKE.items() if key in values), None)
 
 
 def read_document(path: Path, kind: type[_T]) -> _T:
@@ -56,10 +89,12 @@ def read_document(path: Path, kind: type[_T]) -> _T:
     values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
     schema = values.get("schema")
     if schema is None:
-        looks = next((f"; this looks like {what}" for key, what in _LOOKS_LIKE.items() if key in values), "")
+        looks = f"; this looks like {_kind_of(values)}" if _kind_of(values) else ""
         raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
     if schema != tag:
-        raise ConfigError(path, "schema", f"is {schema!r}", tag)
+        words = [_SCHEMAS.get(str(name).partition("/")[0]) for name in (schema, tag)]
+        wrong, right = (f"{name}, {what}" if what else name for name, what in zip((repr(schema), tag), words, strict=True))
+        raise ConfigError(path, "schema", f"is {wrong}", right)
     return read_settings(path, kind, values)
 
 

@@ -126,9 +126,12 @@ class Mismatch(NamedTuple):
     right: str
 
 
-def gripper_digest(gripper: Gripper) -> str:
-    """SHA-256 of what a gripper file says of the gripper; comments, order and spelling of numbers don't count."""
-    return hashlib.sha256(msgspec.json.encode(contents_of(gripper.model), order="sorted")).hexdigest()
+def gripper_digest(gripper: Gripper, name: str | None = None) -> str:
+    """SHA-256 of what a gripper file says of the gripper, or would under another ``name``; comments, order and spelling
+    of numbers don't count.
+    """
+    model = gripper.model if name is None else msgspec.structs.replace(gripper.model, name=name)
+    return hashlib.sha256(msgspec.json.encode(contents_of(model), order="sorted")).hexdigest()
 
 
 def identity(
