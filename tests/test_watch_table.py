@@ -6,6 +6,7 @@ import argparse
 import json
 import random
 import resource
+import time
 from pathlib import Path
 
 import msgspec
@@ -17,7 +18,7 @@ from gripmon.cli.watch import _print_alerts
 from gripmon.client import AlertLog, Condition, MonitorName, MonitorStatus, trouble
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
-GONE_NS = 1_700_000_000_000_000_000
+RECORDED_NS = GONE_NS = 1_700_000_000_000_000_000
 
 
 def state(**changes: object) -> StateRecord:
@@ -212,6 +213,17 @@ def test_the_alert_log_has_every_alert_once_over_restarts(tmp_path: Path, capsys
     assert [json.loads(line) for line in path.read_text().splitlines()] == [json.loads(p) for p in payloads]
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 3 and "arm/wrist  warning  drift, revision 3: moved 0 mm" in said[0]
+
+
+def test_an_alert_with_the_clock_of_recorded_images_says_so(capsys: pytest.CaptureFixture[str]):
+    log = Log(None, as_json=False)
+    for stamp_ns in (time.time_ns(), RECORDED_NS):
+        record = msgspec.structs.replace(alert_record(), stamp_ns=stamp_ns)
+        log.alert(ARM, record, to_json(record))
+    log.show()
+    now, recorded = capsys.readouterr().out.splitlines()
+    assert "(" not in now.partition("arm/wrist")[0]
+    assert recorded.startswith("2023-11-1") and "(the clock of recorded images, or an alert from before)  arm" in recorded
 
 
 @pytest.mark.parametrize("number", [-1, 2**63, -(10**30), 10**400])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from collections import Counter
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ _AS_DATA = (
     "monitor_id", "condition", "gone_since_ns", "state_age_s", "drift_m", "transforms_per_s", "transform_age_s", "state"
 )  # fmt: skip
 _MARKS = {"error": "!!", "warning": "!", "info": "i"}
+_NOT_NOW = "the clock of recorded images, or an alert from before"
 LEGEND = "open alerts: !! errors, ! warnings, i notes, with their number and the worst one's text"
 
 
@@ -84,6 +86,8 @@ def event_line(event: Event) -> str:
     head, record = f"{clock(event.stamp_ns)}  {event.name}", event.alert
     if record is None:
         return printable(f"{head}  {event.what}")
+    if not _is_today(event.stamp_ns):
+        head = f"{clock(event.stamp_ns)} ({_NOT_NOW})  {event.name}"
     which = f" ({record.alert_id})" if record.alert_id else ""
     text = f"{record.severity.value:7}  {event.what}, revision {record.revision}: {record.text}{which}"
     return printable(f"{head}  {text}")
@@ -132,8 +136,14 @@ def clock(stamp_ns: int) -> str:
     """Local time of day with the date if that isn't today's; a stamp from the network may also be none."""
     if (when := local_time(stamp_ns)) is None:
         return "at no time"
-    today = when.date() == datetime.datetime.now().astimezone().date()
-    return when.strftime("%H:%M:%S" if today else "%Y-%m-%d %H:%M:%S")
+    return when.strftime("%H:%M:%S" if _is_today(stamp_ns) else "%Y-%m-%d %H:%M:%S")
+
+
+def _is_today(stamp_ns: int) -> bool:
+    """Of a stamp that is none, too: no."""
+    with contextlib.suppress(OverflowError, ValueError, OSError):
+        return datetime.datetime.fromtimestamp(1e-9 * stamp_ns).date() == datetime.datetime.now().date()
+    return False
 
 
 def printable(text: str) -> str:

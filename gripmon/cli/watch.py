@@ -70,7 +70,8 @@ def watch(arguments: Arguments) -> None:
     monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
 
     With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
-    when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.
+    when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.  An alert has
+    the time of the frame that it is about: where that is recorded or simulated, the recording's own clock.
 
     With --web the same is a page, with what each monitor sees.  Its buttons send what gripmon send does:
     where a router has rules they need an operator's certificate (--zenoh-config).
