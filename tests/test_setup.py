@@ -325,6 +325,44 @@ def test_an_inferred_gripper_is_a_step_that_is_said(tmp_path: Path):
     assert project.states()[4].progress == "ready"
 
 
+def test_a_jaw_range_is_told_where_it_is_said(tmp_path: Path):
+    project = Project(tmp_path)
+    still, _ = project.do("gripper")
+    assert still.level == "WARN" and "they are taken to stand still" in still.text
+    for wrong, said in (("60", "isn't a range"), ("0:60", "millimetres"), ("0.06:0", "doesn't ascend")):
+        project.keep({"jaw_range": wrong})
+        with pytest.raises(InputError, match=f"jaws move: .*{said}"):
+            project.do("gripper")
+        assert project.states()[4].progress == "ready"
+    project.keep({"jaw_range": "0:0.06"})
+    assert project.do("gripper")[0] == Line("the jaws move from 0 to 60 mm", "OK")
+
+
+def test_a_source_given_with_a_step_is_that_steps_alone(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(images / "plate", "my pictures")
+    assert main(["setup", "arm", "--source", "my pictures", "--step", "camera"]) == 0  # named from where a person is
+    assert main(["setup", "arm", "--source", "my pictures/", "--step", "plate"]) == 0
+    for step in ("corners", "gripper", "nose"):
+        assert main(["setup", "arm", "--source", str(images), "--step", step]) == 2
+        assert f"--source: the step {step} takes no images; one of camera, plate, st" in capsys.readouterr().err
+    kept = read_yaml(tmp_path / "arm" / "setup.yaml")["values"]
+    assert (kept["source"], kept["plate_source"], kept["standing_source"]) == ("../my pictures", "../my pictures", "")
+
+
+def test_the_command_of_a_page_can_be_typed_where_a_person_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "my arm"
+    (folder / "standing").mkdir(parents=True)
+    assert main(["setup", str(folder), "--step", "corners"]) == 2
+    assert "first: Lens (camera.yaml)" in capsys.readouterr().err
+    (folder / "camera.yaml").write_text("")
+    (folder / "standing" / "000.png").write_text("")
+    assert main(["setup", str(folder), "--step", "corners"]) == 2
+    assert f"cd '{folder}' && gripmon teach --page standing/000.png" in capsys.readouterr().err
+
+
 def test_what_the_ruler_says_scales_the_target(tmp_path: Path):
     project = Project(tmp_path)
     project.keep({"bar_measured": "153"})
@@ -346,6 +384,7 @@ def test_a_project_that_cant_be_read_or_written(tmp_path: Path, capsys: pytest.C
     assert main(["setup", str(tmp_path / "file"), "--step", "camera"]) == 2
     assert main(["setup", str(tmp_path), "--step", "nose"]) == 2
     assert "is not a step; one of camera, target" in capsys.readouterr().err
+    (tmp_path / "config.yaml").write_text("")
     assert main(["setup", str(tmp_path), "--step", "run"]) == 2
     assert "gripmon run config.yaml --out run" in capsys.readouterr().err
     assert main(["setup", str(tmp_path), "--step", "intrinsics"]) == 2

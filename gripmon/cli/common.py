@@ -15,10 +15,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from gripmon.model.errors import InputError
+from gripmon.model.units import jaw_opening_in, jaw_range_in
 
+_T = TypeVar("_T")
 REQUIRED = {"required": True}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
 NETWORK_OPTIONS = f"""
@@ -240,21 +242,19 @@ def positive_number(text: str) -> float:
 
 def jaw_opening(text: str) -> float:
     """An argument that is a jaw opening, m."""
-    value = 0.0 if text.strip() in ("0", "0.0") else positive_number(text)
-    if value > 0.5:
-        raise argparse.ArgumentTypeError(f"{text} m isn't a jaw opening (millimetres?); metres, 0 to 0.5")
-    return value
+    return _argument(jaw_opening_in, text)
 
 
 def jaw_range(text: str) -> tuple[float, float]:
     """An argument MIN:MAX of jaw openings, m."""
-    low, colon, high = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
-    ends = jaw_opening(low), jaw_opening(high)
-    if not ends[0] < ends[1]:
-        raise argparse.ArgumentTypeError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
-    return ends
+    return _argument(jaw_range_in, text)
+
+
+def _argument(convert: Callable[[str], _T], text: str) -> _T:
+    try:
+        return convert(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:

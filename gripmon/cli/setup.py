@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory
@@ -11,7 +12,7 @@ from gripmon.model.errors import InputError
 _OPTIONS = f"""
 [DIR]            folder of the set-up; made if it is missing (default: this one)
 --source SOURCE  the camera: 0, /dev/video0, a URL, a folder of images, zenoh:WIDTHxHEIGHT[:KEY] or
-                 ros2:WIDTHxHEIGHT:TOPIC
+                 ros2:WIDTHxHEIGHT:TOPIC; with --step plate, standing or teaching: where its images come from
 --step NAME      without a page: carry out this step with what was said in the folder
 {PORT_OPTIONS.strip()}
 """
@@ -36,9 +37,12 @@ def setup(arguments: Arguments) -> None:
     from gripmon.daemon.setup import Project, SetupSite
     from gripmon.teach.page_server import serve
 
-    with contextlib.chdir(make_directory(arguments.dir, "DIR")):
+    folder, source = make_directory(arguments.dir, "DIR"), arguments.source
+    if source is not None and not source.isdecimal() and not os.path.isabs(source) and os.path.exists(source):
+        source = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))  # named from here, kept from there
+    with contextlib.chdir(folder):
         project = Project(Path())
-        project.keep({} if arguments.source is None else {"source": arguments.source})
+        project.keep({} if source is None else {project.source_field(arguments.step): source})
         if arguments.step is not None:
             print("\n".join(f"{line.level:<5} {line.text}".strip() for line in project.do_here(arguments.step, print)))
             return

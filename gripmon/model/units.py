@@ -1,4 +1,4 @@
-"""Lengths and angles for people, with two significant digits: 0.61, 1.2, 340."""
+"""Lengths and angles for people, with two significant digits (0.61, 1.2, 340); jaw openings as people type them."""
 
 from __future__ import annotations
 
@@ -15,3 +15,25 @@ def in_degrees(angle_rad: float) -> str:
 
 def two_digits(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+
+
+def jaw_opening_in(text: str) -> float:
+    """A jaw opening, m, 0 to 0.5; ValueError says what would be right."""
+    try:
+        value_m = float(text)
+    except ValueError:
+        value_m = math.nan
+    if not 0.0 <= value_m <= 0.5:
+        raise ValueError(f"'{text}' isn't a jaw opening (millimetres?); metres, 0 to 0.5")
+    return value_m
+
+
+def jaw_range_in(text: str) -> tuple[float, float]:
+    """MIN:MAX of jaw openings, m; ValueError says what would be right."""
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise ValueError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
+    ends_m = jaw_opening_in(low), jaw_opening_in(high)
+    if not ends_m[0] < ends_m[1]:
+        raise ValueError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
+    return ends_m

@@ -30,6 +30,7 @@ from gripmon.model.atomic import writable_folder, write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.targets import name_of, parse_target
+from gripmon.model.units import jaw_range_in
 
 SETUP = "setup.yaml"
 _FIRST_FRAME_S = 20
@@ -89,6 +90,17 @@ class Project:
         """For one of the steps that take images.  Raises :class:`InputError`."""
         return Capture(self.folder / step, None if step == "teaching" else target_in(self.values))
 
+    def source_field(self, step: str | None) -> str:
+        """Under which name it is kept what a step's images come from, or (None) the monitor's frames.
+
+        Raises :class:`InputError` for a step that takes no images.
+        """
+        name = "source" if step in (None, "camera") else f"{step}_source"
+        if name not in steps.defaults():
+            with_it = ", ".join(each.name for each in STEPS if each.name == "camera" or each.kind == "capture")
+            raise InputError(f"the step {step} takes no images; one of {with_it}, or leave it out", "source")
+        return name
+
     def open_camera(self, step: str) -> Source:
         """What a step's images come from.  Raises :class:`InputError`."""
         text = self.values.get(f"{step}_source") or self.values["source"]
@@ -119,7 +131,9 @@ class Project:
             names = ", ".join(BY_NAME)
             raise InputError(f"{name}: is not a step; one of {names}", "step")
         if step.kind in ("page", "run"):
-            raise InputError(f"{name}: has a command of its own; {self._state(step).command}", "step")
+            state = self._state(step)
+            command = f"cd {shlex.quote(str(self.folder))} && {state.command}"
+            raise InputError(state.note if state.progress == "waits" else f"{name}: has a command of its own; {command}")
         if step.kind == "form":
             return self.do(name)
         capture = self.capture(name)
@@ -254,8 +268,9 @@ class Project:
     def _gripper(self) -> list[Line] | None:
         words = BY_NAME["gripper"].command(self.values)
         if words is None:
+            lines = [_jaws(self.values["jaw_range"]), Line("it comes out of the step Hand and eye", "OK")]
             self._accept("gripper")
-            return [Line("it comes out of the step Hand and eye", "OK")]
+            return lines
         if self.values["gripper"] == steps.FROM_IMAGES:
             return self._gripper_from_images(words)
         if words[0] != "cp":
@@ -333,6 +348,17 @@ class Project:
             [sys.executable, "-m", *words], cwd=self.folder, capture_output=True, text=True, check=False,
             stdin=subprocess.DEVNULL,
         )  # fmt: skip
+
+
+def _jaws(text: str) -> Line:
+    """What an inferred gripper will be told of its jaws."""
+    if not text:
+        return Line("no range is written in which the jaws move: they are taken to stand still, always", "WARN")
+    try:
+        low_m, high_m = jaw_range_in(text)
+    except ValueError as error:
+        raise InputError(f"jaws move: {error}") from None
+    return Line(f"the jaws move from {1e3 * low_m:g} to {1e3 * high_m:g} mm", "OK")
 
 
 def _findings(found: list[dict[str, str]]) -> list[Line]:
