@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -13,7 +14,7 @@ from gripmon.calibrate.detection import detect
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 from gripmon.model.records import Array
-from gripmon.model.targets import Charuco, CircleGrid, Target, name_of, parse_target
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target, name_of, parse_target
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,
@@ -141,6 +142,36 @@ def test_a_board_is_found_where_a_corner_of_the_image_looks_past_its_horizon(qua
         points = points_of(board)
         errors = np.linalg.norm(sight.uv_px - true_uv(wide, T, points)[sight.ids], axis=1)
         assert len(sight) >= 30 and errors.max() < 0.3
+
+
+def swapped(target: Target) -> Target:
+    return msgspec.structs.replace(target, columns=target.rows, rows=target.columns)
+
+
+def test_a_board_whose_columns_and_rows_are_swapped_is_told():
+    """Its marks stand elsewhere then: 8 x 6 squares are another board than 6 x 8."""
+    sight = detect(render(LENS, HELD_MARKED, MARKED, Look(supersampling=2)), swapped(MARKED))
+    assert isinstance(sight, NotFound)
+    assert sight.reason == "the board has 8 x 6 squares, not 6 x 8: columns and rows are swapped"
+    other = detect(render(LENS, HELD_MARKED, MARKED, Look(supersampling=2)), msgspec.structs.replace(MARKED, columns=7))
+    assert isinstance(other, NotFound) and "0 corners of a board of 7 x 6 squares; at least 6" in other.reason
+
+
+@pytest.mark.parametrize(
+    "target", [CircleGrid(columns=9, rows=7, spacing_m=0.008, diameter_m=0.004), Chequerboard(9, 6, 0.012)], ids=name_of
+)
+def test_a_board_without_marks_is_the_same_with_columns_and_rows_swapped(target: Target):
+    """Turned by a quarter, it is that board: the same points, at the same distances from each other, not mirrored."""
+    T = pose(target, (0.0, 0.0, 0.22), (0.3, -0.25), 0.4)
+    image = render(LENS, T, target, Look(supersampling=2), covers=fingers(LENS, 0.2))
+    one, other = found_in(image, target), found_in(image, swapped(target))
+    order = [cKDTree(other.uv_px).query(uv)[1] for uv in one.uv_px]
+    np.testing.assert_allclose(other.uv_px[order], one.uv_px, atol=1e-9)
+    design = np.column_stack([one.plate_m[:, :2], np.ones(len(one))])
+    change, *_ = np.linalg.lstsq(design, other.plate_m[order, :2], rcond=None)
+    np.testing.assert_allclose(design @ change, other.plate_m[order, :2], atol=1e-9)
+    np.testing.assert_allclose(change[:2] @ change[:2].T, np.eye(2), atol=1e-9)
+    assert np.linalg.det(change[:2]) > 0.0
 
 
 def test_a_mirrored_board_is_told():

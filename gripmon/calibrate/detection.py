@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -56,11 +57,16 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     shown = to_bytes(grey)
     board, corners, ids, marks = _marked_corners(shown, target)
     if 2 * len(ids) < (target.columns - 1) * (target.rows - 1):
+        turned = msgspec.structs.replace(target, columns=target.rows, rows=target.columns)
+        if len(_marked_corners(shown, turned)[2]) > max(len(ids), FEWEST["charuco"] - 1):
+            sizes = f"{turned.columns} x {turned.rows} squares, not {turned.rows} x {turned.columns}"
+            return NotFound(f"the board has {sizes}: columns and rows are swapped")
         # In a mirrored board some markers look like others of the dictionary.
         if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
             return NotFound("the board is mirrored; an image that isn't flipped")
         if len(ids) < FEWEST["charuco"]:
-            said = f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}"
+            board_is = f"a board of {target.columns} x {target.rows} squares"
+            said = f"{marks} marks and {len(ids)} corners of {board_is}; at least {FEWEST['charuco']}"
             return NotFound(_blurred(grey) or said)
     plate = np.asarray(board.getChessboardCorners(), np.float64)
     # Markers are in the white squares, and must be outside the windows.
