@@ -53,6 +53,13 @@ def test_the_driver_in_python_is_heard():
         link.close()
 
 
+def test_without_a_monitor_the_driver_ends_in_one_line():
+    code = block("python").replace(DEFAULT_ENDPOINT, endpoint := free_endpoint())
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr == f"nothing answers on {endpoint}; start the monitor or the router first\n"
+
+
 def _read(camera: NetworkCamera, frames: list[Frame]) -> None:
     if isinstance(item := camera.read(), Frame):
         frames.append(item)
