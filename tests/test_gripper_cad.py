@@ -276,6 +276,21 @@ def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, caps
     assert "is there already" in capsys.readouterr().err
 
 
+def test_a_mesh_named_twice_and_one_as_small_as_none_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    left, right = write_meshes(box_meshes(sharp_gripper()), tmp_path)
+    assert from_cad(left, right, left, "--unit", "mm", "--out", tmp_path / "g.yaml") == 2
+    assert f"{left}: is named twice; a mesh for each finger" in capsys.readouterr().err
+    for mesh in box_meshes(sharp_gripper()):
+        mesh.apply_scale(1.0 / 25.4)  # inches, read as millimetres
+        assert from_cad(*write_meshes([mesh], tmp_path), "--unit", "mm", "--out", tmp_path / "g.yaml", "--force") == 0
+        assert "a finger of 1.6 mm: is its unit right?" in capsys.readouterr().out
+    assert from_cad(*write_meshes([mesh], tmp_path), "--unit", "in", "--out", tmp_path / "g.yaml", "--force") == 0
+    assert "unit" not in capsys.readouterr().out
+    words = ("--camera", tmp_path / "g.yaml", "--view", "0.12:30")
+    assert from_cad(right, "--unit", "mm", *words, "--out", tmp_path / "other.yaml") == 2
+    assert "g.yaml: holds no calibration, it is a gripper file; a file of gripmon cal" in capsys.readouterr().err
+
+
 def test_a_gripper_of_two_meshes_is_not_named_after_one_of_its_fingers(tmp_path: Path):
     paths = write_meshes(box_meshes(sharp_gripper()), tmp_path)
     for words, name in (((), "hand"), (("--name", "mine"), "mine")):

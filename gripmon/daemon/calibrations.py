@@ -20,7 +20,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import read_camera, read_hand_eye
-from gripmon.daemon.config.yaml_file import as_yaml, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_settings, read_yaml
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
 from gripmon.model.camera import LensSettings, make_camera
@@ -68,7 +68,8 @@ def _of_yaml(path: Path, values: dict[str, object]) -> Calibrated:
         return readers[str(values["schema"])](path)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
-    raise InputError(f"{path}: holds no calibration; {_RIGHT}")
+    kind = kind_of(values)
+    raise InputError(f"{path}: holds no calibration{f', it is {kind}' if kind else ''}; {_RIGHT}")
 
 
 def _camera(path: Path) -> Calibrated:

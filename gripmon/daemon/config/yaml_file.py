@@ -70,7 +70,7 @@ def read_configuration(path: Path) -> dict[str, Any]:
     file of ours, which it names.
     """
     values = read_yaml(path)
-    kind = _kind_of(values)
+    kind = kind_of(values)
     if kind is not None and kind != "a configuration":
         right = "a configuration, such as gripmon teach writes"
         right += f"; this file belongs there under {_NAMED_UNDER[kind]}" if kind in _NAMED_UNDER else ""
@@ -78,7 +78,7 @@ def read_configuration(path: Path) -> dict[str, Any]:
     return values
 
 
-def _kind_of(values: dict[str, Any]) -> str | None:
+def kind_of(values: dict[str, Any]) -> str | None:
     """Which file of ours this is, in words; None if it looks like none."""
     known = _SCHEMAS.get(str(values.get("schema")).partition("/")[0])
     return known or next((what for key, what in _LOOKS_LIKE.items() if key in values), None)
@@ -89,7 +89,7 @@ def read_document(path: Path, kind: type[_T]) -> _T:
     values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
     schema = values.get("schema")
     if schema is None:
-        looks = f"; this looks like {_kind_of(values)}" if _kind_of(values) else ""
+        looks = f"; this looks like {kind_of(values)}" if kind_of(values) else ""
         raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
     if schema != tag:
         words = [_SCHEMAS.get(str(name).partition("/")[0]) for name in (schema, tag)]

@@ -30,6 +30,8 @@ from gripmon.teach.cad.written import gripper_text, model_of
 FORMATS = (*MESHES, ".urdf", ".cao")
 LONGEST_M = 0.3
 """A finger that is longer than that is an arm, or in another unit."""
+SHORTEST_M = 0.005
+"""One that is shorter spans some tens of pixels before a wrist camera at most, or is in another unit: that is said."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +189,9 @@ def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | N
             raise InputError(f"{path}: is not a format of CAD that is read here; one of {', '.join(FORMATS)}")
         if not path.is_file():
             raise InputError(f"{path}: there is no such file; one of {', '.join(FORMATS)}")
+    for k, path in enumerate(paths):
+        if path.resolve() in [other.resolve() for other in paths[:k]]:
+            raise InputError(f"{path}: is named twice; a mesh for each finger, where it stands, or both in one file")
     if any(path.suffix.lower() == ".urdf" for path in paths):
         if len(paths) > 1:
             raise InputError(f"{paths[0]}: and {len(paths) - 1} more files; a URDF by itself")
@@ -208,7 +213,7 @@ def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | N
         for body in bodies:
             surfaces.append(_checked(surface_of(body), body.name))
             step()
-    notes += [note for body, surface in zip(bodies, surfaces, strict=True) for note in _holes(surface, body.name)]
+    notes += [note for body, surface in zip(bodies, surfaces, strict=True) for note in _odd(surface, body.name)]
     names = _names(len(surfaces), [body.name for body in bodies])
     order = _left_to_right(surfaces)
     return Parts({n: surfaces[k] for n, k in zip(names, order, strict=True)}, [], [], notes)
@@ -238,7 +243,7 @@ def _of_linkage(path: Path, linkage: Linkage) -> Parts:
             "holds fingers that don't turn: a mesh of the finger that stands, or of both at the opening that is used"
         )
     surfaces = [_checked(surface_of(m.body), m.body.name) for m in straight]
-    notes = [note for m, s in zip(straight, surfaces, strict=True) for note in _holes(s, m.body.name)]
+    notes = [note for m, s in zip(straight, surfaces, strict=True) for note in _odd(s, m.body.name)]
     turning = [m.body for m in linkage.moving if m.turns_rad > TURNS_RAD]
     if turning:
         names = ", ".join(body.name for body in turning)
@@ -273,12 +278,17 @@ def _checked(surface: Surface, name: str) -> Surface:
     return surface
 
 
-def _holes(surface: Surface, name: str) -> list[str]:
-    """What is said of a surface that isn't closed: its borders show as edges."""
+def _odd(surface: Surface, name: str) -> list[str]:
+    """What is said of a surface as small as none by its unit, and of one that isn't closed: its borders show as edges."""
+    out = []
+    longest_m = float(np.ptp(surface.points_m, axis=0).max())
+    if longest_m < SHORTEST_M:
+        out.append(f"{name}: a finger of {1e3 * longest_m:.2g} mm: is its unit right?")
     count = int(np.count_nonzero(surface.border))
-    if not count:
-        return []
-    return [f"{name}: the surface is open ({count} sides of triangles have no neighbour): borders are taken as edges"]
+    if count:
+        no = f"{count} sides of triangles have no neighbour"
+        out.append(f"{name}: the surface is open ({no}): borders are taken as edges")
+    return out
 
 
 def _kind(surface: Surface) -> str:
