@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.meters import box_gripper, difference, moved
-from support.simulated import nominal_cam_T_grip
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, rendered, watch, watched
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.model.camera import make_camera
 from gripmon.model.geometry import invert
+from gripmon.model.poses import perturb
 from gripmon.model.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
@@ -155,6 +158,19 @@ def test_drift_is_that_of_equation_14_and_the_tcps_way():
     told = np.array([record.drift.tcp_shift_m for record in seen.records])
     assert np.median(np.abs(told - true)[:, :2]) < 1e-5
     assert np.linalg.norm(true[-1]) > 1e-3, "the creep is a creep"
+
+
+def test_a_step_says_from_where_its_size_counts():
+    """A reference that is 0.6 mm off, as its own uncertainty allows: that is no part of the knock's 4.5 mm."""
+    frames, truths = frames_of("bump")
+    off = reference_of(perturb(nominal_cam_T_grip(), np.array([6e-4, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    rough = tuple(np.diag(np.square([3e-4] * 3 + [2e-3] * 3)).ravel().tolist())
+    reference = msgspec.structs.replace(off, covariance=rough)
+    monitor = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference)
+    seen = watch(frames, truths, monitor)
+    raised, *_ = [alert for record in seen.records for alert in record.alerts if alert.kind is AlertKind.STEP]
+    assert truths[-1].tcp_shift_m == pytest.approx(raised.tcp_shift_m, abs=1e-4)
+    assert " mm from where the first frames had it" in raised.text and "reference" not in raised.text
 
 
 @pytest.mark.parametrize("measurement", ["edges", "corners"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -71,6 +73,12 @@ def test_a_creep_says_how_fast_and_how_long_until_the_limit():
     assert "past the limit" in past.text
     [step] = settled().feed(seen(0.5)).alerts
     assert (step.rate_m_per_min, step.time_left_s) == (None, None)
+
+
+@pytest.mark.parametrize(("since_first", "where"), [(False, "the reference"), (True, "the first frames")])
+def test_a_motion_says_from_where_its_size_counts(since_first: bool, where: str):
+    [alert] = settled().feed(replace(seen(0.5), since_first=since_first)).alerts
+    assert alert.text.startswith(f"a step: TCP now +0.500 +0.000 +0.000 mm from where {where} had it (1 sigma")
 
 
 def test_causes_and_the_part_are_in_the_alerts():

@@ -45,11 +45,18 @@ def test_a_transform_is_suspect_while_its_error_may_exceed_an_alert_limit():
     assert judged(limit_m, limit_rad) == (VALID, None)
     verdict, reason = judged(1.05 * limit_m, 1e-3)
     assert verdict is SUSPECT and reason is not None
-    assert reason.startswith("the TCP may be") and "alert limit 1 mm (edge a belongs" in reason
+    off, why = reason.split("; ")
+    assert off == "the TCP may be 1.1 mm off, alert limit 1 mm"
+    assert why == "it can't be excluded that edge a belongs to something else"
     verdict, reason = judged(1e-4, 1.05 * limit_rad)
     assert verdict is SUSPECT and reason is not None and reason.startswith("the rotation may be")
     itself = run.feed(seen(protection=Protection(0.5, 1e-3, 1e-5, NOTHING_WRONG))).reason
-    assert itself is not None and "nothing is wrong" not in itself and "too little of the gripper is seen" in itself
+    assert itself == "it isn't determined how far the TCP is off, alert limit 1 mm; too little of the gripper is seen"
+    for far in ((0.452, 1e-3), (math.nan, 1e-3), (1e-4, 1.7)):
+        reason = judged(*far)[1] or ""
+        assert reason.startswith("it isn't determined how far the "), (
+            "the figure would be of the prior, not of the image"
+        )
     assert judged(math.nan, 1e-3)[0] is SUSPECT and judged(1e-4, math.nan)[0] is SUSPECT, "NaN bounds nothing"
     assert run.feed(seen(protection=None)).verdict is SUSPECT
     assert run.feed(seen(sigma=np.full(6, 0.1))).verdict is VALID, "bounds count, which are made of covariances"

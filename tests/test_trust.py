@@ -372,7 +372,7 @@ def test_while_something_hides_the_gripper_a_held_transform_has_no_bound():
     for i in held:
         protection = seen.records[i].protection
         assert protection is not None and protection.position_m == 1.0
-        assert protection.hypothesis == "knocked while nothing is seen of the gripper"
+        assert protection.hypothesis == "the mount was knocked while nothing is seen of the gripper"
 
 
 def test_with_both_tips_hidden_the_bound_is_never_smaller_than_before():
@@ -462,7 +462,7 @@ def test_what_first_frames_differ_by_is_in_the_bound_until_accepted():
     assert errors_m(seen)[-1] < 1e-4 and (bounds_m(seen) > 2e-3).all()
     assert not valid(seen).any()
     protection = seen.records[-1].protection
-    assert protection is not None and protection.hypothesis.startswith("at the start it wasn't where")
+    assert protection is not None and protection.hypothesis.startswith("the mount was knocked before the start, or")
     monitor._trust.rebase(reference_of(nominal_cam_T_grip()))
     assert watch(frames, truths, monitor).records[-1].protection.position_m < 1e-3, "a new reference explains it"
 

@@ -343,6 +343,7 @@ class Monitor:
             self._standing.where_it_was,
             self._trust.swing,
             self._standing.believed,
+            since_first=self._baseline.error is not None and bool(self._baseline.error.any()),
         )
 
     def _since_start(self, shift: Array) -> Array | None:

@@ -295,5 +295,5 @@ class Integrity:
 def _reaching(standing: Standing, other_T: Array) -> Standing:
     """The same where the gripper may as well be at another pose (4, 4)."""
     away = perturbation_between(standing.cam_T_grip, other_T)
-    bound = reaching(standing.protection, away, "the fingers' ends are seen elsewhere, too")
+    bound = reaching(standing.protection, away, "the fingers stand elsewhere, where their ends are seen, too")
     return replace(standing, protection=bound, believed=False)

@@ -16,7 +16,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Protection, ReferenceRecord
+from gripmon.model.records import NOTHING_WRONG, Array, Protection, ReferenceRecord
 from gripmon.monitor.anchor import Anchor, Lasting
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
@@ -126,7 +126,7 @@ class Weigher:
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
-            return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen"), False)
+            return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG), False)
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses = fits.hypotheses
@@ -216,7 +216,8 @@ class Weigher:
         """
         risk = protection.risk
         if self._knocked(unseen_s, hidden) > risk:
-            return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "knocked while nothing is seen of the gripper")
+            why = "the mount was knocked while nothing is seen of the gripper"
+            return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
         position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
         return Protection(
             protection.position_m + position_m, protection.rotation_rad + rotation_rad, risk, protection.hypothesis
@@ -283,7 +284,7 @@ class Weigher:
         risk = self._policy.integrity_risk
         covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
         position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
-        why = "at the start it wasn't where the reference has it: knocked before, or the model is off"
+        why = "the mount was knocked before the start, or the model is off: it wasn't where the reference has it"
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
@@ -359,7 +360,7 @@ def foresee_protection(
 ) -> Protection:
     """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
     if not len(measurement.normal.edge):
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
+        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
     hypotheses = _hypotheses_about(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )

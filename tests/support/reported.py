@@ -116,7 +116,7 @@ def said(run: list[FrameRecord], i: int, **changes: object) -> None:
         AlertKind.STEP,
         Cause.CAMERA_MOUNT,
         Severity.ERROR,
-        "a step against the reference",
+        "a step: TCP now 3 mm from where the reference had it",
         event=AlertEvent.RAISED,
         alert_id="1-a",
         since_ns=run[i].stamp_ns,

@@ -30,6 +30,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.units import in_degrees, in_mm
+from gripmon.track.edges import VAGUE_M, VAGUE_RAD
 
 NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 """Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
@@ -70,6 +71,8 @@ class Evidence:
     ``where_it_was``: the gripper is where it proved to be before, so that no second frame has to say so.
     ``swing`` (6,): variance of the way between one proven pose and the next, m² and rad²; None where that isn't known.
     ``believed``: the gripper may be taken to be there.
+    ``since_first``: ``motion`` is reckoned from where the first frames had the camera, which the reference allows, not
+    from the reference.
     """
 
     shift: Array
@@ -85,6 +88,7 @@ class Evidence:
     where_it_was: bool = False
     swing: Array | None = None
     believed: bool = True
+    since_first: bool = False
 
     @property
     def moved(self) -> bool:
@@ -331,7 +335,7 @@ class Policy:
             rate = motion.creep.rate_m_per_min
             left_s = time_left_s(motion.shift, motion.creep.velocity, settings.limit_m, settings.limit_rad)
         x, y, z = motion.shift[:3].tolist()
-        parts = [_motion_text(motion), _creep_text(rate, left_s), explanation.text]
+        parts = [_motion_text(motion, evidence.since_first), _creep_text(rate, left_s), explanation.text]
         return Alert(
             kind=motion.kind,
             cause=explanation.probable.cause,
@@ -347,18 +351,27 @@ class Policy:
 
 
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
-    """Which bound is not within its alert limit, in words; None where both are.  One that is NaN bounds nothing."""
+    """Which bound is not within its alert limit, in words; None where both are.  One that is NaN bounds nothing.
+
+    What makes a bound as large is a hypothesis: it can't be excluded, which doesn't say that it is so.
+    """
     if protection is None:
         return "no bound on the error is known"
-    why = "too little of the gripper is seen" if protection.hypothesis == NOTHING_WRONG else protection.hypothesis
-    hypothesis = f" ({why})" if why else ""
-    if not protection.position_m <= settings.alert_limit_m:
-        limit_mm = 1e3 * settings.alert_limit_m
-        return f"the TCP may be {in_mm(protection.position_m)} mm off, alert limit {limit_mm:g} mm{hypothesis}"
-    if not protection.rotation_rad <= settings.alert_limit_rad:
-        may, limit = in_degrees(protection.rotation_rad), in_degrees(settings.alert_limit_rad)
-        return f"the rotation may be {may} degrees off, alert limit {limit} degrees{hypothesis}"
-    return None
+    position_m, rotation_rad = protection.position_m, protection.rotation_rad
+    if not position_m <= settings.alert_limit_m:
+        what, limit = "TCP", f"{1e3 * settings.alert_limit_m:g} mm"
+        may = f"{in_mm(position_m)} mm" if position_m <= VAGUE_M else None
+    elif not rotation_rad <= settings.alert_limit_rad:
+        what, limit = "rotation", f"{in_degrees(settings.alert_limit_rad)} degrees"
+        may = f"{in_degrees(rotation_rad)} degrees" if rotation_rad <= VAGUE_RAD else None
+    else:
+        return None
+    if protection.hypothesis == NOTHING_WRONG:
+        why = "; too little of the gripper is seen"
+    else:
+        why = f"; it can't be excluded that {protection.hypothesis}" if protection.hypothesis else ""
+    off = f"the {what} may be {may} off" if may else f"it isn't determined how far the {what} is off"
+    return f"{off}, alert limit {limit}{why}"
 
 
 def _severity(past_warning: float, past_limit: float, before: Alert | None) -> Severity:
@@ -372,12 +385,14 @@ def _severity(past_warning: float, past_limit: float, before: Alert | None) -> S
     return Severity.WARNING if past_warning >= (RELEASE_RATIO if warned else 1.0) else Severity.INFO
 
 
-def _motion_text(motion: Motion) -> str:
+def _motion_text(motion: Motion, since_first: bool) -> str:
+    """How it moved last, and by how much it is off in all: of a step after a creep that is more than the step."""
     x, y, z = (1e3 * motion.shift[:3]).tolist()
     sx, sy, sz = (1e3 * motion.sigma[:3]).tolist()
     turn = math.degrees(float(np.linalg.norm(motion.shift[3:])))
     return (
-        f"{_MOTION_KINDS[motion.kind]} against the reference: TCP {x:+.3f} {y:+.3f} {z:+.3f} mm "
+        f"{_MOTION_KINDS[motion.kind]}: TCP now {x:+.3f} {y:+.3f} {z:+.3f} mm from where "
+        f"{'the first frames' if since_first else 'the reference'} had it "
         f"(1 sigma {sx:.3f} {sy:.3f} {sz:.3f}), turned by {turn:.3f} degrees"
     )
 

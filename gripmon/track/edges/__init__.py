@@ -9,7 +9,7 @@ from gripmon.track.edges.ends import (
 )
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
-from gripmon.track.edges.robust_fit import prior_information
+from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, prior_information
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement, MeasurementSettings
 from gripmon.track.edges.sums import edge_sums
@@ -20,6 +20,8 @@ from gripmon.track.edges.warming import warm_up
 
 __all__ = [
     "JAW_UNREPORTED_SIGMA_M",
+    "VAGUE_M",
+    "VAGUE_RAD",
     "Effort",
     "Expected",
     "FingerEnds",

@@ -191,11 +191,15 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
     return starts
 
 
+VAGUE_M, VAGUE_RAD = 0.1, 1.0
+"""Standard deviations of a pose of which nothing is known."""
+
+
 def prior_information(jaw_sigma_m: float | None) -> Array:
     """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
 
     With a ``jaw_sigma_m`` the jaw opening is the seventh unknown, and the reported one is worth that standard
     deviation (at least a micrometre, which stands for "exact").
     """
-    pose = [1.0 / 0.1**2] * 3 + [1.0] * 3
+    pose = [VAGUE_M**-2] * 3 + [VAGUE_RAD**-2] * 3
     return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
