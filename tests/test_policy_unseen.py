@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from support.policy_runs import (
     BENT,
+    BEYOND,
     BLACK,
     CLEARED,
     HIDDEN,
     LOST,
+    PERIOD_S,
     RAISED,
     SETTINGS,
     SUSPECT,
+    TRACKING,
     UNKNOWN,
     UPDATED,
     VALID,
     Nothing,
     Run,
+    alerts_of,
     explained,
     kinds,
     seen,
     settled,
 )
 
-from gripmon.judge.policy import Policy, PolicySettings
+from gripmon.judge.policy import Evidence, Policy, PolicySettings
 from gripmon.model.records import NOTHING_WRONG, AlertKind, Cause, Protection, Verdict
 
 K = AlertKind
@@ -60,6 +65,38 @@ def test_a_transform_is_suspect_while_its_error_may_exceed_an_alert_limit():
     assert judged(math.nan, 1e-3)[0] is SUSPECT and judged(1e-4, math.nan)[0] is SUSPECT, "NaN bounds nothing"
     assert run.feed(seen(protection=None)).verdict is SUSPECT
     assert run.feed(seen(sigma=np.full(6, 0.1))).verdict is VALID, "bounds count, which are made of covariances"
+
+
+def test_a_place_that_nothing_proves_any_more_is_told_after_as_long_as_a_transform_is_held():
+    """Knocked along its fingers, or hidden: frames are suspect, and the state goes on to be ``tracking``."""
+    run, doubted = settled(), seen(protection=BEYOND, unproven=True)
+    frames = round(SETTINGS.hold_s / PERIOD_S)
+    assert kinds(run.feed_all([doubted] * frames)) == [], "an ordinary grasp hides the ends for a moment"
+    since = datetime.fromtimestamp(run.now_s - (frames - 1) * PERIOD_S, UTC)
+    [alert] = run.feed(doubted).alerts
+    assert (alert.kind, alert.event, alert.cause, alert.severity) == (K.OCCLUDED, RAISED, Cause.UNKNOWN, "warning")
+    assert f"not been seen where they should be since {since:%Y-%m-%d %H:%M:%S} UTC" in alert.text
+    assert kinds(run.feed_all([doubted, HIDDEN] * 8)) == [], "it is the same"
+    cleared = run.feed_all([seen()] * 4)
+    assert kinds(cleared) == [(K.OCCLUDED, CLEARED)] and cleared[-1].state is TRACKING
+
+
+def test_hidden_fingers_that_show_without_their_ends_are_told_as_that():
+    """What was said of an older frame doesn't hold: edges are seen again, and they prove nothing."""
+    run, doubted = settled(), seen(protection=BEYOND, unproven=True)
+    run.feed_all([HIDDEN] * 3)
+    told = alerts_of(run.feed_all([doubted, HIDDEN] * 20))
+    assert {alert.kind for alert in told} == {K.OCCLUDED} and {alert.event for alert in told} == {UPDATED}
+    assert len(told) == 1 and "not been seen where they should be" in told[0].text
+
+
+@pytest.mark.parametrize(
+    "between", [seen(), seen(protection=BEYOND), seen(unproven=True)], ids=["valid", "proven", "bounded"]
+)
+def test_what_is_proven_or_bounded_now_and_then_is_no_news(between: Evidence):
+    run, doubted = settled(), seen(protection=BEYOND, unproven=True)
+    stretch = [doubted] * round(SETTINGS.hold_s / PERIOD_S)
+    assert kinds(run.feed_all([*stretch, between] * 5)) == []
 
 
 def test_every_second_frame_hidden_is_never_lost_and_never_valid():

@@ -344,6 +344,7 @@ class Monitor:
             self._trust.swing,
             self._standing.believed,
             since_first=self._baseline.error is not None and bool(self._baseline.error.any()),
+            unproven=self._standing.unproven,
         )
 
     def _since_start(self, shift: Array) -> Array | None:

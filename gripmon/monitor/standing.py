@@ -49,8 +49,9 @@ class Standing:
 
     ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
     it; ``where_it_was``: the anchor has it there; ``grasped``: something between the fingers may have shifted their
-    inner edges, and with them the opening; ``knocked``: it is there from this frame on; ``finer``: what the gripper's
-    look makes of it, which then is the pose.
+    inner edges, and with them the opening; ``knocked``: it is there from this frame on; ``unproven``: nothing in the
+    frame proves it, though something did before; ``finer``: what the gripper's look makes of it, which then is the
+    pose.
     """
 
     measurement: Measurement
@@ -61,4 +62,5 @@ class Standing:
     where_it_was: bool
     grasped: bool = False
     knocked: bool = False
+    unproven: bool = False
     finer: Fused | None = None

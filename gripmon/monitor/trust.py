@@ -238,14 +238,17 @@ class Integrity:
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px)
-        if trust.proven and (moved or not trust.displaced):
+        settles = trust.proven and (moved or not trust.displaced)
+        unproven = self._weigher.anchor is not None and not settles
+        if settles:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if frame.image is not None and not moved:
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         at = measurement, cam_T_grip, covariance, trust.protection
-        return Standing(*at, believed, where_it_was, trust.grasped, knocked=moved and beside_px >= ONE_EDGE_PX)
+        knocked = moved and beside_px >= ONE_EDGE_PX
+        return Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
         """Whether the mount was knocked, the edges showing ``beside_px`` from the old place: so rare that one lucky
@@ -263,7 +266,8 @@ class Integrity:
         number, cam_T_grip, covariance = trust.instead
         seen = self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
-        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed=False, where_it_was=True)
+        at = measurement, cam_T_grip, covariance, trust.protection
+        return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
     def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
         """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""

@@ -52,6 +52,7 @@ def seen(
     stream_at_fault: bool = False,
     protection: Protection | None = BOUNDED,
     where_it_was: bool = False,
+    unproven: bool = False,
 ) -> Evidence:
     """A measured frame: the TCP shifted along the camera's x axis, turned about z; any shift is one that the drift test
     has found unless ``present`` says otherwise.
@@ -74,6 +75,7 @@ def seen(
         stream_at_fault,
         protection,
         where_it_was,
+        unproven=unproven,
     )
 
 

@@ -9,13 +9,13 @@ begin one; ``unknown``, don't move by it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from gripmon.judge.policy.alerts import AlertBook
 from gripmon.judge.policy.settings import PolicySettings, time_left_s
+from gripmon.judge.policy.words import creep_text, frequency_text, motion_text, unproven_text
 from gripmon.model.records import (
     NOTHING_WRONG,
     Alert,
@@ -49,9 +49,6 @@ MOTION, VIBRATION, VIEW, IMAGE, GRIPPER, RENEWAL = "motion", "vibration", "view"
 STREAM = "stream:"
 """What alerts are about; of each there is one open at a time."""
 
-_MOTION_KINDS = {AlertKind.STEP: "a step", AlertKind.CREEP: "a creep", AlertKind.DRIFT: "a drift"}
-
-
 NO_EXPLANATION = Explanation()
 
 VIBRATION_SIGMAS = 3.0
@@ -72,7 +69,7 @@ class Evidence:
     ``swing`` (6,): variance of the way between one proven pose and the next, m² and rad²; None where that isn't known.
     ``believed``: the gripper may be taken to be there.
     ``since_first``: ``motion`` is reckoned from where the first frames had the camera, which the reference allows, not
-    from the reference.
+    from the reference.  ``unproven``: nothing in the frame proves where the gripper is, though a frame before did.
     """
 
     shift: Array
@@ -89,6 +86,7 @@ class Evidence:
     swing: Array | None = None
     believed: bool = True
     since_first: bool = False
+    unproven: bool = False
 
     @property
     def moved(self) -> bool:
@@ -123,6 +121,7 @@ class Policy:
         self._still = 0
         self._still_shift: Array = np.zeros(6)
         self._bad_since_s: float | None = None
+        self._unproven_since: tuple[float, int] | None = None  # by the frames' time, s, and by their stamps, ns
 
     def measured(self, evidence: Evidence, now_s: float, stamp_ns: int) -> Judgement:
         """A frame from which a transform could be measured."""
@@ -145,19 +144,25 @@ class Policy:
         else:
             state = State.TRACKING
         self.state = state
-        reason = self._doubt(evidence, confirmed)
+        beyond = past_alert_limit(evidence.protection, settings)
+        reason = self._doubt(evidence, confirmed, beyond)
+        if beyond is None or not evidence.unproven:
+            self._unproven_since = None
+        elif self._unproven_since is None:
+            self._unproven_since = now_s, stamp_ns
         verdict = Verdict.VALID if reason is None else Verdict.SUSPECT
         return Judgement(state, verdict, self._alerts_of(evidence, moved, now_s, stamp_ns), recalibrate, reason)
 
-    def _doubt(self, evidence: Evidence, confirmed: bool) -> str | None:
-        """Why a measured transform isn't valid; None where it is."""
+    @staticmethod
+    def _doubt(evidence: Evidence, confirmed: bool, beyond: str | None) -> str | None:
+        """Why a measured transform isn't valid, its bound being ``beyond`` a limit or not; None where it is."""
         if not confirmed:
             return "not yet confirmed by a second frame"
         if evidence.stream_at_fault:
             return "the stream of frames is at fault"
         if evidence.explanation.probable.cause in NO_REFERENCE:
             return evidence.explanation.text or str(evidence.explanation.probable.cause)
-        return past_alert_limit(evidence.protection, self._settings)
+        return beyond
 
     def unmeasured(
         self,
@@ -201,8 +206,11 @@ class Policy:
             cause, causes = probable.cause, explanation.causes
             occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
             before = book.about(VIEW)
-            # Lost isn't taken back for one frame, nor is it over while frames in between show nothing.
-            told = occluded if before is None or before.kind is AlertKind.OCCLUDED else before
+            # Lost isn't taken back for one frame, nor is it over while frames in between show nothing; and a place that
+            # nothing proves is not proven by them.
+            since = self._unproven_since
+            lasts = since is not None and now_s - since[0] >= settings.hold_s
+            told = occluded if before is None or (before.kind is AlertKind.OCCLUDED and not lasts) else before
             alerts += book.present(VIEW, told, now_s, stamp_ns)
         if refusal and lasted_s >= settings.image_alert_after_s:
             text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
@@ -296,7 +304,15 @@ class Policy:
     def _alerts_of(self, evidence: Evidence, moved: bool, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
         book, motion, probable = self.alerts, evidence.motion, evidence.explanation.probable
         not_the_camera = probable.cause in NOT_THE_CAMERA
-        alerts = book.absent(VIEW, "the gripper is measured again", now_s)
+        since = self._unproven_since
+        if since is not None and now_s - since[0] >= self._settings.hold_s:
+            # As long as a transform is held of which nothing is seen.
+            text = unproven_text(since[1])
+            unproven = Alert(AlertKind.OCCLUDED, Cause.UNKNOWN, Severity.WARNING, text)
+            before = book.about(VIEW)
+            alerts = book.present(VIEW, unproven, now_s, stamp_ns, news=before is not None and before.text != text)
+        else:
+            alerts = book.absent(VIEW, "the gripper is measured again", now_s)
         alerts += book.absent(IMAGE, "images are good again", now_s)
         # What lies in the gripper or the lens is told once, as that.
         if moved and (not not_the_camera or book.about(MOTION) is not None):
@@ -306,7 +322,7 @@ class Policy:
         vibration = motion.vibration
         if vibration is not None:
             size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
-            text = f"the camera vibrates: TCP {size_mm:.3f} mm rms{_frequency(hertz)}"
+            text = f"the camera vibrates: TCP {size_mm:.3f} mm rms{frequency_text(hertz)}"
             severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(VIBRATION))
             alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
             alerts += book.present(VIBRATION, alert, now_s, stamp_ns)
@@ -335,7 +351,7 @@ class Policy:
             rate = motion.creep.rate_m_per_min
             left_s = time_left_s(motion.shift, motion.creep.velocity, settings.limit_m, settings.limit_rad)
         x, y, z = motion.shift[:3].tolist()
-        parts = [_motion_text(motion, evidence.since_first), _creep_text(rate, left_s), explanation.text]
+        parts = [motion_text(motion, evidence.since_first), creep_text(rate, left_s), explanation.text]
         return Alert(
             kind=motion.kind,
             cause=explanation.probable.cause,
@@ -385,41 +401,7 @@ def _severity(past_warning: float, past_limit: float, before: Alert | None) -> S
     return Severity.WARNING if past_warning >= (RELEASE_RATIO if warned else 1.0) else Severity.INFO
 
 
-def _motion_text(motion: Motion, since_first: bool) -> str:
-    """How it moved last, and by how much it is off in all: of a step after a creep that is more than the step."""
-    x, y, z = (1e3 * motion.shift[:3]).tolist()
-    sx, sy, sz = (1e3 * motion.sigma[:3]).tolist()
-    turn = math.degrees(float(np.linalg.norm(motion.shift[3:])))
-    return (
-        f"{_MOTION_KINDS[motion.kind]}: TCP now {x:+.3f} {y:+.3f} {z:+.3f} mm from where "
-        f"{'the first frames' if since_first else 'the reference'} had it "
-        f"(1 sigma {sx:.3f} {sy:.3f} {sz:.3f}), turned by {turn:.3f} degrees"
-    )
-
-
-def _creep_text(rate_m_per_min: float | None, left_s: float | None) -> str:
-    if rate_m_per_min is None:
-        return ""
-    text = f"{1e3 * rate_m_per_min:.3f} mm/min"
-    if left_s is None:
-        return text
-    return f"{text}, {_duration(left_s)} to the limit" if left_s > 0.0 else f"{text}, past the limit"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
-
-
 def _gripper_alert(explanation: Explanation) -> Alert:
     probable = explanation.probable
     kind = AlertKind.LENS if probable.cause is Cause.LENS else AlertKind.GRIPPER
     return Alert(kind, probable.cause, Severity.ERROR, explanation.text, part=probable.part, causes=explanation.causes)
-
-
-def _frequency(hertz: float) -> str:
-    """With two digits below ten; nothing where there is none, as among frames with one stamp."""
-    if hertz <= 0.0:
-        return ""
-    return f" at about {hertz:.0f} Hz" if hertz >= 9.95 else f" at about {hertz:.2g} Hz"
