@@ -1,4 +1,4 @@
-"""Is this frame an image that the monitor can measure?  Looks at some 1,500 pixels, whatever the image's size."""
+"""Is this frame an image that the monitor can measure?  Examines about 1,700 pixels, whatever the image's size."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, Image, Refusal
 
 _DARK, _FLAT = 0.02, 0.01
-"""Parts of the full scale: nothing brighter is black, nothing as far from the top is white, no more spread is flat."""
+"""Parts of the full scale: an image is black if nothing is brighter than the first, white if nothing is farther than
+that from the top, flat if its grey levels spread no more than the second.
+"""
 
 _FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
 
@@ -19,14 +21,14 @@ FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(
 
 
 def sparse(image: Image) -> Image:
-    """Some 1,700 pixels all over an image (h, w) or (h, w, 3), whatever its size; a copy."""
+    """About 1,700 pixels spread over an image (h, w) or (h, w, 3), whatever its size; a copy."""
     return image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)].copy()
 
 
 def inspect(frame: Frame, camera: Camera, gripper: Gripper, pixels: Image | None = None) -> tuple[Refusal, str] | None:
-    """None if the frame may be measured; else the reason, and in words what came and what would be right.
+    """None if the frame may be measured; else the reason, and a text with what came and what would be right.
 
-    ``pixels``: the image's :func:`sparse` ones, where they are at hand.
+    ``pixels``: the image's :func:`sparse` pixels, if they are already known.
     """
     image = frame.image
     if image is None or not isinstance(image, np.ndarray):

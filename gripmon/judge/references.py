@@ -1,9 +1,8 @@
 """The chain of references: which calibration is in force, what it came from, and the way back to an earlier one.
 
-Pure bookkeeping: no clock, no files; whoever makes a book may have the chain kept before a reference gets into force
-(:data:`Keep`).  A revision is a number that grows by one with every change, also with an undo,
-and that never names two different references: whoever holds two transforms with the same reference and revision may
-compare them.
+No clock and no files: whoever creates a book may have the chain stored before a reference gets into force
+(:data:`Keep`).  The revision grows by one with every change, also with an undo, and never names two different
+references: two transforms with the same reference and revision may be compared.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from gripmon.model.geometry import to_record
 from gripmon.model.records import Array, Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform, to_json
 
 KEPT = 1000
-"""References that are kept: the configured one and the newest.  One takes 1 to 2 kB; older ones can't be undone to."""
+"""References that are kept: the configured one and the newest.  One takes 1 to 2 kB; undo can't go back further."""
 
 CONFIGURATION, MONITOR, OPERATOR = "configuration", "monitor", "operator"
-"""Who let a reference in."""
+"""Who accepted a reference."""
 
 UNDO, RESET = "undo", "reset"
 """Origins of references that an operator brought back."""
@@ -32,23 +31,23 @@ _ROUNDING = 1e-9
 
 
 Keep = Callable[[tuple["ReferenceRecord", ...]], str]
-"""Keeps a chain of references so that it survives a restart; says why it can't, and nothing where it could."""
+"""Stores a chain of references so that it survives a restart; returns why it can't, or an empty text on success."""
 
 
 class CommandRefused(ValueError):
-    """What an operator asked for can't be done, and nothing has changed; the text says why."""
+    """What an operator asked for can't be done, and nothing has changed; the text gives the reason."""
 
 
 class ReferenceBook:
     """References from the configured one to the one in force, and a proposed one that waits for an operator.
 
-    What comes back by undo or reset is a new revision that names the earlier one in ``restores``; that one is always
-    the original, never itself an undo.  A proposal belongs to the reference in force when it was made: any change of
-    reference withdraws it.
+    Undo and reset make a new revision that names the earlier reference in ``restores``; that is always the original,
+    never itself an undo.  A proposal belongs to the reference in force when it was made: any change of reference
+    withdraws it.
     """
 
     def __init__(self, configured: ReferenceRecord, keep: Keep = lambda _: ""):
-        """Begin with the configured reference.  What ``keep`` can't keep doesn't get into force."""
+        """Begin with the configured reference.  A reference that ``keep`` can't store doesn't get into force."""
         self._keep = keep
         self._references: tuple[ReferenceRecord, ...] = (configured,)
         self._proposal: ReferenceRecord | None = None
@@ -58,7 +57,7 @@ class ReferenceBook:
     def restored(
         cls, references: Sequence[ReferenceRecord], proposal: ReferenceRecord | None = None, keep: Keep = lambda _: ""
     ) -> ReferenceBook:
-        """Go on with a chain that was kept.  Raises ValueError with what is wrong if it doesn't hold together."""
+        """Continue a stored chain.  Raises ValueError with what is wrong if the chain is inconsistent."""
         fault = chain_fault(references, proposal)
         if fault:
             raise ValueError(fault)
@@ -83,14 +82,12 @@ class ReferenceBook:
 
     @property
     def history(self) -> tuple[ReferenceRecord, ...]:
-        """From the configured reference to the one in force; once there are more than ``KEPT``, a gap follows the
-        first.
-        """
+        """From the configured reference to the one in force; with more than ``KEPT``, a gap follows the first."""
         return self._references
 
     @property
     def proposal(self) -> ReferenceRecord | None:
-        """What waits for an operator."""
+        """The reference that waits for an operator."""
         return self._proposal
 
     @property
@@ -100,7 +97,7 @@ class ReferenceBook:
 
     @property
     def chosen_by_operator(self) -> bool:
-        """Whether an operator went back to the reference in force: a monitor shouldn't overrule that by itself."""
+        """Whether an operator went back to the reference in force: a monitor shouldn't overrule that on its own."""
         return self.current.origin in (UNDO, RESET)
 
     def draft(
@@ -121,14 +118,14 @@ class ReferenceBook:
         return self._next(to_record(cam_T_grip), flat, stamp_ns, origin, MONITOR, cause=cause, inputs=inputs)
 
     def adopt(self, draft: ReferenceRecord) -> ReferenceRecord:
-        """The monitor itself lets a draft in.  Raises ValueError for one that was made for another revision, or whose
-        numbers can't be a pose with a covariance; :class:`CommandRefused` for one that can't be kept.
+        """Put a draft in force on the monitor's own decision.  Raises ValueError for a draft made for another revision,
+        or whose numbers aren't a pose with a covariance; :class:`CommandRefused` for one that can't be stored.
         """
         self._check(draft)
         return self._append(draft)
 
     def propose(self, draft: ReferenceRecord) -> None:
-        """Keep a draft until an operator accepts or rejects it, in place of an earlier one.  ValueError as above."""
+        """Keep a draft, in place of an earlier one, until an operator accepts or rejects it.  ValueError as above."""
         self._check(draft)
         self._proposal = draft
         self._changes += 1
@@ -138,15 +135,15 @@ class ReferenceBook:
         return self._append(msgspec.structs.replace(self._meant(proposal_id), accepted_by=OPERATOR))
 
     def reject(self, proposal_id: str = "") -> ReferenceRecord:
-        """The proposal is forgotten; returns it.  Raises :class:`CommandRefused`."""
+        """Drop the proposal and return it.  Raises :class:`CommandRefused`."""
         rejected = self._meant(proposal_id)
         self._proposal = None
         self._changes += 1
         return rejected
 
     def undo(self, stamp_ns: int, reference_id: str = "") -> ReferenceRecord:
-        """Back to an earlier reference; without an id to the one before, and with every further undo to the one before
-        that.  Raises :class:`CommandRefused`.
+        """Go back to an earlier reference; without an id to the one before, and with each further undo one more back.
+        Raises :class:`CommandRefused`.
         """
         in_force = self.in_force
         if reference_id:
@@ -164,7 +161,7 @@ class ReferenceBook:
         return self._restore(self._original(earlier), UNDO, stamp_ns)
 
     def reset(self, stamp_ns: int) -> ReferenceRecord:
-        """Back to the configured reference.  Raises :class:`CommandRefused`."""
+        """Go back to the configured reference.  Raises :class:`CommandRefused`."""
         return self._restore(self.configured, RESET, stamp_ns)
 
     def _restore(self, earlier: ReferenceRecord, origin: str, stamp_ns: int) -> ReferenceRecord:
@@ -205,7 +202,7 @@ class ReferenceBook:
         )
 
     def _append(self, reference: ReferenceRecord) -> ReferenceRecord:
-        """Into force, but kept before: a crash must not take back what someone rests on, nor free its revision."""
+        """Put a reference in force, stored first: a crash must not lose one in use, nor reuse its revision."""
         references = (*self._references, reference)
         if len(references) > KEPT:
             references = (references[0], *references[2:])
@@ -231,12 +228,12 @@ class ReferenceBook:
         return next((r for r in reversed(self._references) if r.reference_id == reference_id), None)
 
     def _original(self, reference: ReferenceRecord) -> ReferenceRecord:
-        """What an undo brought back; the reference itself if that is no longer kept, or if it is no undo."""
+        """The reference that an undo restored; the argument itself if it isn't an undo or that is no longer kept."""
         return (self._find(reference.restores) if reference.restores else None) or reference
 
 
 def state_fault(state: MonitorState) -> str:
-    """What of a state that was kept doesn't hold together; empty if all does."""
+    """What is inconsistent in a stored state; empty if nothing is."""
     fault = chain_fault(state.references, state.proposal)
     if fault:
         return fault
@@ -259,7 +256,7 @@ def chain_fault(
     numbers_of: Sequence[ReferenceRecord] | None = None,
 ) -> str:
     """Why these references, oldest first, can't be one chain from the configured one to the one in force; empty if they
-    can.  ``numbers_of``: whose poses and covariances are looked at, all if left out.
+    can.  ``numbers_of``: those whose poses and covariances are checked; all if left out.
     """
     if not references:
         return "no reference at all"
@@ -268,7 +265,7 @@ def chain_fault(
         return f"revision {every[0].revision}"
     if len({r.reference_id for r in every}) != len(every):
         return "two references of one name"
-    # The oldest but the configured one are forgotten in time: a gap, and what is before it is no longer known.
+    # The oldest references but the configured one are dropped in time: that leaves a gap after the first.
     has_gap = len(references) > 1 and references[1].revision > references[0].revision + 1
     known: dict[str, ReferenceRecord] = {}
     for i, (before, after) in enumerate(itertools.pairwise(every)):
@@ -293,7 +290,7 @@ def _numbers_fault(references: Sequence[ReferenceRecord]) -> str:
             return f"{reference.reference_id}: a covariance of {len(reference.covariance)} numbers"
     covariances = np.array([reference.covariance for reference in references]).reshape(-1, 6, 6)
     variances = np.diagonal(covariances, axis1=1, axis2=2)
-    # In units of their own deviations: metres and radians can't be compared.
+    # Normalised by their own deviations: metres and radians can't be compared.
     with np.errstate(all="ignore"):
         scale = np.sqrt(variances)
         normalised = covariances / (scale[:, :, None] * scale[:, None, :])

@@ -1,15 +1,16 @@
-"""The transform averaged over time: a Kalman filter on the manifold for a camera that stands still or creeps.
+"""Average of the transform over time: a Kalman filter on the manifold, for a camera that stands still or creeps.
 
-The state is the pose itself, its covariance that of ``xi = (rho, omega)``; between frames the pose wanders like a
-random walk.  What the filter has to know of the stream it learns from quiet time, by matching covariances (Mehra, "On
-the identification of variances and adaptive Kalman filtering", 1970), axis by axis:
+The state is the pose, its covariance that of ``xi = (rho, omega)``; between frames the pose follows a random walk.  The
+filter learns its noise from quiet time, axis by axis, by covariance matching (Mehra, "On the identification of
+variances and adaptive Kalman filtering", 1970):
 
-- how far frames scatter about the average, as a share of what their covariance says.  Frames err together, by the same
-  background that stands still behind the same edges, so averaging takes away only what scatters: the rest of the
-  reported variance stays in the average's.  More scatter than reported is vibration, which the average must not hide;
-- how fast the average itself walks: the process noise.
+- the scatter of frames about the average, as a share of their reported covariance.  Part of a frame's error is the same
+  in all frames, because the same background stands still behind the same edges.  Averaging removes only the part that
+  scatters; the rest of the reported variance stays in the variance of the average.  Scatter above the reported
+  covariance is vibration, which the average must not hide;
+- the random walk of the average itself: the process noise.
 
-A pose that leaves the average twice in a row starts it again; while frames lie farther from the average than noise
+Two frames in a row outside the gate restart the average.  While frames lie farther from the average than noise
 explains, the transform follows the frames instead.
 """
 
@@ -29,50 +30,51 @@ from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 
 GATE_SQUARE = chi_square_limit(1e-6)
-"""Squared normalised innovation that normal errors exceed once in a million frames."""
+"""Gate on the squared normalised innovation: normal errors exceed it once in a million frames."""
 
 SETTLING, SETTLING_GATE = 20, 14.0
-"""So many frames after a start a frame that is surprising by less starts the average again, and at once: what has just
-moved may swing.  A needless start costs little then."""
+"""Number of frames after a start during which the gate is this narrower value (χ² that 3 % of frames with normal errors
+exceed), and one frame outside it restarts the average: the mount may still be ringing, and a restart costs little."""
 
 SMALLEST_VARIANCE_RATIO = 0.4
-"""Least variance of the average over that of what scatters about it.  Errors have slow parts that no quiet time is long
-enough to see scatter: before moving background about a third of the whole lasts for ten seconds and longer."""
+"""Least variance of the average, over the variance of what scatters about it.  Some errors change too slowly to be seen
+in quiet time: in front of moving background about a third of the whole error lasts for ten seconds or longer."""
 
 FOLLOW_MEMORY, FOLLOW_FROM = 0.25, 2.5
-"""How fast the mean square of the distance from the average follows the newest frames; and from how much more of it
-than usual on the average lags: the transform goes along with the frames, and the average catches up."""
+"""Weight of the newest frame in the running mean of its squared distance from the average; and the multiple of the
+usual scatter above which the average lags: the transform then follows the frames, and the average catches up."""
 SETTLING_LAG = 0.7
-"""While the average settles, the transform goes along from this part of that on: averaging gains little yet."""
+"""While the average settles, the transform follows the frames from this part of the limit: averaging gains little."""
 LAG_VARIANCE_FACTOR = 0.5
-"""What a lag adds to the average's variance, over the square of the lag."""
+"""Variance that a lag adds to the average's, over the square of the lag."""
 
 PRIOR_SCATTER, LEAST_SCATTER, MOST_SCATTER = 0.5, 0.1, 9.0
-"""Share of the reported variance that scatters: before it is known; the least that a lag is compared with; and the most
-that a single frame counts for."""
+"""Share of the reported variance that scatters: the value assumed before it is learnt; the least value that a lag is
+compared with; and the largest value that a single frame contributes."""
 VIBRATES_FROM = 1.25
-"""From this share on the scatter is more than the reported covariance may be wrong by."""
+"""Scatter over reported variance above which frames vibrate: more than the reported covariance may be wrong by."""
 PRIOR_FRAMES, SCATTER_FRAMES = 30.0, 1200.0
-"""So many frames the prior share is worth, and so many are remembered."""
+"""Number of frames that the assumed share is worth, and number of frames that are remembered."""
 LEARN_EVERY = 4
-"""Neighbouring frames tell nearly the same."""
+"""Only every fourth frame is learnt from: neighbouring frames carry nearly the same information."""
 RIPE = 0.6
-"""Below this a young average shows too little of the scatter to learn from: fewer than three frames."""
+"""Part of the scatter that an average must show before it is learnt from: an average of fewer than three frames shows
+less."""
 
 WALK_S = 4.0
-"""The process noise is seen in how far the average gets in so many seconds."""
+"""Time over which the displacement of the average is measured; the process noise is learnt from it."""
 PRIOR_WALKS, MOST_WALKS = 0.25, 64.0
-"""How many such ways the setting is worth, and how many are remembered."""
+"""Number of such displacements that the setting is worth, and number that are remembered."""
 WALK_BOUNDS = (1e-3, 10.0)
-"""Learnt process noise (variance) over that of the settings: least and most."""
+"""Bounds on the learnt process noise (variance), over that of the settings."""
 
 KEPT_FRAMES = 64
-"""Newest frames from which the average can start again at the onset of a step."""
+"""Newest frames that are kept, so that the average can restart at the onset of a step."""
 
 
 class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far the mount may creep between frames, until that is learnt: the learnt creep lies within a thirtieth and
-    three times of it.
+    """How far the mount may creep between frames, until that is learnt; the learnt creep stays between 1/30 and three
+    times the setting.
     """
 
     creep_m_per_sqrt_s: Annotated[
@@ -88,8 +90,8 @@ class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 class QuietTime:
-    """What quiet time has taught: ``scatter`` (6,) of frames about the average over their reported variance, and
-    ``walk`` (6,), the variance by which the pose wanders in a second, m² and rad².
+    """What was learnt in quiet time: ``scatter`` (6,), the variance of frames about the average over their reported
+    variance, and ``walk`` (6,), the variance of the pose's random walk in one second, m² and rad².
     """
 
     def __init__(self, settings: SmoothingSettings):
@@ -104,33 +106,33 @@ class QuietTime:
         self._since_s = 0.0
 
     def _set_scatter(self, scatter: Array) -> None:
-        """And what follows from it for every frame: ``vibrates``, whether frames scatter more than reported on some
-        axis, by the share ``vibration`` (6,).
+        """Set the scatter and what follows from it for every frame: ``vibrates``, whether frames scatter more than
+        reported on some axis, and ``vibration`` (6,), by what share of the reported variance.
         """
         self.scatter = scatter
         self.vibrates = bool(scatter.max() > VIBRATES_FROM)
         self.vibration: Array = np.where(scatter > VIBRATES_FROM, scatter - 1.0, 0.0)
-        # While little is known, up to all of the reported variance may scatter.
+        # Before the scatter is learnt, up to all of the reported variance may scatter.
         unknown = (1.0 - PRIOR_SCATTER) * PRIOR_FRAMES / self._scatter_frames
         self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter + unknown, LEAST_SCATTER)
         self._least_kept = SMALLEST_VARIANCE_RATIO * np.minimum(scatter, 1.0)
 
     def kept(self, ripe: Array | float) -> Array:
-        """Share (6,) of a frame's reported variance that stays in the average's; all of it while ``ripe`` is 0."""
+        """Share (6,) of a frame's reported variance that stays in the average's; all of it at ``ripe`` = 0."""
         out: Array = np.maximum(1.0 - ripe * self.scatter, self._least_kept)
         return out
 
     def wait(self, elapsed_s: float) -> None:
-        """Time passes."""
+        """Let time pass."""
         self._since_s += elapsed_s
 
     def interrupt(self) -> None:
-        """The average was started again, or time isn't quiet: no way goes on across this."""
+        """The average was restarted, or time isn't quiet: start the measurement of a displacement again."""
         self._start_T = None
 
     def add(self, share: Array, ripe: Array, mean_T: Array, variance: Array) -> None:
-        """A quiet frame: its squared distance ``share`` (6,) from the average ``mean_T`` over its ``variance`` (6,), of
-        which an average that is still young shows the part ``ripe`` (6,).
+        """Learn from a quiet frame.  ``share`` (6,) is its squared distance from the average ``mean_T`` over its
+        ``variance`` (6,); a young average shows only the part ``ripe`` (6,) of the scatter.
         """
         if ripe.min() > RIPE:
             self._scatter_frames = min(self._scatter_frames + LEARN_EVERY, SCATTER_FRAMES)
@@ -143,7 +145,9 @@ class QuietTime:
             self._start_T, self._since_s = mean_T, 0.0
 
     def _walked(self, way_square: Array, variance: Array) -> None:
-        """The mean square of ways is twice that of the average's own error, which is known, and the walk's."""
+        """The mean square of a displacement is twice the variance of the average's own error, which is known, plus the
+        random walk's.
+        """
         error = 2.0 * self.kept(1.0) * variance
         if self._way_square is None:
             self._way_square = self._prior_walk * WALK_S + error
@@ -162,12 +166,12 @@ class PoseFilter:
         self.frames = 1
 
     def wander(self, variance: Array) -> None:
-        """The pose may have moved by a random way with the variances (6,)."""
+        """Predict: add the variances (6,) of the random walk to the covariance."""
         self.covariance.flat[::7] += variance
 
     def weigh(self, cam_T_grip: Array, covariance: Array) -> tuple[Array, Array, float]:
-        """Innovation (6,) of a measurement (4, 4) with the covariance (6, 6), its gain (6, 6), and the innovation's
-        squared size in units of what is expected.  ValueError for covariances that aren't positive definite.
+        """Innovation (6,) of a measurement (4, 4) with the covariance (6, 6), its gain (6, 6), and the squared
+        normalised innovation.  ValueError for covariances that aren't positive definite.
         """
         innovation = perturbation_between(self.mean_T, cam_T_grip)
         gain, surprise = _gain(self.covariance, covariance, innovation)
@@ -176,7 +180,7 @@ class PoseFilter:
         return innovation, gain, surprise
 
     def correct(self, innovation: Array, gain: Array) -> Array:
-        """Believe the measurement that was weighed; returns what is left of the innovation."""
+        """Update with the measurement given to :meth:`weigh`; returns the residual (6,) after it."""
         way, self.covariance = _corrected(self.covariance, gain, innovation)
         self.mean_T = perturb(self.mean_T, way)
         self.frames += 1
@@ -254,7 +258,7 @@ def warm_up() -> None:
 class PoseAverage:
     """Running average of ``cam_T_grip``; ``cam_T_grip`` is None until the first measurement.
 
-    ``claimed_covariance`` (6, 6) is that of its error; ``learnt`` what quiet time has taught.
+    ``claimed_covariance`` (6, 6) is that of its error; ``learnt`` what was learnt in quiet time.
     """
 
     def __init__(self, settings: SmoothingSettings):
@@ -268,26 +272,26 @@ class PoseAverage:
         self._stays: Array = np.ones(6)
 
     def forget(self) -> None:
-        """Start again with the next measurement; what quiet time has taught stays."""
+        """Restart with the next measurement; what was learnt in quiet time stays."""
         self.cam_T_grip = None
         self._newest.clear()
         self.learnt.interrupt()
 
     def step(self, frames: int) -> None:
-        """The pose has stepped, and the newest ``frames`` measurements were made after that: start again from them."""
+        """The pose has stepped, and the newest ``frames`` measurements were made after the step: restart from them."""
         since = list(self._newest)[-min(frames, KEPT_FRAMES) :] if frames > 0 else []
         self.forget()
         for cam_T_grip, covariance in since:
             self.add(cam_T_grip, covariance, quiet=False)
 
     def wander(self, elapsed_s: float) -> None:
-        """Time passes: the covariance grows by the random walk."""
+        """Let time pass: the covariance grows by the random walk."""
         self._filter.wander(self.learnt.walk * elapsed_s)
         self.learnt.wait(elapsed_s)
 
     def add(self, cam_T_grip: Array, covariance: Array, quiet: bool = True) -> None:
-        """One measurement (4, 4) with the covariance (6, 6) of its error; ``quiet``: nothing speaks for a motion, so
-        that it may be learnt from.  ValueError for a covariance that isn't positive definite.
+        """Add one measurement (4, 4) with the covariance (6, 6) of its error.  ``quiet``: nothing indicates a motion,
+        so the frame may be learnt from.  ValueError for a covariance that isn't positive definite.
         """
         covariance = np.ascontiguousarray(covariance)
         self._newest.append((cam_T_grip, covariance))
@@ -304,11 +308,11 @@ class PoseAverage:
         if self._suspicions >= 2 or not settled:
             self._restart()
         else:
-            # Not believed alone, but it may be the first after a step.
+            # One frame outside the gate is not used, but it may be the first after a step.
             self.claimed_covariance = self.claimed_covariance + np.outer(innovation, innovation)
 
     def _restart(self) -> None:
-        """From the newest measurement, and the one before if that was surprising in the same way."""
+        """Restart from the newest measurement, and from the one before if that was outside the gate and agrees."""
         self.learnt.interrupt()
         self.cam_T_grip, self.claimed_covariance = self._newest[-1]
         self._filter = PoseFilter(*self._newest[-1])
@@ -320,18 +324,18 @@ class PoseAverage:
         self._recent, self._suspicions = self.learnt.scatter, 0
 
     def _as_it_scatters(self, covariance: Array) -> Array:
-        """A frame's covariance (6, 6), larger on axes that vibrate: the average doesn't follow vibration."""
+        """A frame's covariance (6, 6), enlarged on axes that vibrate: the average doesn't follow vibration."""
         if not self.learnt.vibrates:
             return covariance
         return _scaled(covariance, 1.0 + self.learnt.vibration)
 
     def _conclude(self, distance: Array, covariance: Array, quiet: bool, settled: bool) -> None:
-        """What to stand by, ``distance`` (6,) being from the average to the frame."""
+        """Set the transform and its covariance; ``distance`` (6,) is from the average to the frame."""
         learnt, mean_T, variance = self.learnt, self._filter.mean_T, covariance.diagonal()
         share = distance * distance / variance
         if self._filter.frames % LEARN_EVERY == 0 or not settled:
-            # One over the number of frames that were averaged, in effect.  Errors that last average out more slowly
-            # than independent ones; of those the distance shows all but this.
+            # In effect one over the number of averaged frames.  Lasting errors average out more slowly than
+            # independent ones; the distance shows all of them but this part.
             young = np.minimum(self._filter.covariance.diagonal() / variance, 1.0)
             self._stays = learnt.kept(1.0 - np.sqrt(young))
             if quiet:
@@ -345,7 +349,7 @@ class PoseAverage:
         if learnt.vibrates or lag.max() > 0.0:
             catch_up = np.maximum(self._recent - learnt.lag_from, 0.0)
             self._filter.wander(LAG_VARIANCE_FACTOR * catch_up * variance)
-            # As much of the motion as of the frame's error is in the distance: the transform goes along by that share.
+            # The distance holds motion and the frame's error; the transform follows it by the share of the motion.
             motion = learnt.vibration + np.maximum(lag, 0.0)
             follow = motion / (motion + 1.0)
             self.cam_T_grip = perturb(mean_T, follow * distance)

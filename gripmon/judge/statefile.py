@@ -1,8 +1,8 @@
 """What survives a restart, in a file: written whole or not at all, read whole or not at all.
 
 A file holds one :class:`gripmon.model.records.MonitorState` with the robot, the camera and the calibration that it
-belongs to, under a checksum.  One that is damaged, or that belongs to another calibration, is renamed aside and
-never used; one of another robot is left alone, and so is one that another process uses.
+belongs to, under a checksum.  A damaged file, or one of another calibration, is renamed and never used; a file of
+another robot, or one that another process uses, is left alone.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from gripmon.model.records import MonitorState, ReferenceRecord
 _log = logging.getLogger(__name__)
 
 _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
-"""What decoding raises for a file that is none of ours; the last one where brackets are nested by the thousand."""
+"""What decoding raises for a file of another kind; RecursionError for brackets nested by the thousand."""
 
 FORMAT = 1
 LARGEST_BYTES = 64 << 20
-"""A file larger than this is none of ours: a thousand references take less than 3 MB."""
+"""A larger file is not a state file: a thousand references take less than 3 MB."""
 
 AUTO = "auto"
 
-_MOST_DIGITS = 18  # of a number in the lock's file: what is longer fits no revision
+_MOST_DIGITS = 18  # of a number in the lock file: a longer one is not a revision
 
 
 class StateSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -60,7 +60,7 @@ class StateFileError(InputError):
 
 
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Digests of what a state is about: references of another camera, gripper or start are worth nothing here."""
+    """Digests of what a state belongs to: references of another camera, gripper or start can't be used here."""
 
     camera: str
     gripper: str
@@ -68,7 +68,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Owner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whose state it is."""
+    """Whose state it is: robot, camera, calibration."""
 
     robot: str
     camera: str
@@ -84,7 +84,7 @@ class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _State(MonitorState, frozen=True, forbid_unknown_fields=True):
-    """As it is read from a file, where a field that isn't known here would be lost with the next write."""
+    """A state as read from a file: an unknown field is an error, because the next write would lose it."""
 
 
 class _Read(Kept, frozen=True, forbid_unknown_fields=True):
@@ -107,7 +107,7 @@ def default_path(robot: str, camera: str) -> Path:
     """
     base = os.environ.get("XDG_STATE_HOME", "")
     try:
-        # The standard wants relative paths there to be ignored.
+        # The XDG standard has relative paths ignored.
         folder = Path(base) if Path(base).is_absolute() else Path("~/.local/state").expanduser()
     except RuntimeError:
         raise StateFileError("auto, but this user has no home folder; the path of a file, or null") from None
@@ -115,13 +115,13 @@ def default_path(robot: str, camera: str) -> Path:
 
 
 def calibration_of(lens: LensSettings, gripper: GripperModel, reference: ReferenceRecord) -> Calibration:
-    """Digests of the values, not of the files: a comment more or less changes nothing."""
+    """Digests of the values, not of the files: a changed comment changes nothing."""
     start = msgspec.structs.replace(reference, revision=0, stamp_ns=0)
     values = (
         lens,
         contents_of(gripper),
         msgspec.structs.asdict(start),
-    )  # the reference without the name of its message
+    )  # the reference without its message type
     return Calibration(*(hashlib.sha256(msgspec.json.encode(part)).hexdigest()[:16] for part in values))
 
 
@@ -132,7 +132,7 @@ def pack(owner: Owner, state: MonitorState) -> bytes:
 
 
 def unpack(data: bytes) -> Kept:
-    """The content of a file.  Raises ValueError, which says what is wrong, for all but a whole and sound one."""
+    """The content of a file.  Raises ValueError with what is wrong if the file is damaged or inconsistent."""
     try:
         envelope = msgspec.json.decode(data, type=_Envelope)
     except _UNREADABLE:
@@ -156,25 +156,25 @@ def unpack(data: bytes) -> Kept:
 class StateFile:
     """One monitor's file, which no other process may use while this object is open.
 
-    ``state`` is what to go on from, None for a new start; ``configured`` the reference of a new start: its revision
-    follows on those of a file that was set aside, where they are known.  ``notices`` are for people: what was found.
-    ``failure`` says why nothing can be kept now, empty while all is well.
+    ``state`` is what to continue from, None for a new start; ``configured`` is the reference of a new start: its
+    revision follows those of a file that was set aside, where they are known.  ``notices`` tell people what was found.
+    ``failure`` is why nothing can be stored now, empty while all is well.
     """
 
     def __init__(self, path: Path, owner: Owner, configured: ReferenceRecord, *, fresh: bool = False) -> None:
         """Lock the file and read it.  ``fresh``: set a state aside even if it could be used.
 
-        Raises :class:`StateFileError` if the file is another robot's, in use, or none.  What else goes wrong, such as a
-        folder that may not be written, is said in ``failure`` and stops nothing.
+        Raises :class:`StateFileError` if the file is another robot's, in use, or not a regular file.  Any other fault,
+        such as a folder without write permission, is reported in ``failure`` and stops nothing.
         """
         self.state: MonitorState | None = None
         self.configured = configured
         self.notices: tuple[str, ...] = ()
         self.failure = ""
-        # A link leads to where the file shall be; renaming would replace the link itself.
+        # Resolve links: renaming would replace the link itself.
         self._path, self._owner = path.resolve(), owner
         self._usable = True
-        self._newest_revision: int | None = None  # that was ever kept here, where it is known
+        self._newest_revision: int | None = None  # ever stored here, where it is known
         self._lock = self._take_lock()
         try:
             self._read(fresh)
@@ -183,19 +183,19 @@ class StateFile:
             raise
 
     def write(self, state: MonitorState) -> bool:
-        """Keep a state in place of the last one; False, with ``failure`` set, if that can't be done."""
+        """Store a state in place of the last one; False, with ``failure`` set, if that can't be done."""
         if not self._usable:
             return False
         try:
             data = pack(self._owner, state)
-            # What can't be read again must not replace what can: NaN, say, is null in JSON.
+            # A state that can't be read back must not replace one that can: NaN, for example, is null in JSON.
             if unpack(data).state != state:
                 raise ValueError("it is not what comes back")
             write_atomically(self._path, data)
         except OSError as error:
             self._fail(f"{self._path} can't be written: {error.strerror or error}")
             return False
-        except Exception as error:  # noqa: BLE001  said, and none of the monitor's business
+        except Exception as error:  # noqa: BLE001  reported; the monitor goes on
             self._fail(f"internal error in the state, the last sound one is kept: {error}")
             return False
         if self.failure:
@@ -213,7 +213,7 @@ class StateFile:
             self._lock = None
 
     def _take_lock(self) -> int | None:
-        """A descriptor that holds the lock.  A file of its own: the state's is another one after each writing."""
+        """A descriptor that holds the lock.  A file of its own, since each write replaces the state's file."""
         path = self._path.with_name(self._path.name + ".lock")
         descriptor = None
         try:
@@ -237,16 +237,16 @@ class StateFile:
         return descriptor
 
     def _note(self, descriptor: int) -> None:
-        """Write into the lock's file whose it is, and the newest revision, which a damaged state no longer tells."""
+        """Write the process and the newest revision into the lock file: a damaged state can't tell the revision."""
         revision = b"" if self._newest_revision is None else b" %d" % self._newest_revision
         note = b"%d%s\n" % (os.getpid(), revision)
-        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only no one can say whose
+        with contextlib.suppress(OSError):  # a full disk: the lock still holds, only its owner can't be named
             os.pwrite(descriptor, note, 0)
             os.ftruncate(descriptor, len(note))
 
     def _read(self, fresh: bool) -> None:
         if self._usable:
-            with contextlib.suppress(OSError):  # untidy, no more
+            with contextlib.suppress(OSError):  # leftovers do no harm
                 remove_leftovers(self._path)
         try:
             data = self._bytes()
@@ -288,7 +288,7 @@ class StateFile:
         )
 
     def _bytes(self) -> bytes:
-        """The file's content.  A pipe or a folder is not a state file, and a pipe would be waited for."""
+        """The file's content.  A pipe or a folder is not a state file, and reading a pipe would block."""
         mode = self._path.stat().st_mode
         if not stat.S_ISREG(mode):
             kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
@@ -306,9 +306,9 @@ class StateFile:
         return ", ".join(name for name, same in parts if not same)
 
     def _set_aside(self, why: str, *, until_written: bool = False) -> str:
-        """Rename the file beside itself; says what became of it.
+        """Rename the file in its folder; returns what happened to it.
 
-        ``until_written``: it stays under its own name, too, until it is written over: it alone knows the revisions.
+        ``until_written``: the file also keeps its own name until it is overwritten: only it holds the revisions.
         """
         if not self._usable:
             return "not used"
@@ -338,7 +338,7 @@ class StateFile:
 
 
 def _noted(descriptor: int) -> tuple[int | None, int | None]:
-    """Process and newest revision that a lock's file names."""
+    """Process and newest revision in a lock file; None each where it isn't a number."""
     words = os.pread(descriptor, 64, 0).split()
     numbers = [int(word) if word.isdigit() and len(word) <= _MOST_DIGITS else None for word in words]
     holder, revision, *_ = (*numbers, None, None)
@@ -346,7 +346,7 @@ def _noted(descriptor: int) -> tuple[int | None, int | None]:
 
 
 def _linked(path: Path, other: Path) -> bool:
-    """Whether the file has the other name besides; not every file system can do that."""
+    """Hard-link the file to the other name; False where the file system can't."""
     try:
         other.hardlink_to(path)
     except OSError:

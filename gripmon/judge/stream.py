@@ -1,6 +1,6 @@
-"""Faults of the frame stream, told from the frames alone: frozen, replaced, a clock or a frame rate that went wrong.
+"""Faults of the frame stream, detected from the frames alone: frozen, replaced, a wrong clock or a wrong frame rate.
 
-Time is the frames' own stamps.  Some 1,700 pixels of each frame are looked at, whatever its size.
+Time is the frames' own stamps.  Of each frame about 1,700 pixels are examined, whatever its size.
 """
 
 from __future__ import annotations
@@ -21,47 +21,47 @@ from gripmon.model.records import Cause, Frame, Image
 from gripmon.model.records.values import NS_PER_S
 
 RING_FRAMES = 8
-"""Newest frames among which a frame that comes again is recognised: drivers that hang hand over a ring of buffers."""
+"""Newest frames among which a repeated frame is recognised: a driver that hangs cycles through a ring of buffers."""
 
 FREEZE_TO_USUAL_RATIO = 4
-"""A source that repeats frames now and then is frozen after so many times its longest repetition."""
+"""A source that repeats frames now and then counts as frozen at this multiple of its longest repetition."""
 
 STOOD_SHARE = 0.95
-"""Part of an image's pixels that are the same to the bit as in the one before, while others aren't, from which it is a
-coded stream: of a sensor's own pixels fewer than nine in ten come again, down to a noise of 0.1 grey levels.
+"""Share of bit-identical pixels between two images that differ from which the stream is a coded one.  Of a sensor's own
+pixels fewer than nine in ten repeat, down to a noise of 0.1 grey levels.
 """
 
 FEWEST_INNER = 200
-"""Pixels neither black nor white, of some 1,700, without which an image doesn't tell."""
+"""Fewest pixels, of about 1,700, that are neither black nor white; an image with fewer proves nothing."""
 
 SURE_FRAMES = 3
-"""Frames that make sure: images with large parts that stand, stamps that stand, before it is the clock and not a frame
-that was handed over twice, and images of a kind, before it is the camera's own, or
-another camera.
+"""Frames that confirm a finding: images with large identical parts; repeated stamps, which mean a clock that stands
+still and not a frame that was delivered twice; and images of one size and type, which are then the camera's own, or
+another camera's.
 """
 
 CALM_FRAMES = 30
-"""Frames in a row without a fault of their stamps after which the clock is right again, or in which nothing looks wrong
-after which the evidence of a cause is forgotten.
+"""Consecutive frames without a fault of their stamps after which the clock counts as right again; and consecutive
+frames without anything wrong after which the evidence of a cause is forgotten.
 """
 
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * NS_PER_S
-"""A stamp that is so many usual periods, and so long, after the one before has jumped."""
+"""A stamp has jumped if it is more than both of these after the one before: usual periods, and time."""
 
 BLOCK_INTERVALS = 8
-"""Intervals that are taken together."""
+"""Intervals in a block."""
 
 LEARN_BLOCKS, LEARN_NS = 6, 2 * NS_PER_S
-"""Blocks, and the time that they span, from which the usual rate is learnt."""
+"""Blocks, and the time they span, needed to learn the usual rate."""
 
 ARRIVALS, MOST_BLOCKS = 64, 512
-"""How many newest intervals and blocks are kept."""
+"""Newest intervals, and newest blocks, that are kept."""
 
 REGULAR_INTERVAL_DEVIATION = 0.3
-"""Median deviation of the intervals over their median up to which there is a usual rate at all."""
+"""Median deviation of the intervals over their median, above which the stream has no usual rate."""
 
 DEPARTED, RETURNED = 1.6, 1.3
-"""Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
+"""Ratio to the usual rate, either way, above which the rate is a fault, and below which it is right again."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -86,10 +86,10 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class StreamFault(NamedTuple):
-    """What is wrong with the stream now: of each ``kind`` there is one at a time.
+    """What is wrong with the stream now; at most one of each ``kind`` at a time.
 
-    A fault of the stamps is told for :data:`CALM_FRAMES` frames more; a ``gap`` is over by then.  Its cause is unknown:
-    a camera that was away, or a clock that was set.
+    A fault of the stamps is reported until :data:`CALM_FRAMES` frames in a row are free of it.  A ``gap`` is already
+    over when it is reported; its cause is unknown: the camera was away, or its clock was set.
     """
 
     kind: Literal["frozen", "replaced", "clock", "gap", "rate"]
@@ -98,7 +98,7 @@ class StreamFault(NamedTuple):
 
 
 class StreamWatch:
-    """Watches one camera's stream.  A pure function of the frames so far."""
+    """Watches one camera's stream.  Depends on nothing but the frames so far."""
 
     def __init__(self, settings: StreamSettings | None = None):
         settings = settings or StreamSettings()
@@ -124,7 +124,7 @@ class StreamWatch:
 
     @property
     def repeats(self) -> bool:
-        """Whether the last frame's image was seen a few frames ago: it says nothing new, frozen or not yet."""
+        """Whether the last frame's image was seen a few frames ago: it adds no information, frozen or not yet."""
         return self._frozen.repeats
 
     @property
@@ -134,8 +134,8 @@ class StreamWatch:
 
 
 class _Frozen:
-    """Sensors make noise: no two of their images are the same.  A coder may leave it out: then whole images come again
-    while nothing moves, and before they do, large parts of them.
+    """Sensor noise makes every image different.  A video coder may remove the noise: then whole images repeat while
+    nothing moves, and large parts of images before that.
     """
 
     def __init__(self, settings: StreamSettings):
@@ -163,13 +163,13 @@ class _Frozen:
         if self._coded < SURE_FRAMES and not again:
             self._coded += _stands_in_large_parts(sample, self.pixels)
         self.pixels = sample
-        # An even image shows no noise, and is another fault.
+        # A uniform image shows no noise; that is another fault.
         if not again or sample.size == 0 or sample.min() == sample.max():
             self._longest = self._longest if self._frozen else max(self._longest, self._run)
             self._run, self._since_ns, self._frozen = 0, frame.stamp_ns, False
             return None
         self._run += 1
-        # Stamps may stand still together with the images.
+        # The stamps may repeat together with the images.
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
         enough = max(self._settings.frozen_frames, FREEZE_TO_USUAL_RATIO * self._longest)
         settings = self._settings
@@ -221,7 +221,7 @@ def warm_up() -> None:
 
 
 class _Clock:
-    """Stamps rise, one after the other, by about the same."""
+    """Checks that stamps rise, by about the same interval."""
 
     def __init__(self) -> None:
         self._stamp_ns: int | None = None
@@ -252,16 +252,16 @@ class _Clock:
             text = f"{self._standing} frames have the stamp of the one before: their clock stands still"
             return StreamFault("clock", Cause.CLOCK, text) if self._standing >= SURE_FRAMES else None
         if step_ns > JUMP_NS and step_ns > rate.longest_ns(max(frame.seq - self._seq, 1)):
-            # The frames alone don't tell which.
+            # The frames alone can't tell which.
             text = f"no frame came for {1e-9 * step_ns:.1f} s, or the frames' clock was set ahead by so much"
             return StreamFault("gap", Cause.UNKNOWN, text)
         return None
 
 
 class _Rate:
-    """The interval from frame to frame, dropped ones reckoned in by their missing numbers.
+    """The interval between frames; frame numbers account for dropped frames.
 
-    Intervals are taken in blocks of some, of which the median counts.
+    Intervals are grouped in blocks of :data:`BLOCK_INTERVALS`, of which the median counts.
     """
 
     def __init__(self, settings: StreamSettings):
@@ -283,7 +283,7 @@ class _Rate:
         return NS_PER_S / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
 
     def longest_ns(self, frames: int) -> float:
-        """Longest time that so many frames take as long as nothing is wrong; infinite until it is known."""
+        """Longest time that N ``frames`` take while nothing is wrong; infinite until the rate is known."""
         frames_per_s = self.frames_per_s
         return math.inf if frames_per_s is None else frames * JUMP_PERIODS * NS_PER_S / frames_per_s
 
@@ -331,13 +331,13 @@ class _Rate:
     def _learn(self) -> None:
         if len(self._blocks) < LEARN_BLOCKS or sum(block.lasted_ns for block in self._blocks) < LEARN_NS:
             return
-        # Frames that come as they like have no usual rate.
+        # Frames at irregular intervals have no usual rate.
         if statistics.median(block.uneven for block in self._blocks) < REGULAR_INTERVAL_DEVIATION:
             self.usual_ns = _middle_ns(list(self._blocks))
 
 
 class _Block(NamedTuple):
-    """Some intervals: the middle one, all of them, and their median deviation over the middle one."""
+    """A block of intervals: their median, their sum, and their median deviation over the median."""
 
     middle_ns: float
     lasted_ns: float
@@ -345,7 +345,7 @@ class _Block(NamedTuple):
 
 
 def _middle_ns(blocks: list[_Block]) -> float:
-    """The interval in the middle of the time: half of it went by with shorter ones."""
+    """The median interval, weighted by time: half of the time passed with shorter ones."""
     half_ns, passed_ns = 0.5 * sum(block.lasted_ns for block in blocks), 0.0
     for block in sorted(blocks):
         passed_ns += block.lasted_ns

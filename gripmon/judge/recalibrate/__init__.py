@@ -1,4 +1,4 @@
-"""A new reference from the fingertip corners alone, and from many frames: when to believe it, when to ask a person."""
+"""A new reference from many frames, checked by the fingertip corners alone: when to accept it, when to ask a person."""
 
 from gripmon.judge.recalibrate.pnp import (
     FEWEST_COPLANAR,

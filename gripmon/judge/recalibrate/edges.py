@@ -1,4 +1,4 @@
-"""What the edges of many frames together say against the tracked pose: single edges, and fingers."""
+"""How well the edges of many frames together support the tracked pose: edge by edge, and finger by finger."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from gripmon.model.records import Array, EdgeSums
 from gripmon.track.edges.kernel import FEWEST_FREE
 
 STRETCH_PX, EDGE_PX = 0.015, 0.03
-"""Standard deviations that last and that nothing explains, px: of a stretch's mean, and of a whole edge."""
+"""Standard deviations of lasting errors without a known cause, px: of a stretch's mean, and of a whole edge."""
 
 UNDETERMINED_VARIANCE = 1.0
-"""Variance of a pose that isn't determined without one of its edges, m² and rad²."""
+"""Variance given to a pose that isn't determined when one of its edges is left out, m² and rad²."""
 
 WORST_CONDITION = 1e10
-"""Condition of an information matrix, its unknowns scaled alike, from which it determines nothing."""
+"""Condition number of an information matrix, its unknowns scaled alike, from which it determines no pose."""
 
 _INDEX: tuple[type, tuple[int, ...]] = (np.intp, ())
 _NUMBER: tuple[type, tuple[int, ...]] = (float, ())
 _SHAPES = (_INDEX, _INDEX, _INDEX, _NUMBER, _NUMBER, (float, (6,)), (float, (6,)), (float, (6, 6)), _NUMBER)
-_SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m by rad: equal pixels, about
+_SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m per rad: about equal motions in the image
 
 
 @dataclass(frozen=True, slots=True)
 class PooledEdges:
     """Stretches of edges summed over all frames, with residuals about one pose; fields as in
-    :class:`~gripmon.model.records.EdgeSums`.  ``sigma_px`` (s,) standard deviation of a stretch's residual by itself,
-    ``shared_px`` (s,) of what it shares with the others of its edge.
+    :class:`~gripmon.model.records.EdgeSums`.  ``sigma_px`` (s,) is the standard deviation of a stretch's own error,
+    ``shared_px`` (s,) that of the error it shares with the other stretches of its edge.
     """
 
     edge: NDArray[np.intp]
@@ -46,7 +46,7 @@ class PooledEdges:
 
 
 def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
-    """The stretches that at least half of the frames show, about the mean pose."""
+    """Sum the stretches seen in at least half of the frames, with residuals about ``cam_T_grip`` (4, 4)."""
     nothing = EdgeSums(*(np.zeros((0, *shape), kind) for kind, shape in _SHAPES))
     shown = [nothing, *(_about(f, f.edges, cam_T_grip) for f in frames if f.edges is not None)]
 
@@ -69,7 +69,7 @@ def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
         keys[often, 1].astype(np.intp),
         total(weights * all_of("residual_px")) / weight,
         total(weights[:, None] * all_of("jacobian")) / weight[:, None],
-        # What lasts of a stretch's error is that of one frame, however many there are.
+        # The lasting part of a stretch's error is that of one frame, however many frames there are.
         np.sqrt(STRETCH_PX**2 + count[often] / weight),
         np.hypot(EDGE_PX, spread_px),
         total(all_of("moment")),
@@ -78,7 +78,7 @@ def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
 
 
 def _about(frame: StillFrame, evidence: EdgeSums, cam_T_grip: Array) -> EdgeSums:
-    """A frame's evidence with residuals about another pose near its own."""
+    """A frame's edge sums with residuals about another pose close to its own."""
     xi = perturbation_between(frame.cam_T_grip, cam_T_grip)
     return replace(
         evidence,
@@ -88,8 +88,8 @@ def _about(frame: StillFrame, evidence: EdgeSums, cam_T_grip: Array) -> EdgeSums
 
 
 def leave_one_out(pooled: PooledEdges) -> Array:
-    """Covariance (6, 6) of the pose as the edges show it: by how much it moves when each of them is left out (the
-    jackknife, Tukey 1958).  :data:`UNDETERMINED_VARIANCE` where the others don't determine a pose.
+    """Covariance (6, 6) of the pose by the jackknife (Tukey 1958): how much it moves when each edge is left out.
+    :data:`UNDETERMINED_VARIANCE` on the diagonal where the other edges don't determine a pose.
     """
     edges = np.unique(pooled.edge)
     information = pooled.information * np.outer(_SCALE, _SCALE)
@@ -110,11 +110,12 @@ def leave_one_out(pooled: PooledEdges) -> Array:
 
 
 def fingers_disagree(pooled: PooledEdges) -> float | None:
-    """Probability that fingers which belong together would show residuals which setting one of them free explains so
-    much better (F-test: six more unknowns, each); None where fewer than two fingers, or too few stretches, are seen.
+    """p-value of the hypothesis that the fingers belong together: by an F-test, does one finger free of the others (six
+    more unknowns) explain the residuals so much better?  The smallest of all fingers; None where fewer than two fingers
+    or too few stretches are seen.
 
-    The stretches of an edge err together, too.  Their errors may be larger than :data:`STRETCH_PX` and :data:`EDGE_PX`:
-    then the ratio of residuals alone decides.
+    The errors of an edge's stretches are correlated.  If they are larger than :data:`STRETCH_PX` and :data:`EDGE_PX`,
+    the ratio of residuals alone decides.
     """
     fingers = np.unique(pooled.finger)
     if len(fingers) < 2:
@@ -134,13 +135,13 @@ def fingers_disagree(pooled: PooledEdges) -> float | None:
 
 
 def _whitening(pooled: PooledEdges) -> Array:
-    """(s, s) that makes the stretches' errors independent, of size one."""
+    """Matrix (s, s) that makes the stretches' errors independent, with variance one."""
     together = (pooled.edge[:, None] == pooled.edge) * np.outer(pooled.shared_px, pooled.shared_px)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(together + np.diag(pooled.sigma_px**2))))
 
 
 def _left(unknowns: Array, values: Array) -> tuple[float, int]:
-    """Squares that a least-squares fit leaves, and the unknowns that it determines."""
+    """Sum of squared residuals of a least-squares fit, and the number of unknowns that it determines."""
     fit, _, rank, _ = np.linalg.lstsq(unknowns, values, rcond=1e-6)
     rest = values - unknowns @ fit
     return float(rest @ rest), int(rank)

@@ -1,8 +1,8 @@
-"""On-line recalibration: the full pose from measured corners, without the previous one.
+"""On-line recalibration: the full pose from measured corners, without the previous pose.
 
-The starts come from OpenCV's closed forms: SQPNP, and for coplanar corners also IPPE, which gives both poses that look
-alike, but fails where all corners but one lie on a line: a plane's homography isn't determined then, the pose is.  The
-weighted refinement is ours, since it needs the corners' covariances and gives that of the pose.
+The starting poses come from OpenCV's closed forms: SQPNP, and for coplanar corners also IPPE.  IPPE gives both poses
+that look alike, but fails where all corners but one lie on a line: that leaves the plane's homography undetermined, not
+the pose.  The weighted refinement is our own: it uses the corners' covariances and gives that of the pose.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from gripmon.model.gripper import on_a_line
 from gripmon.model.records import Array
 
 FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
-"""Corners that determine a pose: so many in one plane, or so many in general."""
+"""Fewest corners that determine a pose: in one plane, and in general position."""
 
 COPLANAR_RATIO = 1e-3
-"""Corners whose thickness is below this part of their extent count as coplanar."""
+"""Thickness over extent below which corners count as coplanar."""
 
 AMBIGUITY_SQUARED_ERROR = 16.0
-"""Corners can't tell two poses apart whose weighted squared errors differ by less than this: the worse one is less
+"""Difference of the weighted squared errors below which the corners can't distinguish two poses: the worse one is less
 likely by a factor of exp(8) at most.
 """
 
 
 SAME_POSE_SQUARED_DISTANCE = 1.0
-"""Squared distance of two refined poses, in units of their covariance, below which they are the same one."""
+"""Squared distance of two refined poses, normalised by their covariance, below which they are the same pose."""
 
 
 class RecalibrationRefused(ValueError):
-    """The corners don't determine a pose; the text says why."""
+    """The corners don't determine a pose; the text gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,8 @@ def recalibrate(
     """Pose from n >= 4 coplanar or n >= 6 general corners.
 
     ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates, ``covariance_xy`` (n, 2, 2) of each corner or
-    (2n, 2n) of all together.  ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals
-    don't tell apart.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
+    (2n, 2n) of all together.  ``expected_cam_T_grip`` (4, 4) only decides between the two poses of a plane that the
+    residuals don't distinguish.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
     """
     every = solutions(points_grip_m, measured_xy, covariance_xy, iterations)
     return _choose(every, expected_cam_T_grip, len(points_grip_m))
@@ -64,9 +64,9 @@ def recalibrate(
 def solutions(
     points_grip_m: Array, measured_xy: Array, covariance_xy: Array, iterations: int = 40
 ) -> list[Recalibration]:
-    """All poses that corners allow, each refined, the best fit first; two for many planes.
+    """All poses that the corners allow, each refined, the best fit first; many planes allow two.
 
-    Arguments and refusals as those of :func:`recalibrate`.
+    Arguments and exceptions as for :func:`recalibrate`.
     """
     why = refusal(points_grip_m)
     if why is not None:
@@ -85,9 +85,9 @@ def solutions(
 
 
 def rivals(every: list[Recalibration], corners: int) -> list[Recalibration]:
-    """Those of some :func:`solutions` that n ``corners`` can't tell from the best."""
+    """Those of the :func:`solutions` that n ``corners`` can't distinguish from the best."""
     squares, freedom = 2 * corners * every[0].weighted_rms ** 2, 2 * corners - 6
-    # Where even the best pose fits badly, the corners' covariances are too small and so are differences in their units.
+    # If even the best pose fits badly, the corners' covariances are too small, and so are differences in their units.
     largest = squares + AMBIGUITY_SQUARED_ERROR * max(1.0, squares / freedom)
     return [pose for pose in every if 2 * corners * pose.weighted_rms**2 <= largest]
 
@@ -105,7 +105,7 @@ def coplanar(points_grip_m: Array) -> bool:
 
 
 def refusal(points_grip_m: Array) -> str | None:
-    """Why corners (n, 3) at these places can't give a pose, however well they are seen; None if they can."""
+    """Why corners (n, 3) at these positions can't determine a pose, however well they are seen; None if they can."""
     count = len(points_grip_m)
     if count < FEWEST_COPLANAR:
         return f"{count} corners; at least {FEWEST_COPLANAR} coplanar ones or {FEWEST_GENERAL} are needed"
@@ -136,7 +136,7 @@ def _in_front(cam_T_grip: Array, points_grip_m: Array) -> bool:
 def _refine(
     cam_T_grip: Array, points_grip_m: Array, measured_xy: Array, weight_xy: Array, iterations: int
 ) -> Recalibration | None:
-    """Gauss-Newton on the weighted image error, on the manifold; None where it leads nowhere."""
+    """Gauss-Newton on the weighted image error, on the manifold; None if it fails or ends behind the camera."""
     for _ in range(iterations):
         levers = points_grip_m @ cam_T_grip[:3, :3].T
         points = levers + cam_T_grip[:3, 3]

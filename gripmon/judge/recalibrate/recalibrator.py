@@ -1,9 +1,9 @@
-"""From many frames of a camera that stands still to a new reference, to a question for a person, or to a refusal.
+"""From many frames of a camera that stands still to a new reference, to a question for an operator, or to a refusal.
 
-The tracked poses' average is what is proposed: their edges see more of the gripper than its corners do.  On 152
-simulated knocks with the jaw's opening known its TCP was off by 15 µm (median) and 0.4 mrad, that of the corners by 21
-µm and 1.4 mrad, the two weighted by their covariances no less than the first.  The corners, whose pose needs no earlier
-one, check it.
+The average of the tracked poses is proposed: their edges see more of the gripper than its corners do.  On 152 simulated
+knocks with known jaw opening its TCP was off by 15 µm (median) and 0.4 mrad, that of the corners by 21 µm and 1.4 mrad;
+the two weighted by their covariances were no better than the first.  The corners check it, as their pose needs no
+earlier one.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 from gripmon.track.edges import has_lone_end
 
 OUTLYING_ERROR_SQUARE = chi_square_limit(1e-3)
-"""Squared normalised error that normal errors exceed once in a thousand times."""
+"""Squared normalised error that normal errors exceed once in a thousand cases."""
 
 OUTLIER_SHARE = 0.25
-"""Part of the frames whose pose may lie far from the others' while the camera counts as standing still; and of the
-corners that may be left out because the others contradict them, at least one.
+"""Largest part of the frames whose pose may lie far from the others' while the camera counts as standing still; and of
+the corners that may be left out because the others contradict them (at least one corner).
 """
 
 RETRY_FRAMES = 5
-"""Frames until what waits for more frames is looked at again."""
+"""Frames after which an answer that waits for more frames is computed again."""
 
 UNLIKELY_RESIDUALS_RISK = 0.02
-"""Chance below which residuals are believed to say that the fingers don't belong together."""
+"""p-value below which the residuals show that the fingers don't belong together."""
 
 
 class RefusalReason(enum.StrEnum):
@@ -74,8 +74,8 @@ class RefusalReason(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """The old reference stays; ``text`` says why.  ``wait``: nothing speaks against it but that the frames are too few
-    yet.
+    """The old reference stays; ``text`` gives the reason.  ``wait``: the only objection is that the frames are still
+    too few.
     """
 
     reason: RefusalReason
@@ -87,7 +87,8 @@ class Refusal:
 class Proposal:
     """A new reference: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, and what it was made of.
 
-    ``needs_person``: why an operator has to accept it, None if no one has to.  ``wait``: more frames may spare him.
+    ``needs_person``: why an operator has to accept it, None if no one has to.  ``wait``: with more frames no one may
+    have to.
     """
 
     cam_T_grip: Array
@@ -104,38 +105,38 @@ class _Refused(Exception):
 
 
 class Recalibrator:
-    """Collects frames while the camera stands still, and says what they are worth as a new reference."""
+    """Collects frames while the camera stands still, and decides what they are worth as a new reference."""
 
     def __init__(
         self, settings: RecalibrationSettings, gripper: Gripper, floor: Array, most_corners: int | None = None
     ):
-        """``floor`` (6, 6): covariance of the systematic error that no averaging removes; ``most_corners``: take so
-        many of the corners next to the TCP, None for all.
+        """``floor`` (6, 6): covariance of the systematic error that no averaging removes; ``most_corners``: use only
+        this number of corners, those nearest to the TCP; None for all.
         """
         self._settings, self._gripper, self._floor, self._most = settings, gripper, floor, most_corners
         self._frames: deque[StillFrame] = deque(maxlen=max(settings.frames, settings.most_frames))
-        self._waiting: tuple[str, Proposal | Refusal] | None = None  # in place of which reference, and what
+        self._waiting: tuple[str, Proposal | Refusal] | None = None  # id of the reference to replace, and the answer
         self._since = 0
 
     @property
     def frames(self) -> int:
-        """Frames that are collected."""
+        """Number of frames collected."""
         return len(self._frames)
 
     def add(self, still: StillFrame) -> None:
-        """One more measured frame of a camera that hasn't moved since the one before; the oldest ones give way."""
+        """Add a measured frame of a camera that hasn't moved since the one before; the oldest frames drop out."""
         self._frames.append(still)
         self._since += 1
 
     def forget(self) -> None:
-        """The camera has moved, or may have: begin again."""
+        """The camera has moved, or may have: start collecting again."""
         self._frames.clear()
         self._waiting = None
 
     def outcome(self, reference: ReferenceRecord) -> Proposal | Refusal:
-        """What the frames say of a new reference in place of the one in force.
+        """What the frames give as a new reference in place of the one in force.
 
-        An answer that waits for more frames is given again until :data:`RETRY_FRAMES` more have come.
+        An answer that waits for more frames is repeated until :data:`RETRY_FRAMES` more have come.
         """
         if self._waiting is not None and self._waiting[0] == reference.reference_id and self._since < RETRY_FRAMES:
             return self._waiting[1]
@@ -196,7 +197,7 @@ class Recalibrator:
         return Proposal(tracked.cam_T_grip, covariance, inputs, "; ".join(asks) or None, wait)
 
     def _asks(self, pooled: PooledEdges, step_m: float, step_rad: float) -> list[str]:
-        """Why a person has to be asked, whatever the pose's covariance."""
+        """Why an operator has to be asked, whatever the pose's covariance."""
         settings, asks = self._settings, []
         if settings.mode == "confirm":
             asks.append("every recalibration has to be accepted")
@@ -233,7 +234,7 @@ class Recalibrator:
             )
 
     def _by_corners(self, corners: MeanCorners, tracked: Average) -> tuple[MeanCorners, Recalibration]:
-        """The corners that agree with each other and their pose, checked against the tracked one."""
+        """The mutually consistent corners and their pose, checked against the tracked one."""
         settings = self._settings
         corners = self._taken(corners)
         corners, every = self._agreeing(corners, self._solved(corners))
@@ -282,7 +283,9 @@ class Recalibrator:
             raise _Refused(RefusalReason.NO_POSE, str(refused)) from None
 
     def _agreeing(self, corners: MeanCorners, every: list[Recalibration]) -> tuple[MeanCorners, list[Recalibration]]:
-        """Without the corner, or the few, that the others contradict: whichever leaves the smallest residuals."""
+        """Leave out the few corners, at least one, that the others contradict: each time the one without which the
+        residuals are smallest.
+        """
         for _ in range(max(1, int(OUTLIER_SHARE * len(corners.corner)))):
             count = len(corners.corner)
             if _rms(every[0], count) <= self._settings.worst_weighted_rms:
@@ -305,16 +308,16 @@ class Recalibrator:
 
 
 def _tcp_sigma_m(covariance: Array) -> float:
-    """Standard deviation of the TCP's distance from where it is said to be, its axes together."""
+    """Standard deviation of the TCP's distance from its estimate, all axes together."""
     return math.sqrt(float(np.trace(covariance[:3, :3])))
 
 
 def _rms(pose: Recalibration, corners: int) -> float:
-    """Weighted rms of the corners' residuals, by their degrees of freedom: 1 if their covariances hold."""
+    """Weighted rms of the corners' residuals per degree of freedom: 1 if their covariances hold."""
     return pose.weighted_rms * math.sqrt(2 * corners / (2 * corners - 6))
 
 
 def _agree(pose: Recalibration, tracked: Average) -> bool:
-    """Whether the corners' pose is the tracked one within both covariances, as if they were independent."""
+    """Whether the corners' pose equals the tracked one within both covariances, taken as independent."""
     difference = perturbation_between(tracked.cam_T_grip, pose.cam_T_grip)
     return bool(difference @ np.linalg.solve(pose.covariance + tracked.covariance, difference) <= OUTLYING_ERROR_SQUARE)

@@ -1,4 +1,4 @@
-"""How many frames a recalibration takes, and what it must show to count without a person."""
+"""How many frames a recalibration takes, and what it must show to count without an operator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from msgspec import Meta
 
 
 class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a new reference is measured past the limit, and who lets it in."""
+    """When a new reference is measured past the limit, and who accepts it."""
 
     mode: Annotated[
         Literal["auto", "confirm", "off"],

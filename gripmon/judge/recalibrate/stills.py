@@ -1,8 +1,8 @@
-"""Frames of a camera that stands still, taken together: the tracked poses' average, and the corners' mean places.
+"""Frames of a camera that stands still, combined: the average of the tracked poses, and the corners' mean positions.
 
-Both kinds of error are in every frame: one that changes from frame to frame, as noise and a moving background do, and
-one that doesn't, as texture, light and a background that stands still.  What the frames' covariances claim holds both;
-what their scatter shows is the first, and only that becomes less by averaging.
+Every frame has two kinds of error: one that changes from frame to frame, from noise and a moving background, and one
+that doesn't, from texture, light and a static background.  The frames' claimed covariances hold both; their scatter
+shows the first, and averaging reduces only that.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, EdgeSums
 
 LASTING_SHARE = 0.25
-"""Part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""
+"""Least part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""
 
 NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
-"""Frames in a row that count as one at least, since their changing errors are alike, too; and the largest correlation
-of neighbours that a few frames can tell.
+"""Least number of consecutive frames that count as one, since their changing errors are correlated, too; and the
+largest correlation of neighbours that a few frames can show.
 """
 
 FIRST_FRAMES = 3
-"""First frames, whose claims are taken for those of all if they are larger."""
+"""Number of first frames; if their claimed covariance is larger, it is taken for all frames."""
 
 FEWEST_SEEN = 0.2
-"""Part of the frames in which a corner must be usable."""
+"""Least part of the frames in which a corner must be usable."""
 
 
 @dataclass(frozen=True, slots=True)
 class StillFrame:
     """What one measured frame gives: the tracked ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error; the
-    corners' places ``points_grip_m`` (c, 3) at the frame's jaw opening; ``usable`` (c,) those that were measured, at
-    ``xy`` (c, 2) in ideal coordinates, with the joint covariance ``covariance_xy`` (2k, 2k) of the k usable ones; what
-    the ``edges`` say, None where no one asked.
+    corners' positions ``points_grip_m`` (c, 3) at the frame's jaw opening; ``usable`` (c,), those that were measured,
+    at ``xy`` (c, 2) in ideal coordinates, with the joint covariance ``covariance_xy`` (2k, 2k) of the k usable ones;
+    the ``edges``' sums, None where they weren't asked for.
     """
 
     seq: int
@@ -52,10 +52,10 @@ class StillFrame:
 
 @dataclass(frozen=True, slots=True)
 class Average:
-    """Mean ``cam_T_grip`` (4, 4) of the tracked poses with the honest ``covariance`` (6, 6) of its error;
-    ``covariance_at_last`` the same once ``most_frames`` were averaged.  ``way`` (6,) from the mean of the first half to
-    that of the second, and its squared size ``trend`` over the frames' own scatter; ``outlying``: part of the frames
-    whose pose doesn't belong to the others'.
+    """Mean ``cam_T_grip`` (4, 4) of the tracked poses with the ``covariance`` (6, 6) of its error, lasting part
+    included; ``covariance_at_last`` is the same once ``most_frames`` are averaged.  ``way`` (6,) is the displacement
+    from the mean of the first half to that of the second, ``trend`` its square, normalised by the frames' own scatter;
+    ``outlying``: part of the frames whose pose lies far from the others'.
     """
 
     cam_T_grip: Array
@@ -67,7 +67,7 @@ class Average:
 
 
 def average(frames: list[StillFrame], most_frames: int) -> Average:
-    """Weighted mean of the tracked poses of at least four frames, without those that lie far from the middle."""
+    """Weighted mean of the tracked poses of at least four frames, without those far from the median."""
     middle_T = _middle(frames)
     xis = np.array([perturbation_between(middle_T, f.cam_T_grip) for f in frames])
     weights = np.array([np.linalg.inv(f.covariance) for f in frames])
@@ -78,7 +78,7 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
         xis, weights = xis[~far], weights[~far]
     claimed = np.linalg.inv(weights.mean(axis=0))
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, xis))
-    # What later frames claim to know better, of the jaw's opening say, they have learnt from pictures that err alike.
+    # Later frames may claim to know more, e.g. of the jaw opening, but they learnt it from images with the same error.
     claimed = larger(claimed, np.mean([f.covariance for f in frames[:FIRST_FRAMES]], axis=0))
     scatter = np.cov(xis.T)
     half = len(xis) // 2
@@ -95,12 +95,12 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
 
 
 def averaged_covariance(claimed: Array, values: Array, count: int) -> Array:
-    """Covariance (m, m) of the mean of ``count`` values in a row whose error has the ``claimed`` covariance each, as n
-    of them, ``values`` (n, m), show.
+    """Covariance (m, m) of the mean of ``count`` consecutive values, each with an error of the ``claimed`` covariance
+    (m, m); ``values`` (n, m) are n of them.
 
-    Along each common axis of what is claimed and of the values' scatter, with v the scatter in units of what is
-    claimed: what doesn't scatter, 1 - v, but at least :data:`LASTING_SHARE`, stays as it is, and v becomes less as
-    the mean of so many independent values as the values' own likeness from one to the next leaves.
+    Works along each common axis of the claimed covariance and the values' scatter; v is the scatter in units of what is
+    claimed.  The part that doesn't scatter, 1 - v, but at least :data:`LASTING_SHARE`, stays.  The part v is divided by
+    the number of independent values that the correlation of neighbours leaves.
     """
     factor = np.linalg.cholesky(claimed)
     off = np.linalg.solve(factor, (values - values.mean(axis=0)).T)
@@ -113,21 +113,21 @@ def averaged_covariance(claimed: Array, values: Array, count: int) -> Array:
 
 
 def _alike(values: Array) -> float:
-    """How many values (n,) in a row count as one: from the correlation of neighbours, as if all of it were handed on
-    from one to the next.
+    """Number of consecutive values (n,) that count as one independent value: from the correlation of neighbours, as in
+    a first-order autoregression; at least :data:`NEIGHBOURS`.
     """
     squares = float(values @ values)
     if not squares > 0.0:
         return NEIGHBOURS
     count = len(values)
     correlation = float(values[1:] @ values[:-1]) / squares
-    # A short series shows too little of it (Marriott and Pope 1954).
+    # A short series shows too little correlation (Marriott and Pope 1954).
     correlation = min(correlation + (1.0 + 3.0 * correlation) / count, MOST_ALIKE)
     return max((1.0 + correlation) / (1.0 - correlation), NEIGHBOURS)
 
 
 def larger(covariance: Array, other: Array) -> Array:
-    """(m, m) the larger of two covariances along each of their common axes."""
+    """The larger of two covariances (m, m) along each of their common axes."""
     factor = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(factor)
     part, axes = np.linalg.eigh(inverse @ other @ inverse.T)
@@ -136,7 +136,7 @@ def larger(covariance: Array, other: Array) -> Array:
 
 
 def _middle(frames: list[StillFrame]) -> Array:
-    """The frame's pose whose TCP is nearest to the median of all."""
+    """Pose of the frame whose TCP is nearest to the median."""
     tcp_m = np.array([f.cam_T_grip[:3, 3] for f in frames])
     distance = np.linalg.norm(tcp_m - np.median(tcp_m, axis=0), axis=1)
     return frames[int(np.argmin(distance))].cam_T_grip
@@ -144,7 +144,7 @@ def _middle(frames: list[StillFrame]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class MeanCorners:
-    """The k corners that most frames show: their indices ``corner`` (k,), mean ``points_grip_m`` (k, 3), mean ``xy``
+    """The k corners that enough frames show: their indices ``corner`` (k,), mean ``points_grip_m`` (k, 3), mean ``xy``
     (k, 2) with the joint covariance (2k, 2k) of its error.
     """
 
@@ -154,7 +154,7 @@ class MeanCorners:
     covariance_xy: Array
 
     def of(self, taken: NDArray[np.bool_]) -> MeanCorners:
-        """Only those ``taken`` (k,)."""
+        """Only those of the mask ``taken`` (k,)."""
         both = np.repeat(taken, 2)
         return MeanCorners(
             self.corner[taken], self.points_grip_m[taken], self.xy[taken], self.covariance_xy[np.ix_(both, both)]
@@ -162,10 +162,11 @@ class MeanCorners:
 
 
 def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
-    """Corners averaged over the frames: their mean distance from where ``cam_T_grip`` puts them at each frame's own jaw
-    opening, added to where it puts their mean points.  A corner's frames that lie far from its median don't count.
+    """Corners averaged over the frames: their mean offset from where ``cam_T_grip`` projects them at each frame's own
+    jaw opening, added to the projection of their mean points.  Frames in which a corner lies far from its median don't
+    count for it.
 
-    The pose only carries the corners from one opening to the others: an error of it cancels to first order.
+    The pose only relates the corners at different openings: its error cancels to first order.
     """
     off_xy = np.array([f.xy - _image(f.points_grip_m, cam_T_grip) for f in frames])
     usable = np.array([f.usable for f in frames])
@@ -176,7 +177,7 @@ def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
     times = usable[:, corner].sum(axis=0)
     information, pull, part = _sums(frames, off_xy, usable)
     mean = np.linalg.solve(information, pull)
-    # As if each corner had been seen once, and all together: what lasts of their errors is in every frame.
+    # As if each corner had been seen once, all in one frame: the lasting part of their errors is in every frame.
     once = np.sqrt(np.repeat(times, 2))
     claimed = np.linalg.inv(information / np.outer(once, once))
     left = max(1.0 - part, LASTING_SHARE) + part * NEIGHBOURS / max(int(times.min(initial=len(frames))), 1)
@@ -188,7 +189,7 @@ def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
 
 def _sums(frames: list[StillFrame], off_xy: Array, usable: NDArray[np.bool_]) -> tuple[Array, Array, float]:
     """Over all frames: information (2k, 2k) of the k corners usable in any, information times offset (2k,), and the
-    scatter about their medians in units of what is claimed.
+    scatter about their medians over what is claimed.
     """
     ever = usable.any(axis=0)
     middle = np.zeros(off_xy.shape[1:])
@@ -209,7 +210,7 @@ def _sums(frames: list[StillFrame], off_xy: Array, usable: NDArray[np.bool_]) ->
 
 
 def _astray(frames: list[StillFrame], off_xy: Array) -> NDArray[np.bool_]:
-    """(n, c) corners that lie further from their median over the frames than five standard deviations."""
+    """Mask (n, c) of corners that lie more than five standard deviations from their median over the frames."""
     usable = np.array([f.usable for f in frames])
     middle = np.zeros(off_xy.shape[1:])
     for c in np.flatnonzero(usable.any(axis=0)):
