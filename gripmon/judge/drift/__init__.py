@@ -1,5 +1,4 @@
-"""Has the camera moved?  A sequential test on the drift with a stated rate of false alarms, and what kind of motion it
-was."""
+"""Has the camera moved?  A sequential test on the drift with a stated false-alarm rate, and the kind of motion."""
 
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
 from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, Lasting, MotionWatch

@@ -1,5 +1,5 @@
-"""What kind of motion it is: a step or a creep from the drift's history over minutes, and a vibration, where the
-differences between frames grow in one direction while their mean stays.
+"""Kind of motion: a step or a creep, from the drift's history over minutes; or a vibration, where the differences
+between frames grow in one direction while their mean stays.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ import numpy as np
 from gripmon.model.records import Array, Creep, Vibration
 
 BLOCK_S = 0.5
-"""Seconds over which frames are averaged; a change of the mean that took no longer is a step."""
+"""Time over which frames are averaged; a change of the mean within it is a step."""
 
 KEPT_BLOCKS = 256
-"""Blocks in which the beginning of a motion is looked for: two minutes."""
+"""Blocks in which the onset of a motion is searched for: two minutes."""
 
 LASTING_BLOCKS = 3
-"""Blocks that must have come after a step."""
+"""Fewest blocks after a step."""
 
 FEWEST_BLOCKS = 2 * LASTING_BLOCKS
-"""Blocks below which a creep isn't told from a step: as many before it."""
+"""Fewest blocks that distinguish a creep from a step: as many before it as after it."""
 
 EXPLAINED_SQUARES_RATIO = 0.6
-"""A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
+"""Largest ratio of the squares that a creep leaves to those that a step leaves for it to be a creep, and vice versa."""
 
 SIGNIFICANT_SIGMAS = 4.0
-"""Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero,
-a first shift from the reference on some axis is more than the reference's error, an edge contradicts the fit otherwise
-than usually, and a piece of an edge doesn't stand at a place.
+"""Significance limit in standard deviations; normal errors exceed it once in 16,000 cases.  It applies to a rate that
+differs from zero, a first shift that is more than the reference's error on some axis, an edge that contradicts the fit
+unusually, and a piece of an edge that isn't at a place.
 """
 
 
 class History:
-    """Means over :data:`BLOCK_S` of the shift against the reference."""
+    """Means of the shift against the reference over blocks of :data:`BLOCK_S`."""
 
     def __init__(self) -> None:
         self._times_s: deque[float] = deque(maxlen=KEPT_BLOCKS)
@@ -45,7 +45,7 @@ class History:
         self._begun_s: float | None = None
 
     def add(self, shift: Array, now_s: float) -> bool:
-        """One frame's shift (6,); True when a block is complete."""
+        """Add one frame's shift (6,); True when a block is complete."""
         if self._begun_s is None:
             self._begun_s = now_s
         complete = now_s - self._begun_s >= BLOCK_S and self._count > 0
@@ -58,15 +58,15 @@ class History:
         return complete
 
     def clear(self) -> None:
-        """The reference has changed."""
+        """Start again: the reference has changed."""
         self._times_s.clear()
         self._means.clear()
         self._sum, self._count, self._begun_s = np.zeros(6), 0, None
 
     def creep(self, towards: Array) -> Creep | None:
-        """The creep that the blocks show, None if a step explains them as well or if it doesn't go on.
+        """The creep that the blocks show; None if a step explains them as well, or if it has stopped.
 
-        ``towards`` (6,): its product with a shift is a number of standard deviations along the drift.
+        ``towards`` (6,): its product with a shift is the shift along the drift, in standard deviations.
         """
         count = len(self._means)
         if count < FEWEST_BLOCKS:
@@ -88,13 +88,13 @@ class History:
             return False
         along = np.array(self._means) @ towards
         step, before = _best_step(along)
-        # Of a creep that has just begun the first block is a step, too.
+        # The first block of a creep that has just begun also looks like a step.
         lasts = count - 1 - before >= LASTING_BLOCKS
         return lasts and step <= EXPLAINED_SQUARES_RATIO * _best_ramp(along, np.array(self._times_s))[0]
 
 
 def goes_on(values: Array) -> bool:
-    """Whether the newest of a series (n,) are still on their way rather than at a new place."""
+    """Whether the newest of a series (n,) are still moving rather than settled at a new level."""
     count = len(values)
     if count < FEWEST_BLOCKS:
         return False
@@ -102,17 +102,17 @@ def goes_on(values: Array) -> bool:
 
 
 def _best_step(values: Array) -> tuple[float, int]:
-    """Smallest sum of squares of values (n,) that a constant and a step leave, and the number of the block before."""
+    """Smallest sum of squared residuals of a step fitted to values (n,), and the index of the block before it."""
     values = values - values.mean()
     after = np.arange(len(values) - 1, 0, -1)  # blocks after each but the last
     return _best(values, _from_each(values)[1:], after * (1.0 - after / len(values)))
 
 
 def _best_ramp(values: Array, times_s: Array) -> tuple[float, int]:
-    """The same of a constant until a block, and from there on a straight line: by its squares, and the block."""
+    """The same for a constant followed by a ramp, and the index of the block in which the ramp begins."""
     values, times_s = values - values.mean(), times_s - times_s[-1]
     begin, after = times_s[:-2], np.arange(len(values), 2, -1.0)
-    # Of (t - t_k) over all t from t_k on: its product with the values, its sum and its squares.
+    # For (t - t_k) over all t from t_k on: its product with the values, its sum and its squares.
     product = _from_each(times_s * values)[:-2] - begin * _from_each(values)[:-2]
     total = _from_each(times_s)[:-2] - begin * after
     square = _from_each(times_s**2)[:-2] - 2.0 * begin * _from_each(times_s)[:-2] + begin**2 * after
@@ -120,13 +120,13 @@ def _best_ramp(values: Array, times_s: Array) -> tuple[float, int]:
 
 
 def _from_each(values: Array) -> Array:
-    """(n,) sums over values (n,) from each on."""
+    """Sums (n,) over values (n,) from each one to the last."""
     return np.cumsum(values[::-1])[::-1]
 
 
 def _best(values: Array, product: Array, square: Array) -> tuple[float, int]:
-    """Smallest sum of squares that one multiple of some shapes leaves of values (n,) about their mean, and the shape's
-    number; ``product`` of each with the values, and ``square`` of each about its mean.
+    """Smallest sum of squared residuals of values (n,) about their mean after fitting a multiple of one of some shapes,
+    and the index of that shape; ``product`` of each shape with the values, ``square`` of each about its mean.
     """
     explained = product**2 / np.maximum(square, 1e-300)
     index, whole = int(explained.argmax()), float(values @ values)
@@ -146,27 +146,27 @@ def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array
 
 
 KEPT_FRAMES = 128
-"""Frames that are looked at: two seconds at 60 frames/s."""
+"""Frames in which a vibration is searched for: two seconds at 60 frames/s."""
 
 PARTS = 4
-"""In which it is looked for, each by itself."""
+"""Number of parts of these frames, each evaluated separately."""
 
 LOOK_FRAMES = KEPT_FRAMES // PARTS
-"""Looked at once in so many frames: when a part is new."""
+"""Frames between two evaluations: one part is new each time."""
 
 VIBRATION_VARIANCE_RATIO = 6.0
-"""Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
+"""Ratio of the variance in a direction to the usual one, claimed or learnt, from which it is a vibration."""
 
 
 VIBRATION_RELEASE_RATIO = 0.5
-"""Part of what it takes to find a vibration from which one that was found goes on."""
+"""Factor on the limits for a vibration that was already found, so that it isn't lost at the limit."""
 
 
 class VibrationWatch:
-    """Looks at the last :data:`KEPT_FRAMES` shifts of the TCP."""
+    """Searches the last :data:`KEPT_FRAMES` shifts of the TCP for a vibration."""
 
     def __init__(self, smallest_m: float):
-        """``smallest_m``: root mean square from which a vibration is worth telling."""
+        """``smallest_m``: root mean square from which a vibration is reported."""
         self._smallest_m = smallest_m
         self._shifts: deque[Array] = deque(maxlen=KEPT_FRAMES)
         self._times_s: deque[float] = deque(maxlen=KEPT_FRAMES)
@@ -177,19 +177,19 @@ class VibrationWatch:
 
     @property
     def is_news(self) -> bool:
-        """Whether it vibrates by more than the stream's noise, as learnt by now, explains."""
+        """Whether it vibrates by more than the stream's noise, as learnt so far, explains."""
         return self._found is not None and not self._learnt
 
     def forget(self) -> None:
-        """The camera has moved: the step is not a vibration."""
+        """Start again: the camera has moved, and the step is not a vibration."""
         self._shifts.clear()
         self._times_s.clear()
         self._found = None
 
     def add(self, shift: Array, now_s: float, usual: Callable[[], Array]) -> Vibration | None:
-        """One frame's shift (6,); ``usual()`` (6, 6): covariance of an unmoved camera's shifts about their mean.
+        """Add one frame's shift (6,); ``usual()`` (6, 6): covariance of an unmoved camera's shifts about their mean.
 
-        What is going on; None for no vibration.  One that goes on is learnt as noise sooner or later, and goes on.
+        Returns the vibration, None if there is none.  One that lasts is learnt as noise in time; it is still reported.
         """
         self._shifts.append(shift)
         self._times_s.append(now_s)
@@ -204,7 +204,7 @@ class VibrationWatch:
 
     def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
         shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
-        # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
+        # Three of four parts must show it, each about its own line: a step or a wild frame is loud in only one of them.
         parts = _about_its_line(shifts.reshape(PARTS, -1, 3))
         direction = _loudest(np.einsum("pni,pnj->ij", parts, parts) / KEPT_FRAMES, usual)
         loud = sorted(np.square(parts @ direction).mean(axis=1).tolist())
@@ -212,7 +212,7 @@ class VibrationWatch:
         if loud[1] < ease * VIBRATION_VARIANCE_RATIO * expected:
             return None
         self._learnt = loud[1] < VIBRATION_VARIANCE_RATIO * float(direction @ learnt @ direction)
-        # A part may hold less than a period: the size is that about a line through all of them.
+        # A part may be shorter than a period: the size is taken about a line through all of them.
         along = _about_its_line(shifts) @ direction
         excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected
         if excess < ease * self._smallest_m**2:
@@ -221,7 +221,7 @@ class VibrationWatch:
 
 
 def _about_its_line(values: Array) -> Array:
-    """(..., n, 3) what is left of values (..., n, 3) that grow evenly: a creep is not a vibration."""
+    """Residuals (..., n, 3) of values (..., n, 3) about a straight line in time: a creep is not a vibration."""
     count = values.shape[-2]
     index = np.arange(count) - 0.5 * (count - 1)
     slope = np.einsum("n,...ni->...i", index, values) / (index @ index)
@@ -230,7 +230,7 @@ def _about_its_line(values: Array) -> Array:
 
 
 def _loudest(covariance: Array, usual: Array) -> Array:
-    """The direction (3,) of length one in which a covariance exceeds the usual one the most."""
+    """Unit vector (3,) along which a covariance exceeds the usual one most."""
     root = np.linalg.cholesky(usual)
     inverse = np.linalg.inv(root)
     _, directions = np.linalg.eigh(inverse @ covariance @ inverse.T)
@@ -239,7 +239,7 @@ def _loudest(covariance: Array, usual: Array) -> Array:
 
 
 def _frequency_hz(values: Array, times_s: Array) -> float:
-    """Of the largest line in the spectrum, between lines by a parabola through its neighbours."""
+    """Frequency of the largest peak in the spectrum, interpolated by a parabola; 0 where no time passes."""
     interval_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
     if interval_s <= 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""One stream of poses: is the camera where the reference has it, since when not, and how does it move?
+"""One stream of poses: is the camera at its reference, since when not, and how does it move?
 
 The part of a shift that an inexact reference explains doesn't count.
 """
@@ -22,23 +22,23 @@ from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 class Baseline:
     """The error of a reference that is only roughly known, such as a configured one.
 
-    A calibration is off by some tenths of a millimetre from the start: not a drift.  The mean shift of the first
-    frames, without those that lie farthest out, is taken for that error if the reference's own uncertainty allows it,
-    else nothing is.
+    A calibration is off by some tenths of a millimetre from the start, which is not a drift.  The mean shift of the
+    first frames, outliers left out, is taken for that error if the reference's own uncertainty allows it; otherwise the
+    error is taken as zero.
     """
 
     def __init__(self, reference_sigma: Array, frames: int, error: Array | None = None):
-        """``reference_sigma`` (6,): standard deviations of the reference's error, m and rad.  ``error`` (6,) if it is
-        known from before.
+        """``reference_sigma`` (6,): standard deviations of the reference's error, m and rad; ``frames``: number of
+        first frames; ``error`` (6,): the error, if it is already known.
         """
         self._allowed = SIGNIFICANT_SIGMAS * reference_sigma
         self._frames = frames
         self._first: list[Array] = []
         self.error = error
-        """(6,) what is subtracted; None until it is known."""
+        """Error (6,) that is subtracted; None until it is known."""
 
     def subtract(self, shift: Array) -> Array | None:
-        """The shift (6,) less the reference's error; None while that isn't known yet."""
+        """The shift (6,) minus the reference's error; None until that is known."""
         if self.error is None:
             self._first.append(shift)
             if len(self._first) < self._frames:
@@ -50,7 +50,7 @@ class Baseline:
 
 
 def _mean_of_the_inner_half(shifts: Array) -> Array:
-    """(6,) of shifts (n, 6), those closest to their median: a wild frame among them counts for nothing."""
+    """Mean (6,) of the half of the shifts (n, 6) closest to their median, so that wild frames don't count."""
     distance = np.abs(shifts - np.median(shifts, axis=0))
     scale = np.maximum(np.median(distance, axis=0), 1e-12)
     inner = np.argsort((distance / scale).max(axis=1), kind="stable")[: (len(shifts) + 1) // 2]
@@ -58,50 +58,50 @@ def _mean_of_the_inner_half(shifts: Array) -> Array:
 
 
 LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
-"""Frames at most, and since the last step, whose mean tells whether the camera is back, and of which the present shift
-is the mean.
+"""Most frames since the last step whose mean tells whether the camera is back; and number of newest frames whose mean
+is reported as the present shift.
 """
 
 USUAL_SQUARE = chi_square_limit(0.05)
-"""Squared normalised distance that normal errors exceed once in twenty times: with a shift below it
-the camera counts as back, so that between this and the test's threshold an alert stays.
+"""Squared normalised distance that normal errors exceed once in twenty cases.  With a shift below it the camera counts
+as back; between this and the test's threshold an alert stays.
 """
 
 EVIDENCE_LOOK_RATIO = 0.4
-"""Part of the threshold from which the evidence is looked at more closely, before it is decided."""
+"""Part of the threshold from which the evidence is examined more closely, before the test decides."""
 
 BIAS_CHANGED = 0.2
-"""Relative change of a finer measurement's lasting variance from which the test takes note of it: a tenth of its
+"""Relative change of the lasting variance of a finer measurement from which the test is updated: a tenth of its
 standard deviation.
 """
 
 VIBRATING_FRAMES = BLOCK_FRAMES
-"""While it vibrates: frames of the shortest window that decides, for over a block a vibration is nearly gone; over
-twice as many the mean tells whether the camera is back.
+"""Frames of the shortest window that decides during a vibration, since the mean over a block nearly cancels it; the
+mean over twice this number tells whether the camera is back.
 """
 
 VIBRATION_STEP_RATIO = 4.0
-"""Times a vibration's root mean square by which two frames must be off to be a step nevertheless: a sinusoid swings by
-1.4 to either side.
+"""Multiple of a vibration's root mean square that two frames must be off to count as a step; a sinusoid reaches 1.4 to
+either side.
 """
 
 
 class Lasting(NamedTuple):
-    """Error that lasts: its ``covariance`` (6, 6), and the ``share`` of it that is another one from frame to frame."""
+    """Error that lasts: its ``covariance`` (6, 6), and the ``share`` of it that changes from frame to frame."""
 
     covariance: Array
     share: float
 
 
 class MotionWatch:
-    """The sequential test, and what follows from it for one camera."""
+    """The sequential test for one camera, and what follows from it."""
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
         self._settings = settings
-        # What a finer measurement refines has a noise of its own, and so a test of its own.
+        # The finer measurement has its own noise, and therefore its own test.
         self._other: SequentialTest | None = None
-        self._finer, self._missed = False, 0  # frames that the other one hasn't seen
+        self._finer, self._missed = False, 0  # frames that the other test hasn't seen
         self._reference: Array = np.zeros((6, 6))
         self._of_bias: Array = np.zeros((6, 6))
         self._vibration = VibrationWatch(settings.vibration_m)
@@ -115,10 +115,10 @@ class MotionWatch:
         self._vibrates: Vibration | None = None
         self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
         self.statistic_share: float | None = None
-        """The newest frame's largest statistic over its threshold, 1 at the threshold; None if it wasn't tested."""
+        """The newest frame's largest statistic over its threshold; None if the frame wasn't tested."""
 
     def reset(self, reference_covariance: Array) -> None:
-        """There is a new reference, with the covariance (6, 6) of its error: drift is reckoned from zero."""
+        """There is a new reference, with the covariance (6, 6) of its error: drift counts from zero."""
         for test in self._tests:
             test.restart(np.array([True]))
         self.set_reference_covariance(reference_covariance)
@@ -130,12 +130,12 @@ class MotionWatch:
         self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
 
     def resume(self, moved: bool) -> None:
-        """After a restart: whether the camera was not where the reference has it."""
+        """Continue after a restart; ``moved``: whether the camera was away from its reference."""
         self._present = moved
         self._last = replace(self._last, present=moved)
 
     def set_reference_covariance(self, covariance: Array) -> None:
-        """Covariance (6, 6) of the reference's own error, which is no drift."""
+        """Covariance (6, 6) of the reference's own error, which is not a drift."""
         self._reference = covariance
         for test in self._tests:
             test.set_reference_covariance(covariance)
@@ -145,16 +145,16 @@ class MotionWatch:
         return (self.test,) if self._other is None else (self.test, self._other)
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
-        """The stream's own rate."""
+        """Set the stream's own frame rate."""
         self._frames_per_s = frames_per_s
         for test in self._tests:
             test.set_frames_per_s(frames_per_s)
 
     def add(self, shift: Array | None, covariance: Array, now_s: float, bias: Lasting | None = None) -> Motion:
-        """One frame's shift (6,) against the reference, with its covariance (6, 6), at the frames' time.
+        """Add one frame's shift (6,) against the reference, with its covariance (6, 6), at the frames' time.
 
-        None for a shift while the reference's error isn't known yet.  ``bias``, of a frame that a finer measurement
-        refines: what lasts of its error; ``covariance`` is that of the rest then.
+        ``shift`` is None while the reference's error isn't known yet.  ``bias`` is given for a frame that a finer
+        measurement refines: the lasting part of its error; ``covariance`` is then that of the rest.
         """
         self.statistic_share = None
         self._choose_test(bias)
@@ -176,7 +176,7 @@ class MotionWatch:
         frames = max(int(test.windows.frames[0]), 1)
         level, level_covariance = self._level(min(frames, 2 * VIBRATING_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
         before = self._present
-        # Those that have shown it are forgotten if it was a difference: as many more may show it again.
+        # A detected difference discards the frames before it: as many frames again may be needed to show the motion.
         self._held = 2 * length if moved else max(self._held - 1, 0)
         self._present = moved or (before and (self._held > 0 or self._away(level, level_covariance)))
         complete = self._history.add(shift, now_s)
@@ -202,7 +202,7 @@ class MotionWatch:
         return self._last
 
     def _choose_test(self, bias: Lasting | None) -> None:
-        """The one for frames of this kind; what it has of a minute ago is of another place, perhaps."""
+        """Select the test for frames of this kind; it restarts if its frames are old: the camera may have moved."""
         self._missed += 1
         if self._finer is not (bias is not None):
             self._finer = bias is not None
@@ -221,21 +221,21 @@ class MotionWatch:
                 self.test.set_bias(*bias)
 
     def learn(self) -> None:
-        """Learn from the newest frame what nothing waits for; :meth:`add` does it first if no one has."""
+        """Learn from the newest frame, off the critical path; otherwise the next :meth:`add` does it first."""
         self.test.learn()
 
     @property
     def vibrates_anew(self) -> bool:
-        """Whether it vibrates, and what was learnt of the stream's noise doesn't hold that yet."""
+        """Whether it vibrates, and the learnt noise doesn't include that yet."""
         return self._vibration.is_news
 
     def skip(self) -> Motion:
-        """A frame whose transform is doubtful tells nothing: all is as it was."""
+        """Skip a frame whose transform is doubtful: nothing changes."""
         self.statistic_share = None
         return replace(self._last, begun=False, stepped=False, suspicious=False)
 
     def _shortest_window(self, shift: Array) -> int:
-        """Frames of the shortest window that may decide: the swings of a vibration are no steps."""
+        """Frames of the shortest window that may decide: the swings of a vibration are not steps."""
         if self._vibrates is None or not self.vibrates_anew or not self._newest:
             return 1
         frames = min(int(self.test.windows.frames[0]), VIBRATING_FRAMES)
@@ -257,7 +257,7 @@ class MotionWatch:
         return self.test.square_beyond(level, covariance) > USUAL_SQUARE
 
     def _look_back(self, level: Array, covariance: Array) -> None:
-        """Step or creep, by the last minutes."""
+        """Decide between step and creep from the last minutes."""
         towards = np.linalg.solve(covariance, level)
         length = float(np.sqrt(np.maximum(level @ towards, 1e-300)))
         towards = towards / length

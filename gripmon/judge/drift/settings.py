@@ -1,4 +1,4 @@
-"""What counts as a drift, and how often an unmoved camera may be said to have moved."""
+"""What counts as a drift, and how many false alarms an unmoved camera may cause."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gripmon.model.records import Array
 
 
 class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The sequential test's contract."""
+    """The contract of the sequential test."""
 
     false_alarms_per_day: Annotated[
         float, Meta(gt=0.0, le=1000.0, description="drift alarms a day that an unmoved camera may give (1/day)")
@@ -35,5 +35,5 @@ class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def tolerated(self) -> Array:
-        """(6,) what of a shift of the TCP and of a turn is never worth an alarm, m and rad."""
+        """Shift of the TCP and turn (6,) that never cause an alarm, m and rad."""
         return np.array([self.tolerated_m] * 3 + [self.tolerated_rad] * 3)

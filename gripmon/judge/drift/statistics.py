@@ -2,19 +2,19 @@
 
 *Windows*: means over the last n frames for many n at once, at a cost that doesn't depend on n.
 
-*Scatter*: the covariance of the means of windows while nothing moves, learnt from the stream.  Frames err together:
-the background stands still for a while, lamps flicker, a mount hums.  No formula therefore gives the error of the mean
-of n frames.  It is measured, for every length n separately: the difference of two neighbouring windows of n frames has
-a covariance A(n) (twice the Allan variance), which a slow drift hardly touches.  By Haar's decomposition the mean of n
-frames is that of 2 n frames plus or minus half the difference of its two halves; the two are uncorrelated for
-stationary noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames
-claim, but that the stream has not shown, counts as a bias of this background: it changes with it, at any moment.
+*Scatter*: the covariance of window means while nothing moves, learnt from the stream.  The errors of frames are
+correlated: the background stands still for a while, lamps flicker, a mount hums.  Therefore no formula gives the error
+of the mean of n frames; it is measured for every length n separately.  The difference of two neighbouring windows of n
+frames has a covariance A(n) (twice the Allan variance), which a slow drift hardly affects.  By Haar's decomposition the
+mean of n frames is that of 2 n frames plus or minus half the difference of its two halves.  The two are uncorrelated
+for stationary noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames
+claim but the stream hasn't shown counts as a bias from this background, which may change with it at any moment.
 
 *Extremes*: the threshold of a stream, learnt by extreme value theory from the largest statistic of every block of
-frames.  Of the upper quarter of blocks the excess over the least of them is modelled as exponential in the statistic's
-square root, a number of standard deviations: between normal errors, whose tails are lighter, and Student's, whose are
-heavier.  The level that a block exceeds with a given chance follows by extrapolation, and is the predictive one, which
-holds for the next block although the tail's scale is known from few blocks: the fewer, the farther out it lies.
+frames.  In the upper quarter of the blocks the excess over the smallest is modelled as exponential in the statistic's
+square root, a number of standard deviations: a tail between that of normal errors and that of Student's.  The level
+that a block exceeds with a given probability follows by extrapolation.  It is the predictive one, which holds for the
+next block although the tail's scale is known from few blocks: the fewer blocks, the higher the level.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from gripmon.judge.drift import kernel
 from gripmon.model.records import Array
 
 LENGTHS = tuple(2**k for k in range(13))
-"""Frames that a window holds: 1, 2, 4 ... 4096, which is a minute at 60 frames/s."""
+"""Frames in a window: 1, 2, 4 ... 4096, which is a minute at 60 frames/s."""
 
 COUNT = np.array(LENGTHS, dtype=float)[:, None]
-"""(k, 1) the lengths, for what is reckoned for all of them at once."""
+"""The lengths (k, 1), for vectorised computations."""
 
 
 class Windows:
     """Running means of ``streams`` series of 6-vectors, from a ring of their sums.
 
-    One stream is the daemon; benchmarks run hundreds beside one another.
+    One stream for the daemon; benchmarks run hundreds in parallel.
     """
 
     def __init__(self, streams: int):
@@ -45,13 +45,13 @@ class Windows:
         self._newest = 0
 
         self.frames = np.zeros(streams, dtype=np.intp)
-        """(s,) frames in the windows of each stream."""
+        """Frames (s,) in the windows of each stream."""
 
     def add(self, values: Array) -> tuple[Array, Array]:
-        """One frame's values (s, 6); the means (k, s, 6) of the last n frames, for every n of :data:`LENGTHS`, and by
-        how much they differ from those of the n before.
+        """Add one frame's values (s, 6); returns the means (k, s, 6) of the last n frames, for every n of
+        :data:`LENGTHS`, and their differences from the means of the n frames before.
 
-        What reaches back beyond the first frame is meaningless; see :meth:`full`.
+        Values that reach back beyond the first frame are meaningless; see :meth:`full`.
         """
         self._newest = (self._newest + 1) % len(self._ring)
         self.frames += 1
@@ -59,40 +59,40 @@ class Windows:
         return of
 
     def full(self) -> tuple[np.ndarray, np.ndarray]:
-        """(k, s) whether the last n frames, and the last 2 n, lie within the stream."""
+        """Masks (k, s): whether the last n frames, and the last 2 n, lie within the stream."""
         count = self._lengths[:, None]
         return self.frames >= count, self.frames >= 2 * count
 
     def mean_of_last(self, frames: int) -> Array:
-        """(s, 6) mean over the last ``frames`` frames, 1 to 4096."""
+        """Mean (s, 6) over the last ``frames`` frames, 1 to 4096."""
         return (self._ring[self._newest] - self._ring[(self._newest - frames) % len(self._ring)]) / frames
 
     def keep(self, streams: np.ndarray, frames: np.ndarray | int) -> None:
-        """Forget all but the last ``frames`` frames of some streams (s,) bool."""
+        """Forget all but the last ``frames`` frames of some streams (s,), a mask."""
         self.frames = np.where(streams, np.minimum(self.frames, frames), self.frames)
 
 
 PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
-"""Pairs of windows that a small part of the reported covariance counts for at every length, before the stream has shown
-its own: until then nearly all of what is claimed is a bias that may change.
+"""Pairs of windows that the assumed covariance is worth at every length, and its share of the reported covariance,
+until the stream has shown its own: until then nearly all of the claimed error is a bias that may change.
 """
 
 LONGER, LONG = (4, 1), 64
-"""Lengths, each twice the one before, from a window's own on: noise that is seen in these is always there.  What shows
-only in yet longer ones comes in rare steps, of which the next may come at any moment.  Windows of so many frames and
-more are themselves as rare as that.
+"""Number of lengths, from a window's own on, whose noise is always present: for windows shorter than ``LONG`` frames,
+and for longer ones.  Noise that shows only at longer lengths comes in rare steps, and the next may come at any moment.
+Windows of ``LONG`` frames and more are as rare themselves.
 """
 
 MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
-"""What is learnt is forgotten over so many frames, or windows, whichever is longer."""
+"""Memory of what is learnt, in frames and in windows; the longer one applies."""
 
 _MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
 
 LARGEST_SQUARE = 4.0
-"""Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
+"""Largest squared normalised difference, over its expectation, that is learnt; larger ones are clipped to it."""
 
 RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
-"""(k,) number of the first length in which noise is rare to each."""
+"""(k,) for each length, the index of the first length at which noise counts as rare to it."""
 
 
 class Scatter:
@@ -105,16 +105,16 @@ class Scatter:
 
     @property
     def windows(self) -> Array:
-        """(k, s) pairs of independent windows that the covariances rest on."""
+        """Pairs of independent windows (k, s) from which the covariances are known."""
         return self._windows
 
     def begin(self, covariance: Array) -> None:
-        """What to expect by the reported covariances (s, 6, 6), before the first frame has shown anything."""
+        """Start with what the reported covariances (s, 6, 6) suggest, before the first frame."""
         self._of_difference[:] = PRIOR_SHARE * covariance
 
     def learn(self, difference: Array, normalised: Array, usable: np.ndarray, frames: int) -> None:
-        """Differences (k, s, 6) of neighbouring windows after ``frames`` more of them, their squares ``normalised``
-        (k, s) to a mean of 6, and which of them to learn from.
+        """Learn from differences (k, s, 6) of neighbouring windows after ``frames`` more frames; ``normalised`` (k, s):
+        their squares, normalised to a mean of 6; ``usable`` (k, s): those to learn from.
         """
         share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
         kernel.learn(
@@ -124,37 +124,37 @@ class Scatter:
 
     @property
     def of_differences(self) -> Array:
-        """(k, s, 6, 6) of the differences between neighbouring windows, as learnt."""
+        """Covariances (k, s, 6, 6) of the differences between neighbouring windows, as learnt."""
         return self._of_difference
 
     @property
     def learnt(self) -> Array:
-        """(k, s) part of the covariances that the stream has shown; the rest was only assumed."""
+        """Part (k, s) of the covariances that the stream has shown; the rest is assumed."""
         return 1.0 - PRIOR_WINDOWS / self._windows
 
     def of_single_frames(self) -> Array:
-        """(s, 6, 6) of frames about their mean, as the stream has shown it."""
+        """Covariance (s, 6, 6) of frames about their mean, as the stream has shown it."""
         return np.asarray(0.25 * self._of_difference.sum(axis=0))
 
 
 BLOCK_FRAMES, KEPT_BLOCKS = 256, 512
-"""Frames of a block, longer than bursts last (they do for half a second), and blocks that are remembered: half an hour
-at 60 frames/s, since rare changes of the background must be among them.
+"""Frames in a block, longer than bursts last (half a second), and number of blocks that are kept: half an hour at 60
+frames/s, to include rare changes of the background.
 """
 
 FEWEST_BLOCKS = 32
-"""Blocks below which nothing is said: eight of them are in the tail then, and its scale is known to a third."""
+"""Fewest blocks for a limit: eight of them are then in the tail, and its scale is known to a third."""
 
 TAIL_SHARE = 0.25
-"""Part of the blocks that is the tail."""
+"""Part of the blocks that forms the tail."""
 
 _LEFT_OUT = -1.0  # below the root of any square
 
 
 class Extremes:
-    """Limits of statistics (kinds, streams), each by its own extremes.
+    """Limits of statistics (kinds, streams), each from its own extremes.
 
-    ``frames`` (kinds, 1): over how many frames a statistic stays alike; blocks within them count as one together.
+    ``frames`` (kinds, 1): over how many frames a statistic is correlated; blocks within them count as one.
     """
 
     def __init__(self, frames: Array, streams: int):
@@ -165,11 +165,11 @@ class Extremes:
         self._frames = 0
         self._alike = np.broadcast_to(np.maximum(frames / BLOCK_FRAMES, 1.0), shape)
         self.blocks = np.zeros(shape, dtype=np.intp)
-        """(kinds, streams) that were remembered, each of :data:`BLOCK_FRAMES` frames."""
+        """Number (kinds, streams) of blocks kept, each of :data:`BLOCK_FRAMES` frames."""
 
     def add(self, squares: Array, usable: np.ndarray, frames: int) -> bool:
-        """Squared statistics (kinds, streams) after ``frames`` more frames, and which of them count; True if a block is
-        complete.  A block of which less than half counts is left out.
+        """Add squared statistics (kinds, streams) after ``frames`` more frames, and which of them count; True if a
+        block is complete.  A block of which less than half counts is left out.
         """
         np.maximum(self._largest, squares, out=self._largest, where=usable)
         self._usable += np.where(usable, frames, 0)
@@ -185,18 +185,19 @@ class Extremes:
         return True
 
     def limits(self, chance: float) -> Array:
-        """(kinds, streams) squares that a block exceeds with this chance; infinite where too little is known."""
+        """Squares (kinds, streams) that a block exceeds with this probability; infinite where too little is known."""
         count = min(self._frames // BLOCK_FRAMES, KEPT_BLOCKS)
         enough = self.blocks >= FEWEST_BLOCKS * self._alike
         if not enough.any():
             return np.full(enough.shape, np.inf)
         tail = (TAIL_SHARE * self.blocks).astype(np.intp)
-        # Those that are left out come first; only the upper ones need be in order.
+        # Those left out come first; only the upper ones need to be sorted.
         ordered = np.sort(self._ring[..., :count], axis=-1)
         start = np.take_along_axis(ordered, (count - tail - 1).clip(0)[..., None], axis=-1)[..., 0]
         rank = count - np.arange(count)
         scale = np.where(rank <= tail[..., None], ordered, 0.0).sum(axis=-1) / np.maximum(tail, 1) - start
-        # An exponential law whose scale is the mean of n values: (1 + x / (n scale))^-n is the chance of the next.
+        # An exponential with the mean of n values as scale: the next value exceeds x with probability (1 + x / (n
+        # scale))^-n.
         known = np.maximum(tail / self._alike, 1.0)
         reach = known * np.expm1(math.log(TAIL_SHARE / chance) / known)
         return np.where(enough, np.square(start + scale * reach), np.inf)
