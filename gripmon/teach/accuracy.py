@@ -1,7 +1,7 @@
 """Accuracy forecast: how certain a frame's transform will be, what the view can't separate, which alert limits hold.
 
-The monitor's own measurement and update are run on edge points where the model puts them, each with the same assumed
-standard deviation: what comes out is the covariance that the geometry gives, without any image.
+The monitor's own measurement and update run on edge points where the model predicts them, each with the same assumed
+standard deviation.  The result is the covariance that follows from the geometry, without any image.
 """
 
 from __future__ import annotations
@@ -29,25 +29,27 @@ from gripmon.track.edges.robust_fit import RobustFit
 from gripmon.track.edges.uncertainty import Uncertainty, assess
 
 EDGE_POINT_SIGMA_PX = 0.05
-"""Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
+"""Assumed error of an edge point, besides the floors in the settings: that of a step of 40 grey levels in noise of 1.5.
+"""
 
 CLUTTER_PX = 0.1
-"""What the background is assumed to shift a stretch of an edge by, beside that, for the protection level: with it the
-bound is that of the usual frame before clutter; one in twenty has up to four times as much (tools/bench integrity).
+"""Assumed shift of a stretch of an edge by the background, in addition, for the protection level.  It gives the bound
+of the usual frame in front of clutter; one frame in twenty has up to four times as much (tools/bench integrity).
+the usual frame in front of clutter; one frame in twenty has up to four times as much (tools/bench integrity).
 """
 
 
 UNTOLD_BEVEL_M = 2e-4
-"""Width of the bevels that machined edges have where a drawing asks for broken edges and says no more."""
+"""Width of a bevel on machined edges where the drawing only asks for broken edges."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnknownOpening:
-    """What an unknown jaw opening does, the seventh unknown of the fit.
+    """The effect of an unknown jaw opening, the seventh unknown of the fit.
 
-    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when the robot doesn't report it.  ``pose_per_m`` (6,): by
-    how much the pose is wrong for each metre by which an opening that is taken as exact is wrong.  ``correlation`` of
-    the opening with the pose's weakest direction when it is unknown, 0 to 1: near 1 the image can't separate them.
+    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when the robot doesn't report it.  ``pose_per_m`` (6,):
+    error of the pose per metre of error of an opening that is taken as exact.  ``correlation``, 0 to 1, of an unknown
+    opening with the pose's least certain direction: near 1 the image can't separate them.
     """
 
     sigma: Array
@@ -57,18 +59,19 @@ class UnknownOpening:
 
     @property
     def growth(self) -> float:
-        """By what factor the weakest direction is less certain than with an exactly known opening."""
+        """Factor by which the least certain direction is less certain than with an exactly known opening."""
         return float(1.0 / np.sqrt(max(1.0 - self.correlation**2, 1e-12)))
 
 
 @dataclass(frozen=True, slots=True)
 class AccuracyForecast:
-    """Expected of one frame in which all visible edges are seen; vectors are (position, rotation), m and rad.
+    """Expected of one frame in which all visible edges are measured; vectors are (position, rotation), m and rad.
 
-    ``covariance`` (6, 6) as it would be published.  ``edges``: how many can be sampled; with fewer than
+    ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
     ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
     distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``protection``: the
-    level before clutter.  ``jaw``: with an unknown opening; None for a gripper without jaw, or where not asked for.
+    protection level in front of clutter.  ``jaw``: the effect of an unknown opening; None for a gripper without jaw, or
+    where not asked for.
     """
 
     covariance: Array
@@ -80,12 +83,12 @@ class AccuracyForecast:
 
     @property
     def sigma(self) -> Array:
-        """(6,) standard deviations."""
+        """Standard deviations (6,)."""
         return np.asarray(np.sqrt(self.covariance.diagonal()))
 
     @property
     def weakest(self) -> Array:
-        """(6,) one standard deviation along the least certain direction, a radian counting as ``lever_m``."""
+        """One standard deviation (6,) along the least certain direction, a radian counting as ``lever_m``."""
         return weakest_direction(self.covariance, self.lever_m)
 
     @property
@@ -107,7 +110,7 @@ def forecast_accuracy(
     jaw_opening_m: float | None,
     taught: TaughtEdges | None = None,
 ) -> AccuracyForecast:
-    """What a frame at the reference's pose and an opening (nominal if None) may give."""
+    """Expected accuracy of a frame at the reference's pose and an opening (nominal if None)."""
     rig = Rig(camera, gripper, settings, taught)
     return forecast_frame(rig, from_record(reference.cam_T_grip), jaw_opening_m, with_jaw=gripper.has_jaw)
 
@@ -115,7 +118,9 @@ def forecast_accuracy(
 def forecast_frame(
     rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, with_jaw: bool = False
 ) -> AccuracyForecast:
-    """What a frame at a pose and a reported opening (nominal if None) gives; ``with_jaw``: with an unknown one, too."""
+    """Expected accuracy of a frame at a pose and a reported opening (nominal if None); ``with_jaw``: with an unknown
+    opening, too.
+    """
     gripper, settings = rig.gripper, rig.settings
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     meter = ForecastMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
@@ -134,19 +139,19 @@ def forecast_frame(
 
 
 def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tuple[float, AccuracyForecast | None]]:
-    """At ``count`` openings (m) over the jaw's travel: what a frame gives, None where too little is visible."""
+    """The expected accuracy at ``count`` openings (m) over the jaw's travel; None where too little is visible."""
     openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count).tolist()
     return [(m, forecast_frame(rig, cam_T_grip, m) if see(rig, cam_T_grip, m).enough else None) for m in openings_m]
 
 
 def with_bevels(gripper: Gripper, least_m: float) -> Gripper:
-    """The same gripper with all its edges bevelled or rounded by at least so much."""
+    """The same gripper with all edges bevelled or rounded by at least ``least_m``."""
     edges = {n: structs.replace(edge, bevel_m=max(edge.bevel_m, least_m)) for n, edge in gripper.model.edges.items()}
     return Gripper(structs.replace(gripper.model, edges=edges))
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
-    """(6,) one standard deviation along the least certain direction of a covariance (6, 6), a radian counting as
+    """One standard deviation (6,) along the least certain direction of a covariance (6, 6), a radian counting as
     ``lever_m``.
     """
     scale = np.array([1.0] * 3 + [lever_m] * 3)
@@ -156,10 +161,10 @@ def weakest_direction(covariance: Array, lever_m: float) -> Array:
 
 
 def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) -> UnknownOpening:
-    """``covariance`` (7, 7) of the fit itself, ``pose_covariance`` (6, 6) as it would be published."""
+    """``covariance`` (7, 7) is that of the fit, ``pose_covariance`` (6, 6) as it would be published."""
     weakest = weakest_direction(covariance[:6, :6], lever_m)
     scale = np.array([1.0] * 3 + [lever_m] * 3)
-    # Its length is one standard deviation, so that projecting on it twice takes the scale out.
+    # Its length is one standard deviation; projecting on it twice cancels the scale.
     with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
     variance = float(covariance[6, 6])
     sigma_m = float(np.sqrt(variance))
@@ -169,10 +174,10 @@ def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) 
 
 
 class ForecastMeter(FingertipMeter):
-    """Reads no image: finds an edge point on every profile that no other finger hides, where it was predicted."""
+    """Reads no image: has an edge point, where predicted, on every search line that no other finger hides."""
 
     def forecast(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
-        """What the edge points alone give at a pose and an opening."""
+        """The measurement from edge points alone at a pose and an opening."""
         nothing = np.zeros((1, 1), np.uint8)
         here = Patience(when_doubtful=False, when_lost=False)
         return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
@@ -188,7 +193,7 @@ class ForecastMeter(FingertipMeter):
         return self._votes(Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0), prediction)
 
     def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
-        """As assumed: nothing scatters here."""
+        """Uses the assumed errors: there is no scatter here."""
         scatters = assess(edgels, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
         return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
@@ -196,8 +201,8 @@ class ForecastMeter(FingertipMeter):
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """``protection`` of a transform in which all visible edges are seen, and the alert limits that it is compared with:
-    whether a view's transforms can be valid, before there is any image.
+    """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
+    whether transforms of a view can be valid, before there is any image.
     """
 
     protection: Protection
@@ -221,7 +226,7 @@ class Promise:
 
     @property
     def needed(self) -> str:
-        """The alert limits that this view could keep, where the present ones are too tight; else empty."""
+        """The alert limits that this view can keep, where the present ones are too tight; else empty."""
         bound, parts = self.protection, []
         if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
             return "more of the fingers in view: no limit would do"
@@ -243,6 +248,6 @@ class Promise:
 
 
 def _rounded_up(value: float) -> float:
-    """To two digits, never below."""
+    """Round up to two significant digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.ceil(value / unit - 1e-9) * unit

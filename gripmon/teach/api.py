@@ -1,4 +1,4 @@
-"""What programs call to teach; ``gripmon teach --config`` is this."""
+"""What programs call to teach; ``gripmon teach --config`` calls it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Settings(Protocol):
 
 
 class Configured(Protocol):
-    """What teaching needs of a configuration; :class:`gripmon.Config` has it."""
+    """The part of a configuration that teaching needs; :class:`gripmon.Config` has it."""
 
     @property
     def camera(self) -> Camera: ...
@@ -68,7 +68,7 @@ class Configured(Protocol):
 
 @dataclass(frozen=True)
 class Teaching:
-    """What the images show of every edge (``taught``), and the ``model`` that a configuration names."""
+    """How every edge looks in the images (``taught``), and the ``model`` that a configuration names."""
 
     taught: Taught
     model: TaughtModel
@@ -80,7 +80,7 @@ class Teaching:
         return to_yaml(self.model)
 
     def picture(self, ending: str = ".png") -> bytes:
-        """The first image that was used with what was taught, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
+        """The first image used, with what was taught drawn, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
         config = self.config
         edges = TaughtEdges.of_model(self.model, config.gripper)
         drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.first, edges, self.model)
@@ -94,15 +94,14 @@ def teach(
     jaw_opening_m: float | None = None,
     command: str = "gripmon.teach.api.teach",
 ) -> Teaching:
-    """Measure what the gripper's edges look like in image files that were taken at the reference calibration; for a
-    folder in all images in it.
+    """Measure how the gripper's edges look in image files taken at the reference calibration; of a folder, all images.
 
-    ``config``: load it without a taught model (``with_taught=False``).  ``jaw_opening_m``: in all images (m); None: the
-    configuration's where it is fixed, else that of a ``timestamps.csv`` beside each image.  ``command`` is written into
-    the model's provenance.
+    ``config``: load it without a taught model (``with_taught=False``).  ``jaw_opening_m``: the opening in all images
+    (m); if None, the configuration's fixed one, else that in a ``timestamps.csv`` beside each image.  ``command`` is
+    written into the model's provenance.
 
     Raises :class:`~gripmon.model.errors.InputError` for images that can't be used,
-    :class:`~gripmon.model.errors.NoResultError` where nothing can be taught from them.
+    :class:`~gripmon.model.errors.NoResultError` if nothing can be taught from them.
     """
     cv2.setNumThreads(1)
     if not images:
@@ -133,7 +132,7 @@ def teach(
 
 
 def _check_different(pictures: Sequence[Picture]) -> None:
-    """The same image twice would make the scatter, and so the uncertainty, too small."""
+    """A duplicate image would make the scatter, and so the uncertainty, too small."""
     seen: dict[str, str] = {}
     for each in pictures:
         assert each.path is not None
@@ -145,7 +144,7 @@ def _check_different(pictures: Sequence[Picture]) -> None:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image to teach from; ``jaw_opening_m`` None where it isn't known.  ``path`` None: taken live, no file yet."""
+    """An image to teach from; ``jaw_opening_m`` is None if unknown, ``path`` None for a live image without a file."""
 
     name: str
     image: Image
@@ -156,7 +155,7 @@ class Picture:
 def read_picture(
     path: Path, camera: Camera, gripper: Gripper, bit_depth: int, jaw_opening_m: float | None = None
 ) -> Picture:
-    """An image that fits the camera, in full scale, with its jaw opening: the one given, else that of its folder's
+    """Read an image that fits the camera, in full scale, with its jaw opening: the one given, else that in its folder's
     ``timestamps.csv``.  Raises :class:`~gripmon.model.errors.InputError`.
     """
     image = read_any(path)
@@ -169,7 +168,7 @@ def read_picture(
 
 
 def read_any(path: Path) -> Image:
-    """An image of any camera.  Raises :class:`~gripmon.model.errors.InputError`."""
+    """Read an image of any camera.  Raises :class:`~gripmon.model.errors.InputError`."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder; an image file")
     image, fault = read_image(path)
@@ -206,7 +205,7 @@ def taught_model(
     command: str,
     data: Mapping[str, bytes] = {},
 ) -> TaughtModel:
-    """What was taught, bound to what it was taught with.  ``data``: images that become files only now, by path."""
+    """The model of what was taught, bound to its inputs.  ``data``: by path, images not yet written to files."""
     images = []
     for picture in pictures:
         assert picture.path is not None, "an image has a file before it is taught from"
@@ -252,7 +251,7 @@ _WORDS = ("true", "false", "null", "yes", "no", "on", "off", "y", "n")
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
-    """Text in quotes wherever it could be taken for something else."""
+    """Quotes text wherever YAML could take it for something else."""
 
 
 def _text(dumper: _Dumper, text: str) -> Any:
@@ -264,7 +263,7 @@ _Dumper.add_representer(str, _text)
 
 
 def to_yaml(model: TaughtModel) -> str:
-    """The file's text; reading it gives the same model, to the last bit."""
+    """The file's text; reading it gives exactly the same model."""
     values = _without_nothing(msgspec.to_builtins(model))
     return _HEADER + yaml.dump(
         values, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=160, allow_unicode=True

@@ -1,8 +1,8 @@
 """``cam_T_grip`` from the corners of one image, without a hand/eye calibration.
 
-It is the pose of on-line recalibration, with everything in its covariance that one image can't average out: the
-corners, the jaw opening, the camera's calibration, and how exactly the gripper was made.  A plate under the fingertips
-(``gripmon calibrate plane``) gives the distance far better than the fingertips' own small extent does.
+It is the pose of on-line recalibration; its covariance includes everything that one image can't average out: the
+corners, the jaw opening, the camera's calibration, and the gripper's manufacturing tolerance.  A plate under the
+fingertips (``gripmon calibrate plane``) gives the distance far better than the small extent of the fingertips does.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import Measurement
 
 BY_HAND_PX = 1.0
-"""Standard deviation of a corner that a person set by hand where it wasn't measured, or against what was."""
+"""Standard deviation of a corner that a person set by hand, where it wasn't measured or instead of the measured one."""
 
 MADE_TO_M = 2e-5
-"""How exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
+"""Manufacturing tolerance of a fingertip's corners against the gripper file (each coordinate, standard deviation)."""
 
-_LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
+_LARGEST_PX = 100_000.0  # of a coordinate: corners may be set in the image, or beside it
 _STEP = 0.3  # of a standard deviation, for central differences
 
 
 @dataclass(frozen=True, slots=True)
 class SnappedCorner:
-    """One corner: ``model_px`` (2,) where the pose puts it, NaN beyond the lens; ``uv_px`` (2,) where its edges meet,
-    with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused and ``reason`` says why;
-    ``inliers``: part of the profiles on its edges that agree, None without any.
+    """One corner: ``model_px`` (2,) where the pose projects it, NaN beyond the lens; ``uv_px`` (2,) where its edges
+    meet, with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused for the
+    ``reason``; ``inliers``: part of the search lines on its edges that agree, None without any.
     """
 
     name: str
@@ -50,11 +50,12 @@ class SnappedCorner:
 
 @dataclass(frozen=True, slots=True)
 class Snapped:
-    """What the image shows near corners put by hand.
+    """What the image shows near corners set by hand.
 
-    ``refused``: why nothing was found, in words; ``cam_T_grip`` (4, 4) then is the rough pose, else the measured one.
-    ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2) that agree;
-    ``share`` of the profiles that do.  ``jaw_opening_m`` with ``jaw_sigma_m``: as given, or as seen where it wasn't.
+    ``refused``: why nothing was found, as a text; then ``cam_T_grip`` (4, 4) is the rough pose, otherwise the measured
+    one.  ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2), the
+    inliers; ``share``: their part of the search lines.  ``jaw_opening_m`` with ``jaw_sigma_m``: as given, else as
+    measured.
     """
 
     cam_T_grip: Array
@@ -69,12 +70,12 @@ class Snapped:
 
 
 class PoseRefused(ValueError):
-    """These corners give no pose; the text is ``what is wrong; what would be right``."""
+    """These corners determine no pose; the text is ``what is wrong; what would be right``."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraError:
-    """How uncertain a camera is: ``covariance`` (n, n) of its ``parameters``, named as in its calibration's file."""
+    """Uncertainty of a camera: ``covariance`` (n, n) of its ``parameters``, named as in its calibration file."""
 
     parameters: tuple[str, ...]
     covariance: Array
@@ -82,9 +83,9 @@ class CameraError:
 
 @dataclass(frozen=True, slots=True)
 class CornerPose:
-    """``cam_T_grip`` (4, 4), the covariance (6, 6) of its error, the ``corners`` it rests on, and the weighted root
-    mean square of their residuals, 1 where their covariances hold.  ``rival``: another pose fits them as well.  Without
-    ``corners`` it rests on the edges' joint fit: too few corners are seen for a pose of their own.
+    """``cam_T_grip`` (4, 4), the covariance (6, 6) of its error, the ``corners`` it is computed from, and the weighted
+    root mean square of their residuals, 1 where their covariances hold.  ``rival``: another pose fits them as well.  An
+    empty ``corners`` means the joint fit of the edges: too few corners are seen for a pose of their own.
     """
 
     cam_T_grip: Array
@@ -101,7 +102,7 @@ def pose_from_corners(
     by_hand_px: Mapping[str, Array],
     camera_error: CameraError | None = None,
 ) -> CornerPose:
-    """Pose of the gripper by the corners that were measured, or set by hand.  Raises :class:`PoseRefused`."""
+    """Pose of the gripper from corners that were measured or set by hand.  Raises :class:`PoseRefused`."""
     found = snapped.measurement
     if found is None:
         raise PoseRefused(f"no pose: {snapped.refused}")
@@ -117,7 +118,7 @@ def pose_from_corners(
     of_edges: Array = np.zeros((6, 6))
     by_edges = refusal(gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]) is not None
     if by_edges:
-        # All corners where the edges' joint fit has them: its covariance is the measurement's.
+        # Take all corners where the edges' joint fit has them; their covariance is that of the measurement.
         every = [i for i, c in enumerate(snapped.corners) if np.isfinite(c.model_px).all()]
         uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
         joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
@@ -135,7 +136,7 @@ def pose_from_corners(
         ]
     except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
         raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
-    # Corners that contradict each other are at least as wrong as their residuals.
+    # Corners that contradict each other have errors of at least their residuals.
     covariance = pose.covariance * max(pose.weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
     points_m = gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]
     alike = rivals(solutions(points_m, camera.undistort(uv_px), covariance_xy), len(every))
@@ -145,7 +146,9 @@ def pose_from_corners(
 
 
 def _covariance(camera: Camera, uv_px: Array, measured: Array, depth_m: float) -> Array:
-    """(2n, 2n) of ideal coordinates: measured corners together, those by hand alone, and how the gripper was made."""
+    """Covariance (2n, 2n) of ideal coordinates: of measured corners jointly, of corners set by hand one by one, and of
+    the manufacturing tolerance.
+    """
     count = len(uv_px)
     out = np.zeros((2 * count, 2 * count))
     out[: len(measured), : len(measured)] = measured
@@ -163,7 +166,9 @@ _Seen = tuple[Camera, float | None]
 def _error_sources(
     camera: Camera, gripper: Gripper, snapped: Snapped, error: CameraError | None
 ) -> list[tuple[_Seen, _Seen]]:
-    """What else may be wrong, by independent standard deviations: each by a part of one less and more."""
+    """Other sources of error, independent of each other: each a pair of inputs, a part of a standard deviation below
+    and above.
+    """
     opening_m = snapped.jaw_opening_m
     sources: list[tuple[_Seen, _Seen]] = []
     if snapped.jaw_sigma_m and opening_m is not None:
@@ -185,10 +190,10 @@ def _error_sources(
 
 
 ROUGH_SHARE = 0.006
-"""How exactly corners are put by hand: standard deviation, as a part of the image's width."""
+"""Standard deviation of a corner set by hand, as a part of the image's width."""
 
 _TILT_RAD = 0.4  # a wrist camera looks at the fingertips from beside the gripper
-_FILLS = 0.4  # part of the image that the gripper's corners then span
+_FILLS = 0.4  # part of the image that the gripper's corners span in that view
 _ROUNDS = 40
 _TURNS = 4
 _SAME_RAD, _SAME_SHARE = 0.02, 0.01
@@ -204,9 +209,9 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A pose that hand-placed corners and the prior allow: ``covariance`` (6, 6), ``cost`` the weighted squares of what
-    is left, ``left_px`` for each placed corner how far the pose leaves it from where it was put; infinite where the
-    lens maps it nowhere.
+    """A pose that corners set by hand and the prior allow: ``covariance`` (6, 6); ``cost``, the weighted sum of squared
+    residuals; ``left_px``, for each corner the distance from where it was set to where the pose projects it, infinite
+    where the lens can't map it.
     """
 
     cam_T_grip: Array
@@ -221,8 +226,8 @@ def prior_of(reference: ReferenceRecord) -> Prior:
 
 
 def usual_view(camera: Camera, gripper: Gripper, jaw_opening_m: float | None) -> Prior:
-    """A camera that looks at the fingertips from the gripper's near side (-y), near enough for them to fill a good
-    part of the image; it may be turned about its own axis in any way.
+    """A camera that looks at the fingertips from the gripper's near side (-y), close enough for them to fill a good
+    part of the image; its turn about its own axis is free.
     """
     corners_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     extent_m = float(np.ptp(corners_m, axis=0).max())
@@ -233,17 +238,17 @@ def usual_view(camera: Camera, gripper: Gripper, jaw_opening_m: float | None) ->
 
 
 def rough_sigma_px(camera: Camera) -> float:
-    """Standard deviation of a corner put by hand (px)."""
+    """Standard deviation of a corner set by hand (px)."""
     return max(ROUGH_SHARE * camera.width_px, 2.0)
 
 
 def place(
     camera: Camera, gripper: Gripper, jaw_opening_m: float | None, put_px: Mapping[str, Array], prior: Prior
 ) -> list[Placed]:
-    """Poses that explain where corners were ``put_px`` (name: (2,)), the likeliest first; several where corners in one
-    plane allow two.
+    """Poses that explain where corners were set, ``put_px`` (name: (2,)), the most likely first; several where corners
+    in one plane allow two.
 
-    Corners that lie outside of what the lens maps count as not put.  Without any corner the prior itself.
+    Corners outside of what the lens maps are ignored.  Without any corner the result is the prior itself.
     """
     names = [name for name in gripper.corner_ids if name in put_px]
     uv_px = np.array([put_px[name] for name in names], dtype=float).reshape(-1, 2)
@@ -267,7 +272,7 @@ def place(
 
 
 def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator[Array]:
-    """The prior, the prior turned about the optical axis, and what closed forms give."""
+    """Starting poses: the prior, the prior turned about the optical axis, and OpenCV's closed forms."""
     yield prior.cam_T_grip
     if len(xy) > 1 and math.sqrt(prior.covariance[5, 5]) > 1.0:
         for quarter in range(1, _TURNS):
@@ -282,10 +287,10 @@ def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator
 
 
 def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
-    """Levenberg-Marquardt on the weighted image error and the prior; None where it leads behind the camera.
+    """Levenberg-Marquardt on the weighted image error and the prior; None where it starts behind the camera.
 
-    Its damping falls more slowly than :func:`gripmon.model.least_squares.minimise`'s: that one's longer steps take
-    corners which lie anywhere to poses next to the camera's plane, where nothing is determined.
+    Its damping decreases more slowly than in :func:`gripmon.model.least_squares.minimise`: longer steps would take
+    corners set anywhere to poses next to the camera's plane, where nothing is determined.
     """
     information = np.linalg.inv(prior.covariance)
     pose, damping = start, 1e-3
@@ -333,7 +338,7 @@ def _same(one: Array, other: Array) -> bool:
 
 
 def corners_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
-    """Key, what is wrong, what would be right, of corners in a file or a request; None if nothing is."""
+    """The key, what is wrong and what would be right, for corners in a file or a request; None if nothing is wrong."""
     for name, uv_px in corners.items():
         if name not in gripper.corner_ids:
             return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"

@@ -1,7 +1,8 @@
-"""Curved edges of an outline, as round fingertips have them: one smooth curve through what the images show along it.
+"""Curved edges of an outline, as of round fingertips: a smooth curve through the points the images show along it.
 
-Straight pieces say where a curve bends; their vertices lie beside it.  So it is measured along itself, a point a pixel,
-and a cubic spline fitted (least squares; de Boor 1978), with knots near to each other where the pieces are short.
+Straight pieces show where a curve bends, but their vertices lie beside it.  So the curve is measured along itself, one
+point per pixel, and a cubic spline is fitted (least squares; de Boor 1978), with denser knots where the pieces are
+short.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from gripmon.teach.silhouette import Stations, from_ideal_px, in_image, inner_si
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, STATION_MARGIN_PX, STRAIGHT_PX
 
 ON_A_PIECE = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
-"""Where on its length the best line through a stretch of a curve crosses it: the parabola's mean square is least so."""
+"""Fractions of its length at which a piece, the least-squares line through a stretch of a curve, crosses the curve:
+exact for a parabola."""
 KNOTS_PX = 5.0
-"""Between knots where a curve bends: where a straight edge goes over into a circle of 15 px (2 mm, 100 mm away) its
-curvature jumps, and a cubic spline misses that by up to 0.05 px; five points of 0.1 px give as much."""
+"""Knot spacing where a curve bends.  Where a straight edge turns into a circle of 15 px (2 mm, 100 mm away) the
+curvature jumps, and a cubic spline misses that by up to 0.05 px; five points of 0.1 px give the same error."""
 STRAIGHT_FROM_PX = 4.0 * KNOTS_PX
-"""Longer pieces of a curve bend at their ends at most."""
+"""Length above which a piece of a curve bends at its ends at most."""
 _FEWEST_BETWEEN_KNOTS = 3
 _UNSEEN = 0.1
 _ROUNDS = 3
@@ -34,10 +36,10 @@ _ROUNDS = 3
 def smooth_curve(
     camera: Camera, seen: OpeningSeen, mask: NDArray[np.bool_], uv_px: Array, tangent: tuple[bool, bool]
 ) -> tuple[Array, Array]:
-    """Points (n, 2) along a curve in the image, with its ends, and how far (n,) along its pieces each lies, in pieces.
+    """Points (n, 2) along a curve in the image, including its ends, and the position (n,) of each, counted in pieces.
 
-    ``uv_px`` (v, 2): its pieces' vertices; ``tangent``: the first and the last piece lie on straight edges that the
-    curve goes on from, and it begins where it leaves those.  Where the images show nothing the pieces count.
+    ``uv_px`` (v, 2): the vertices of its pieces; ``tangent``: whether the first and the last piece lie on straight
+    edges; the curve then begins where it leaves these.  Where the images show nothing the pieces count.
     """
     vertices = to_ideal_px(camera, uv_px)
     steps = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
@@ -70,7 +72,7 @@ def smooth_curve(
 
 
 def _leaves(curve: BSpline | CubicSpline, s: Array, vertices: Array, end: int) -> float:
-    """Where a curve leaves the straight edge that its first (0) or last (-1) piece lies on."""
+    """Position at which a curve leaves the straight edge that its first (0) or last (-1) piece lies on."""
     p = curve(s)
     line = vertices[[end, 1 if end == 0 else -2]]
     off = np.linalg.norm(p - _foot(line, p), axis=1) > STRAIGHT_PX
@@ -80,14 +82,14 @@ def _leaves(curve: BSpline | CubicSpline, s: Array, vertices: Array, end: int) -
 
 
 def _foot(line: Array, points: Array) -> Array:
-    """Nearest to points (..., 2) on the line through two (2, 2)."""
+    """Feet of the perpendiculars from points (..., 2) to the line through two points (2, 2)."""
     way = line[1] - line[0]
     return np.asarray(line[0] + ((points - line[0]) @ way / float(way @ way))[..., None] * way)
 
 
 def _on_pieces(at: Array, vertices: Array, tangent: tuple[bool, bool]) -> tuple[Array, Array]:
-    """Points (n, 2) where the curve crosses its pieces, and how far (n,) along them; those on straight edges lie on it
-    with their ends.
+    """Points (n, 2) where the curve crosses its pieces, and their position (n,) along them; a piece on a straight edge
+    contributes its middle and its end.
     """
     places, points = [at[0]], [vertices[0]]
     for k in range(len(at) - 1):
@@ -99,7 +101,7 @@ def _on_pieces(at: Array, vertices: Array, tangent: tuple[bool, bool]) -> tuple[
 
 
 def _knots(at: Array) -> list[float]:
-    """Between the ends, closest along short pieces."""
+    """Inner knots, densest along short pieces."""
     out: list[float] = []
     for start, end in itertools.pairwise(at.tolist()):
         if end - start > STRAIGHT_FROM_PX:
@@ -110,7 +112,7 @@ def _knots(at: Array) -> list[float]:
 
 
 def _spline(at: Array, s: Array, shown: Array, usable: NDArray[np.bool_], ends: Array) -> BSpline:
-    """Through what is shown (n, 2) at places (n,) along the pieces, robustly, from end to end."""
+    """Robust spline from end to end through points ``shown`` (n, 2) at positions ``s`` (n,) along the pieces."""
     knots = [0.0]
     for knot in _knots(at):
         if np.count_nonzero((s > knots[-1]) & (s < knot)) >= _FEWEST_BETWEEN_KNOTS:
@@ -122,7 +124,7 @@ def _spline(at: Array, s: Array, shown: Array, usable: NDArray[np.bool_], ends: 
     worth = np.where(usable[1:-1], 1.0, _UNSEEN)
     robust = np.ones(len(worth))
     for _ in range(_ROUNDS):
-        # The ends are known as well as the straight edges that they lie on: by all their points.
+        # The ends are known as well as the straight edges on which they lie, so they get a high weight.
         curve = make_lsq_spline(places, points, t, w=np.concatenate([[10.0], worth * robust, [10.0]]))
         off = np.linalg.norm(points[1:-1] - curve(s[1:-1]), axis=1)
         robust = 1.0 / np.maximum(off / max(2.0 * float(np.median(off)), LEAST_SCATTER_PX), 1.0)

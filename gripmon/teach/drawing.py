@@ -1,5 +1,5 @@
-"""Pictures of what was taught or measured, drawn over an enlarged image: places in its pixels, lines in parts of a
-pixel, letters that stay readable.
+"""Pictures of what was taught or measured, drawn over an enlarged image: positions in its pixels, lines to parts of a
+pixel, readable text.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 Colour = tuple[int, int, int]
 """Blue, green, red."""
 
-_SHIFT = 4  # binary digits of a pixel in OpenCV's drawing
+_SHIFT = 4  # fractional bits of a pixel in OpenCV's drawing functions
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Canvas:
-    """An image ``zoom`` times as large: ``picture`` (h, w, 3), BGR of 8 bits."""
+    """An image enlarged by ``zoom``: ``picture`` (h, w, 3), BGR of 8 bits."""
 
     def __init__(self, image: Image, zoom: int) -> None:
         scaled = image.astype(np.float32) * (255.0 / full_scale(image))
@@ -35,27 +35,27 @@ class Canvas:
         self.zoom = zoom
 
     def circle(self, at_px: Array, radius_px: float, colour: Colour) -> None:
-        """``radius_px`` in the picture's own pixels."""
+        """Draw a circle; ``radius_px`` in the picture's own pixels."""
         (centre,) = self._fixed(at_px).tolist()
         cv2.circle(self.picture, centre, round(radius_px * (1 << _SHIFT)), colour, 1, cv2.LINE_AA, _SHIFT)
 
     def line(self, points_px: Array, colour: Colour, thickness: int = 1) -> None:
-        """Through points (n, 2)."""
+        """Draw a line through points (n, 2)."""
         cv2.polylines(self.picture, [self._fixed(points_px)], False, colour, thickness, cv2.LINE_AA, _SHIFT)
 
     def pixel(self, at_px: Array) -> tuple[int, int]:
-        """The place in the picture's own pixels."""
+        """The position in the picture's own pixels."""
         u, v = np.rint((np.asarray(at_px) + 0.5) * self.zoom - 0.5).astype(int).tolist()
         return u, v
 
     def _fixed(self, points_px: Array) -> Array:
-        """(n, 2) in OpenCV's fixed-point coordinates of the picture."""
+        """Points (n, 2) in OpenCV's fixed-point coordinates of the picture."""
         own = (np.reshape(points_px, (-1, 2)) + 0.5) * self.zoom - 0.5
         return np.rint(own * (1 << _SHIFT)).astype(np.int32)
 
 
 def write(picture: Image, text: str, at: tuple[int, int], colour: Colour, size: float) -> None:
-    """With a dark outline, of the same weight: thicker letters are wider.  OpenCV's font knows ASCII only."""
+    """Write text with a dark outline of equal weight, as thicker letters are wider.  OpenCV's font has only ASCII."""
     plain = text.encode("ascii", "replace").decode()
     for right, down in (*itertools.product((-1, 0, 1), repeat=2), (0, 0)):
         paint = colour if right == down == 0 else (0, 0, 0)
@@ -63,22 +63,22 @@ def write(picture: Image, text: str, at: tuple[int, int], colour: Colour, size: 
 
 
 def text_size(text: str, size: float) -> tuple[int, int]:
-    """Width and height, px."""
+    """Width and height of a text, px."""
     (across, up), _ = cv2.getTextSize(text, _FONT, size, 1)
     return int(across), int(up)
 
 
 def enlargement(largest_px: float, to_px: float) -> int:
-    """A round number by which to enlarge what is to be seen: the largest is then at most ``to_px`` long."""
+    """A round factor by which to enlarge lengths so that the largest is at most ``to_px`` long."""
     return max((k for k in (1, 2, 5, 10, 20, 50, 100, 200, 500) if k * largest_px <= to_px), default=1)
 
 
-_ENLARGED_TO_PX = 12.0  # the largest offset is drawn at most so long
+_ENLARGED_TO_PX = 12.0  # length at which the largest offset is drawn, at most
 _SHARP_BGR, OUTLINE_BGR, CREASE_BGR, CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
 _TEXT_BGR = (255, 255, 255)
 _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
 _MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
-_ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # lines above and below its place that a label may stand in
+_ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # rows above and below its point in which a label may be placed
 _SMALLEST_PX = 1200  # pictures are enlarged to at least this width
 
 
@@ -116,7 +116,7 @@ def draw_taught(
 def _line(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, points_grip_m: Array, taught: TaughtEdges, edge: int
 ) -> tuple[Array, Array]:
-    """The sharp edge's taught part (n, 2), px, and by how much it is shifted across itself (n, 2)."""
+    """The sharp edge's taught part (n, 2), px, and its shift across itself (n, 2)."""
     start, end = points_grip_m[gripper.edge_points[edge]]
     fraction = np.linspace(taught.share[edge, 0], taught.share[edge, 1], 33)
     sharp = start + fraction[:, None] * (end - start)
@@ -130,14 +130,14 @@ def _line(
 
 
 class Labels:
-    """Texts in a picture, none over another and all of them inside; one that had to give way is tied to its place."""
+    """Texts in a picture that neither overlap nor leave it; one that was moved away is tied to its point by a line."""
 
     def __init__(self, picture: Image) -> None:
         self._picture = picture
         self.boxes: list[tuple[int, int, int, int]] = []
 
     def title(self, *lines: str) -> None:
-        """At the top, as large as fits."""
+        """Write lines at the top, as large as fits."""
         width, top = self._picture.shape[1] - 2 * _MARGIN_PX, _MARGIN_PX
         for line in lines:
             scale = min(_TITLE, _TITLE * width / text_size(line, _TITLE)[0])
@@ -147,7 +147,7 @@ class Labels:
             top += up + 2 * _GAP_PX
 
     def put(self, text: str, at: tuple[int, int], colour: Colour) -> None:
-        """Beside a place (x, y), as near as there is room; nowhere free: right of it."""
+        """Write a text beside a point (x, y), as close as there is room; to its right if there is none."""
         across, up = text_size(text, _LABEL)
         height, width = self._picture.shape[:2]
         step = up + _GAP_PX
@@ -186,8 +186,8 @@ _SIZE = 0.8
 
 def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image:
     """The image, BGR and enlarged, with the plate's points (green, red if left out), the gripper's corners by name
-    (yellow), and arrows from where the calibration has each of them to where it was measured, enlarged as it says; the
-    gripper's axes at the TCP.
+    (yellow), and arrows from where the calibration predicts each of them to where it was measured, enlarged by the
+    factor in the caption; the gripper's axes at the TCP.
     """
     zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, _LARGEST_ZOOM))
     canvas = Canvas(image, zoom)
@@ -204,7 +204,7 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
     for name, uv_px, residual in zip(found.corners.names, found.corners.uv_px, found.residuals_px, strict=True):
         canvas.circle(uv_px, 5.0, _MEASURED_BGR)
         canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), _MEASURED_BGR)
-        # Away from the middle, where the plate's points are: the fingers are darker, and of one shade.
+        # Place the name away from the centre, where the plate's points are: the fingers are darker and uniform.
         width, height = text_size(name, _SIZE)
         u, v = canvas.pixel(uv_px)
         aside = -width - 12 if uv_px[0] < 0.5 * lens.width_px else 12
@@ -218,7 +218,7 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
 
 
 def _axes(canvas: Canvas, lens: LensSettings, found: Coincidence) -> None:
-    """A third of the corners' reach along x and y."""
+    """Draw the x and y axes, a third of the corners' extent long."""
     reach_m = 0.33 * float(np.abs(found.corners_m[:, :2]).max())
     ends_m = np.vstack([np.zeros(3), reach_m * np.eye(3)[:2]])
     uv_px = make_camera(lens).project(ends_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3])
@@ -230,7 +230,7 @@ def _axes(canvas: Canvas, lens: LensSettings, found: Coincidence) -> None:
 
 
 def _with_caption(picture: Image, text: str) -> Image:
-    """The words below, on a strip of their own, as large as the width allows."""
+    """Add the text below, on a strip of its own, as large as the width allows."""
     width, height = text_size(text, 1.0)
     size = min(1.2 * _SIZE, 0.96 * picture.shape[1] / width)
     strip = np.full((round(2.4 * size * height) + 8, picture.shape[1], 3), _STRIP, np.uint8)

@@ -1,15 +1,15 @@
 """From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that
 refuse images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
 
-Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images is its part of what is common to all (the
-reference, or the reported opening, is off by a little; bevels make every outline lie inside of the sharp one) plus what
-is its own, plus noise, which clutter behind an outline can make large.  How much edges have of their own is estimated
-from all of them, and what of an offset their noise explains is taken back: a gripper with sharp edges isn't taught the
-clutter of its images.
+Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images has three parts: its share of what is common
+to all edges (a small error of the reference or of the reported opening; bevels, which move every outline inside of the
+sharp one), its own offset, and noise, which clutter behind an outline can make large.  The size of the edges' own
+offsets is estimated from all of them, and the part of an offset that noise explains is removed: a gripper with sharp
+edges doesn't learn the clutter of its images.
 
 Depth (:func:`~gripmon.teach.lines.slopes`): images at one pose can't show it, but the shape of a bevel does.  A bevel
 or a rounding cuts an edge off; what shows instead is its rim, which lies on one of the two faces that would have met in
-the sharp edge.  So an offset across the line of sight goes with one along it: the rim lies in the face.
+the sharp edge.  So an offset across the line of sight comes with one along it, because the rim lies in the face.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Vi
 from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
-"""How far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""
+"""Largest distance of a real edge from the sharp model's: a bevel of 0.7 mm, or a rounding of 1.2 mm radius."""
 
 INSET_SIGMA_M = 0.5 * SHAPE_M
-"""Of what bevels shift all outlines by alike, to the finger's side (standard deviation)."""
+"""Standard deviation of the shift towards the finger that bevels give all outlines in common."""
 
 PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
-"""How much bevels differ from edge to edge (standard deviation)."""
+"""Standard deviation of the difference between the bevels of different edges."""
 
 SINGLE_SIGMA_PX = 0.03
-"""How far the background and the pixel grid move a whole edge in one image (standard deviation)."""
+"""Standard deviation by which the background and the pixel grid move a whole edge in one image."""
 
 GRID_SIGMA_PX = 0.01
-"""What of that is the pixel grid's, and the same in all images of a standing camera."""
+"""The part of it from the pixel grid, which is the same in all images of a standing camera."""
 
 BACKGROUND_SHARE = 0.3
-"""A bevel at an outline is blurred into the background: by this part of it, as a standard deviation, what it shifts the
-outline by depends on the background's shade (bevels of the simulator before grey levels of 60 to 230)."""
+"""Standard deviation, relative to its shift, by which a bevel's shift of an outline depends on the background's shade:
+the bevel is blurred into the background (bevels of the simulator in front of grey levels of 60 to 230)."""
 
 _SMALLEST_DEPTH_M = 1e-6
-_NOTHING_M = 1.0  # standard deviation of an offset that isn't seen: what all edges together show of it remains
+_NOTHING_M = 1.0  # standard deviation of the offset of an edge that isn't seen: only what all edges share remains
 
-_SHRINKAGE = 2  # images of each edge that the usual scatter of all edges counts as
+_SHRINKAGE = 2  # number of images of each edge that the usual scatter of all edges is worth
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeLines:
-    """One edge in all images: the ``line`` through all of them, ``ends_px`` (s, 2) those in the images that show it,
-    numbers ``images`` (s,), and ``within_px2`` (2,) the ends' mean variance by the scatter of the points.
+    """One edge in all images: the ``line`` through all of them, ``ends_px`` (s, 2) its ends in the images that show it,
+    their numbers ``images`` (s,), and ``within_px2`` (2,) the ends' mean variance from the scatter of the points.
 
-    Without a line (``line`` None, no images) it is an outline in view that too little is seen of.
+    Without a line (``line`` None, no images) it is an outline in view of which too little is seen.
     """
 
     sampled: Sampled
@@ -68,16 +68,16 @@ class EdgeLines:
 
     @property
     def mean_px(self) -> Array:
-        """(2,) over the images; zero without any."""
+        """Mean offsets (2,) over the images; zero without any."""
         return np.asarray(self.ends_px.mean(axis=0)) if self.images else np.zeros(2)
 
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
     """Arrays of all edges with lines: ``indices`` (e,) in the gripper, ``outline`` (e,), ``ends_m`` one (s, 2) each,
-    carried over to the mean jaw opening by the depths ``depth_m`` (e,) known so far; ``turned`` as in the viewer, one
-    (s,) each; ``noise_m2`` (e, 2) variance of their means; ``rows`` (e, 2, 8) metres by the unknowns of the
-    measurement and by an inset of all outlines.
+    transferred to the mean jaw opening by the depths ``depth_m`` (e,) known so far; ``turned`` as in the viewer, one
+    (s,) each; ``noise_m2`` (e, 2) variance of their means; ``rows`` (e, 2, 8) derivatives, metres by the unknowns of
+    the measurement and by an inset of all outlines.
     """
 
     indices: list[int]
@@ -102,13 +102,13 @@ class _Measured:
             for edge, scale, angle, depth in zip(edges, per_m, turned, depth_m, strict=True)
         ]
         noise_m2 = _noise_m2(ends_m, np.array([edge.within_px2 for edge in edges]), per_m)
-        # Bevels and roundings put all outlines to the finger's side: common to them, like a motion.
+        # Bevels and roundings shift all outlines towards the finger: common to them, like a motion.
         inset = np.repeat((viewer.inside[indices] * outline)[:, None, None], 2, axis=1)
         rows = np.concatenate([np.array([edge.sampled.rows for edge in edges]), inset], axis=2)
         return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows)
 
     def pooled(self, motion_covariance: Array) -> Pooled:
-        """All edges together, with a prior (7, 7) of pose and opening."""
+        """Pool all edges, with a prior (7, 7) of pose and opening."""
         prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
         return pool(
             self.means_m, self.noise_m2[:, :, None] * np.eye(2), self.rows, (~self.outline).astype(np.intp), prior
@@ -116,15 +116,17 @@ class _Measured:
 
     @property
     def means_m(self) -> Array:
-        """(e, 2) over the images."""
+        """Mean ends (e, 2) over the images."""
         return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
 
 
 def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
-    """What reference and opening are off by (``common``, the first 7) to the outlines, from a prior (7, 7) about zero.
+    """Error of the reference and the opening (``common``, the first 7) from the outlines, with a prior (7, 7) about
+    zero.
 
-    Bevels of all outlines alike and each outline's own offset are allowed for, :data:`PLAUSIBLE_OWN_M` at least, since
-    what happens to look like a motion doesn't show as their own; creases have more of it.
+    Allows for a common shift of all outlines by bevels and for each outline's own offset, of at least
+    :data:`PLAUSIBLE_OWN_M`, since an own offset that looks like a motion can't be seen.  Creases are left out: their
+    own offsets are larger.
     """
     measured = _Measured.of(viewer, lines, None)
     seen = np.array([len(ends_m) > 0 for ends_m in measured.ends_m])
@@ -141,14 +143,14 @@ def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance:
 def estimate_edges(
     viewer: Viewer, lines: Mapping[int, EdgeLines], before: Mapping[str, TaughtEdge] | None
 ) -> dict[str, TaughtEdge]:
-    """Means over the images, their noise from the scatter between them, pooled over all edges; an outline that too
-    little is seen of is expected where the others put it, with what edges have of their own as its deviation.
+    """Means over the images with noise from the scatter between them, pooled over all edges.  An outline of which too
+    little is seen is expected where the others predict it; its standard deviation is that of the edges' own offsets.
 
-    ``before``: the edges as known so far, whose depths carry the lines of images with other jaw openings over.
+    ``before``: the edges as known so far; their depths transfer the lines of images with other jaw openings.
     """
     measured = _Measured.of(viewer, lines, before)
     pooled = measured.pooled(viewer.prior_covariance)
-    # An edge's own, and what bevels shift all outlines by; the rest the reference and the opening are off by.
+    # An edge's own offset, and the common shift by bevels; the rest is error of the reference and the opening.
     shape_m = pooled.own_m + pooled.common[-1] * measured.rows[:, :, -1]
     depth_m, depth_sigma_m = _depths(viewer, measured, pooled.ends_m.mean(axis=1), shape_m.mean(axis=1))
     sigma_m = np.sqrt(np.einsum("eii->ei", pooled.covariance_m2))
@@ -169,13 +171,13 @@ def estimate_edges(
 
 
 def _nanometres(ends_m: Array) -> tuple[float, float]:
-    """Rounded, so that people can read the file."""
+    """Rounded to nanometres, so that people can read the file."""
     return round(float(ends_m[0]), 9), round(float(ends_m[1]), 9)
 
 
 def _changing_m(measured: _Measured, shape_m: Array) -> Array:
-    """(e, 2) standard deviation of what an offset has more or less in one image than in another, beyond the scatter of
-    its points: no average makes that less for a single frame.
+    """Standard deviation (e, 2) by which an offset changes from image to image, beyond the scatter of its points: for a
+    single frame no average reduces it.
     """
     out = np.zeros_like(shape_m)
     for i, (edge, ends_m) in enumerate(zip(measured.edges, measured.ends_m, strict=True)):
@@ -188,10 +190,10 @@ def _changing_m(measured: _Measured, shape_m: Array) -> Array:
 
 
 def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array:
-    """(e, 2) variance of each edge's mean ends: the scatter between its images, or within them if that is more.
+    """Variance (e, 2) of each edge's mean ends: from the scatter between its images, or within them if that is larger.
 
-    The usual scatter of all edges counts as some more images of each; in a single image it is what usually moves a
-    whole edge.
+    The usual scatter of all edges counts as some additional images of each; with a single image it is
+    :data:`SINGLE_SIGMA_PX`.
     """
     between_px2 = [np.var(m * ends, axis=0, ddof=1) for m, ends in zip(per_m, ends_m, strict=True) if len(ends) > 1]
     usual_px2 = np.median(between_px2, axis=0) if between_px2 else np.full(2, SINGLE_SIGMA_PX**2)
@@ -207,8 +209,8 @@ def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array
 
 
 def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array) -> tuple[Array, Array]:
-    """Depth (e,) and its standard deviation (e,): as a bevel of that shape has it, and as images with different jaw
-    openings show it, in which the line of sight has turned.
+    """Depth (e,) and its standard deviation (e,): from the shape of a bevel, and from images with different jaw
+    openings, between which the line of sight turns.
     """
     gripper, indices = viewer.gripper, measured.indices
     offset_of_all_m = np.zeros(len(gripper.edge_ids))
@@ -231,28 +233,28 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
 
 
 REFERENCE_SIGMAS = 3.0
-"""Standard deviations of the reference and of the reported opening that are allowed on top."""
+"""Standard deviations of the reference and of the reported opening that are allowed in addition to a bevel."""
 
 JAW_SIGMAS = 5.0
-"""Standard deviations that the seen opening may be from the reported one, as in the monitor."""
+"""Standard deviations by which the measured opening may differ from the reported one, as in the monitor."""
 
 NOTED_PX = 1.0
-"""A reference that is off by more than this is worth a note: a view turned by 3° makes a twentieth of it an error."""
+"""Offset of the reference above which a note is given: in a view turned by 3° a twentieth of it becomes an error."""
 
 TAUGHT_SHARE = 0.5
-"""Part of the outlines in view, by profiles, that must be seen: with fewer, something hides the gripper."""
+"""Least part of the outlines in view, by search lines, that must be seen: with less, something hides the gripper."""
 
 LOST_SHARE = 0.25
-"""With a smaller part the gripper, or a finger, isn't there."""
+"""Part below which the gripper, or a finger, counts as absent."""
 
 AGREEING_PX = 0.5
-"""How far the edges of an image may lie from where all images show them, in the median; else something has moved."""
+"""Largest median distance of an image's edges from where all images show them; above it something has moved."""
 
 _FEWEST_SHARED = 4
 
 
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
-    """Refuse a gripper of which too little is seen, on the whole or of one finger."""
+    """Refuse if too little of the gripper, or of one finger, is seen."""
     profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
     seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
     share = seen.sum() / max(profiles.sum(), 1)
@@ -269,8 +271,8 @@ def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
 
 
 def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
-    """Refuse the image in which the gripper stands farthest from where the others show it: most of its ``edges`` then
-    show elsewhere, each looked for in every image by itself.  A few that differ are clutter, or bevels before another
+    """Refuse the image whose gripper is farthest from where the others show it: most of its ``edges``, each searched
+    for in every image separately, are then displaced.  A few displaced edges are clutter, or bevels in front of another
     background.
     """
     if len(views) < 2:
@@ -282,7 +284,7 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
             line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
             if line is not None:
                 places_px[number, k] = line.ends_px.mean()
-    # By edges that most images show.
+    # Use edges that most images show.
     places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
     enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
     if not enough.any():
@@ -299,10 +301,10 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
 
 
 def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> str | None:
-    """Refuse a gripper that stands elsewhere, or opens its jaw otherwise, than the stated deviations allow.
+    """Refuse a gripper whose pose or jaw opening differs by more than the stated standard deviations allow.
 
-    Each is tried with the other one taken as stated, since together they can hardly be separated; what leaves less of
-    their own to the edges is named first.  What is allowed, but more than a pixel, is returned in words.
+    Each is tested with the other one taken as stated, since both together can hardly be separated; the one that leaves
+    smaller own offsets to the edges is named first.  An allowed error above a pixel is returned as a text.
     """
     stated = viewer.prior_covariance
     free_pose, free_jaw = stated.copy(), stated.copy()
@@ -340,7 +342,7 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
 
 
 def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
-    """Refuse edges that lie farther from the reference than a bevel and the stated deviations explain."""
+    """Refuse edges that lie farther from the reference than a bevel and the stated standard deviations explain."""
     for index, edge in lines.items():
         if not edge.images:
             continue

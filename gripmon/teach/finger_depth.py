@@ -1,10 +1,10 @@
-"""Where in space the outlines of fingers lie that one camera sees from one side: up to one length, perspective tells.
+"""Position in space, up to scale, of finger outlines that one camera sees from one side, by perspective.
 
-Long edges of a finger that run along it are parallel in space, so their images meet in one point, which is the fingers'
-direction (the vanishing point; Caprile and Torre 1990).  Fingertips end square to that: their outline lies in the
-contact plane, and the long edges run back from it.  A round tip's outline lies in the plane of the finger's sides: it
-leaves them smoothly, where one in the contact plane would bend by 90 degrees, and only from a few places not be seen
-to.  Where edges don't meet so, the outline is taken as flat, facing the camera.
+Long edges along a finger are parallel in space, so their images meet in one point, the vanishing point, which gives the
+fingers' direction (Caprile and Torre 1990).  Fingertips end square to it: their outline lies in the contact plane, and
+the long edges run back from it.  The outline of a round tip lies in the plane of the finger's sides instead: it leaves
+them smoothly, whereas an outline in the contact plane would bend by 90 degrees, which is invisible from only a few
+places.  Where edges don't meet in a point, the outline is taken as flat, facing the camera.
 """
 
 from __future__ import annotations
@@ -20,31 +20,30 @@ from gripmon.model.records import Array
 from gripmon.teach.straight_pieces import LONGEST_CUT_PX
 
 LONG_PX = 30.0
-"""Edges that tell a direction: 0.1 px at each end is 0.3 degrees."""
+"""Least length of an edge that shows a direction: 0.1 px at each end is 0.3 degrees."""
 PARALLEL_RAD = math.radians(0.6)
-"""By which a long edge may miss the vanishing point: twice what 30 px tell."""
+"""Largest angle by which a long edge may miss the vanishing point: twice what 30 px resolve."""
 FEWEST_PARALLEL = 3
 MAJORITY = 0.5
-"""Part of the length of the edges that may run along the fingers that has to, as where the monitor looks for their
-ends."""
+"""Least part of the total length of candidate edges that must run along the fingers, as in the monitor's search for
+their ends."""
 ALONG_RAD = math.radians(50.0)
-"""Between an edge's image and the way to the tip: perspective turns edges along a finger by up to so much."""
+"""Largest angle between an edge's image and the direction to the tip: perspective turns edges along a finger so far."""
 STEEPEST = 0.25
-"""Cosine between line of sight and fingers below which a contact plane is seen too obliquely to place corners on it."""
+"""Cosine between line of sight and fingers below which the contact plane is too oblique to place corners on it."""
 AT_ONCE = 0.75
-"""Part of the turn within the length of a cut corner that a corner has: of the tightest curve that shows as one, three
-pieces of 6 px, each vertex has a third, twice that by their scatter."""
+"""Least part of the turn, within the length of a cut corner, that a corner makes at once.  On the tightest curve that
+isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
-"""Of a plane whose tilt isn't known: anything up to 45 degrees (45 / sqrt(3))."""
+"""Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
 
 
 @dataclass(frozen=True)
 class Outline:
     """A finger's outline: ``xy`` (v, 2) of its vertices in ideal coordinates, ``corner`` (v,), ``pieces`` as pairs of
-    vertices, ``outwards`` (2,): the way to its tip in the image, ``length_px`` (p,) of the pieces; ends ``inner_xy``
-    (i, 2, 2) and
-    lengths ``inner_px`` (i,) of its inner edges.
+    vertices, ``outwards`` (2,), the direction to its tip in the image, ``length_px`` (p,) of the pieces; ends
+    ``inner_xy`` (i, 2, 2) and lengths ``inner_px`` (i,) of its inner edges.
     """
 
     name: str
@@ -59,10 +58,10 @@ class Outline:
 
 @dataclass(frozen=True)
 class Placed:
-    """Outlines in space at unit depth of the TCP.  ``points`` for each finger (v, 3) in the camera frame, NaN where
-    not known; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
-    fingers' direction isn't known; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some are taken to
-    lie in the plane of their sides; ``by_motion``: depths are from how fingers moved with the jaws.
+    """Outlines in space, the TCP at unit depth.  ``points`` of each finger (v, 3) in the camera frame, NaN where
+    unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
+    fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
+    to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws.
     """
 
     points: tuple[Array, ...]
@@ -76,7 +75,7 @@ class Placed:
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
-    """The fingers in space, from their perspective, or with ``rotation`` (3, 3) and ``tcp`` (3,) at unit depth, where a
+    """The fingers in space, from their perspective; or, with ``rotation`` (3, 3) and ``tcp`` (3,) at unit depth, as a
     calibration has them.
     """
     given = None if rotation is None else rotation[:, 2]
@@ -98,7 +97,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     tips = [sorted(tip) for tip, _ in runs]
     if rotation is None or tcp is None:
         inner = innermost([p[t] for p, t in zip(points, tips, strict=True)])
-        # Between the fingers, where they end: what is innermost of round tips lies farther back.
+        # Between the fingers, at their ends: the innermost parts of round tips lie farther back.
         tcp = np.mean(inner, axis=0)
         tcp = tcp + direction * float(direction @ (plane_at - tcp))
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
@@ -151,8 +150,8 @@ def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
 
 
 def _direction_sigma(meet: Array, middle: Array, line: Array) -> float:
-    """Standard deviation (rad) of a direction whose image n lines (n, 3) through ``middle`` (n, 2) meet in, each known
-    to half of :data:`PARALLEL_RAD`; large where they are nearly one line.
+    """Standard deviation (rad) of a direction in which n lines (n, 3) through ``middle`` (n, 2) meet, each known to
+    half of :data:`PARALLEL_RAD`; large where they are nearly one line.
     """
     at = meet[:2] / (meet[2] if abs(meet[2]) > 1e-9 else 1e-9)
     off = 0.5 * PARALLEL_RAD * np.linalg.norm(at - middle, axis=1)
@@ -161,7 +160,7 @@ def _direction_sigma(meet: Array, middle: Array, line: Array) -> float:
 
 
 def _image_way(direction: Array, xy: Array) -> Array:
-    """Way (2,) in the image of a point that goes along a direction in space."""
+    """Direction (2,) in the image of a point's motion along a direction in space."""
     return np.asarray(direction[:2] - direction[2] * xy)
 
 
@@ -177,13 +176,13 @@ def _ray(xy: Array) -> Array:
 
 
 def tip_centre(fingers: Sequence[Outline]) -> Array:
-    """Middle (2,) between the foremost vertices of all fingers, ideal coordinates."""
+    """Centre (2,) of the foremost vertices of all fingers, ideal coordinates."""
     return np.asarray(np.mean([f.xy[int((f.xy @ f.outwards).argmax())] for f in fingers], axis=0))
 
 
 def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tuple[int, int]]]:
-    """Vertices of the tip's outline, and the pieces along the finger that follow it on both sides, outwards first; the
-    rest, as a body that carries the finger, has another depth.
+    """Vertices of the tip's outline, and the pieces along the finger that follow it on both sides, outwards first.  The
+    rest, e.g. a body that carries the finger, has another depth.
     """
     along = {
         piece
@@ -227,7 +226,7 @@ def _in_space(
     plane_at: Array,
     turns: Sequence[int],
 ) -> Array:
-    """Vertices (v, 3): the tip's in the contact plane, or in that of the sides, which turn into it at ``turns``."""
+    """Vertices (v, 3): the tip's in the contact plane, or in the plane of the sides, which join it at ``turns``."""
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
@@ -244,15 +243,15 @@ def _in_space(
 
 
 def _smooth_turns(finger: Outline, tip: set[int], sides: Sequence[tuple[int, int]]) -> list[int]:
-    """The two vertices at which a finger's sides turn into its tip's curve; none where one is a corner."""
+    """The two vertices at which a finger's sides turn smoothly into its tip's curve; none where one is a corner."""
     first = [(start, end) for start, end in sides if start in tip]
     smooth = len(first) == 2 and all(leaves_smoothly(finger, tip, *side) for side in first)
     return [start for start, _ in first] if smooth else []
 
 
 def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> bool:
-    """Whether a side that comes from ``behind`` turns into a curve of the ``tip`` at its ``start``: a corner turns all
-    at once.
+    """Whether a side that comes from ``behind`` turns smoothly into a curve of the ``tip`` at its ``start``; a corner
+    makes the turn all at once.
     """
     way, at, travelled_px, turns = finger.xy[start] - finger.xy[behind], start, 0.0, []
     used = {behind}
@@ -273,8 +272,8 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
 
 
 def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], direction: Array, height: float) -> None:
-    """Move the tip's vertices, in the contact plane so far, along their lines of sight into the plane of the two sides,
-    which begin at ``turns`` equally far from the tip; what reaches farthest out then lies in the contact plane.
+    """Move the tip's vertices from the contact plane along their lines of sight into the plane of the two sides, which
+    begin at ``turns`` equally far from the tip; then scale so that the outermost vertex lies in the contact plane.
     """
     normal = np.cross(direction, points[turns[1]] - points[turns[0]])
     rays = points[tip] / points[tip][:, 2:]
@@ -283,13 +282,13 @@ def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], di
 
 
 def nearest_on_ray(ray: Array, start: Array, direction: Array) -> Array:
-    """The point (3,) of a line of sight that is nearest to the parallel of the fingers through ``start``."""
+    """The point (3,) of a line of sight that is nearest to the line through ``start`` parallel to the fingers."""
     normal = np.cross(direction, np.cross(ray, direction))
     return np.asarray(ray * (float(normal @ start) / float(normal @ ray)))
 
 
 def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp: Array | None) -> Placed:
-    """All in one plane through the TCP that faces the camera."""
+    """All fingers in one plane through the TCP that faces the camera."""
     facing = _ray(centre if tcp is None else tcp[:2] / tcp[2])
     facing = facing / np.linalg.norm(facing)
     at = _ray(centre) if tcp is None else tcp
@@ -309,7 +308,9 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
 
 
 def innermost(tips: Sequence[Array]) -> list[Array]:
-    """Middle (3,) of what each finger's tip (v, 3) shows nearest to the others, first and last; of one its own."""
+    """Mean (3,) of the vertices of the first and the last finger's tip (v, 3) that are nearest to the other one; of a
+    single tip, of all its vertices.
+    """
     points = [tip[np.isfinite(tip).all(axis=1)] for tip in (tips[0], tips[-1])]
     if len(tips) == 1:
         return [points[0].mean(axis=0)]
@@ -317,7 +318,7 @@ def innermost(tips: Sequence[Array]) -> list[Array]:
     for _ in range(_ROUNDS):
         across = inner[1] - inner[0]
         far = [p @ across / float(np.linalg.norm(across)) for p in points]
-        # Vertices as far in as the innermost one, to a tenth of the gap: the paper's rectangle has two on each finger.
+        # Vertices within a tenth of the gap of the innermost one: the paper's rectangle has two on each finger.
         gap = abs(float(far[1].min() - far[0].max()))
         near = far[0] > far[0].max() - 0.1 * gap, far[1] < far[1].min() + 0.1 * gap
         inner = [p[chosen].mean(axis=0) for p, chosen in zip(points, near, strict=True)]
@@ -327,7 +328,9 @@ def innermost(tips: Sequence[Array]) -> list[Array]:
 def _across_inner_edges(
     fingers: Sequence[Outline], points: Sequence[Array], tips: Sequence[Sequence[int]], direction: Array
 ) -> Array | None:
-    """Direction (3,) square to the edges of two fingertips that face each other: jaws close square to those."""
+    """Direction (3,) square to the edges of two fingertips that face each other, along which the jaws close; None where
+    they have no such edge.
+    """
     if len(fingers) != 2:
         return None
     middles = [np.nanmean(p[list(t)], axis=0) for p, t in zip(points, tips, strict=True)]

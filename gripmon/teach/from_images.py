@@ -1,8 +1,8 @@
-"""A gripper file from images before changing backgrounds: ``gripmon gripper from-images`` is this.
+"""A gripper file from images in front of changing backgrounds; ``gripmon gripper from-images`` calls this.
 
-The images show outlines and inner edges in pixels (:mod:`~gripmon.teach.image_outline`), perspective and the jaws'
-motion their places in space up to one length (:mod:`~gripmon.teach.finger_depth`, :mod:`~gripmon.teach.image_motion`),
-which someone gives, a calibration knows, or the openings in metres tell.
+The images show outlines and inner edges in pixels (:mod:`~gripmon.teach.image_outline`).  Perspective and the jaws'
+motion give their positions in space up to scale (:mod:`~gripmon.teach.finger_depth`,
+:mod:`~gripmon.teach.image_motion`).  The scale is given, or comes from a calibration or from the openings in metres.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ Pose = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class GripperFromImages:
-    """``gripper`` and where it is: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the
-    TCP then rotation, camera axes.  ``opening_m`` that the coordinates hold at; ``outline_sigma_px`` median standard
-    deviation of the outline's vertices by their scatter over the images; ``left_out``: images that weren't used, and
-    why; ``notes``: what isn't known, or was taken for granted.
+    """``gripper`` and its pose: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the TCP
+    then rotation, camera axes.  ``opening_m``: at which the coordinates hold; ``outline_sigma_px``: median standard
+    deviation of the outline's vertices from their scatter over the images; ``left_out``: images that weren't used, and
+    why; ``notes``: what is unknown or was assumed.
     """
 
     gripper: Gripper
@@ -64,7 +64,7 @@ class GripperFromImages:
     rms_px: float
 
     def picture(self) -> Image:
-        """The first image that was used, with outline, scatter and fingers; BGR."""
+        """The first image used, with outline, scatter and fingers; BGR."""
         return draw_outlines(self.shown, self.seen, self.names)
 
     def values(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class GripperFromImages:
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def document(self, provenance: Provenance) -> HandEyeCalibration:
-        """The reference, as a file has it."""
+        """The reference, as a file holds it."""
         pixel_m = float(self.cam_T_grip[2, 3]) / self.lens.fx_px
         return HandEyeCalibration(
             camera=self.lens,
@@ -133,14 +133,14 @@ def gripper_from_images(
     provenance: Provenance | None = None,
     progress: Progress = quiet,
 ) -> GripperFromImages:
-    """A gripper and its reference from ten to some hundred ``images`` before changing backgrounds.
+    """A gripper and its reference from ten to some hundred ``images`` in front of changing backgrounds.
 
-    ``openings_m``: the jaw's opening in each image (None: the images tell which are of one); ten images at least of
-    each opening that is to be used.  The scale comes from ``distance_m`` (of the fingertips from the camera, along the
-    optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference`` calibration, or from several
-    openings.
+    ``openings_m``: the jaw's opening in each image (None: images of one opening are found from the images); every
+    opening that is to be used needs at least ten images.  The scale comes from ``distance_m`` (of the fingertips from
+    the camera, along the optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference``
+    calibration, or from several openings.
 
-    Raises :class:`~gripmon.model.errors.InputError` for what was given wrong,
+    Raises :class:`~gripmon.model.errors.InputError` for wrong arguments,
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
     """
     _check(distance_m, finger_width_m, reference, openings_m, len(images))
@@ -208,8 +208,8 @@ def _see_openings(
     left_out: dict[str, str],
     step: Callable[[], None],
 ) -> tuple[OpeningSeen, dict[float, OpeningSeen]]:
-    """What the images of the first opening show, and those of each other one that has enough of them; ``notes`` and
-    ``left_out`` grow.
+    """What the images of the first opening show, and of each other opening with enough images; adds to ``notes`` and
+    ``left_out``.
     """
     seen: dict[float, OpeningSeen] = {}
     for opening, own in groups.items():
@@ -266,7 +266,7 @@ def _spread(openings_m: Sequence[float | None]) -> float:
 def _groups(
     openings_m: Sequence[float | None] | None, grey: Sequence[NDArray[np.float32]], least_noise: float
 ) -> dict[float, list[int]]:
-    """Indices of the images of each opening; the one with most images first.  Unknown openings have numbers."""
+    """Indices of the images of each opening, the one with most images first.  Unknown openings are numbered."""
     if openings_m is None:
         return {float(k): own for k, own in enumerate(image_sets(grey, least_noise))}
     order = sorted(range(len(grey)), key=lambda k: openings_m[k] or 0.0)
@@ -290,7 +290,7 @@ def _groups(
 def _motions(
     camera: Camera, seen: OpeningSeen, placed: Placed, around: Mapping[float, OpeningSeen], notes: list[str]
 ) -> dict[float, Sequence[FingerMoved]]:
-    """How each finger moved to each other opening; openings at which one isn't found are left out, and noted."""
+    """How each finger moved to each other opening; openings where a finger isn't found are left out, with a note."""
     out: dict[float, Sequence[FingerMoved]] = {}
     for opening, other in around.items():
         moved = [
@@ -340,7 +340,9 @@ def _scale(
 
 
 def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) -> Array:
-    """(6, 6): the distance along the line of sight, the outline's scatter across it, and the axes' directions."""
+    """Covariance (6, 6): from the distance along the line of sight, the outline's scatter across it, and the axes'
+    directions.
+    """
     depth, sigma = scale
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     across = float(np.median(sigmas)) / fx_px * depth
@@ -352,7 +354,7 @@ def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) 
 
 
 def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int) -> list[str]:
-    """What isn't known, in words."""
+    """What is unknown or was assumed, as texts."""
     notes = []
     if reference is None:
         depth, sigma = scale

@@ -1,8 +1,8 @@
 """Hand/eye calibration from images of the gripper, for programs and notebooks: on a plate, or as the monitor sees it.
 
 ``gripmon calibrate plane`` and ``verify`` call these functions.  Images are arrays (as OpenCV reads them) or paths.
-What is wrong with the input is an :class:`~gripmon.model.errors.InputError`, images from which nothing can be measured
-a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text.
+Wrong input raises :class:`~gripmon.model.errors.InputError`, images from which nothing can be measured
+:class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Pose = tuple[Array, Array]
 
 @dataclass(frozen=True, slots=True)
 class ImageOnPlate:
-    """What an image gives.  ``missing``: corners that were wanted and not measured, and why; ``outline`` of an inferred
+    """The result of one image.  ``missing``: wanted corners that weren't measured, and why; ``outline`` of an inferred
     gripper, with its points as measured.
     """
 
@@ -75,8 +75,8 @@ class KnownGripper:
     expected_cam_T_grip: Array | None = None
 
     def measure(self, image: Image, sighting: Sighting, rough: Rough | None) -> ImageOnPlate:
-        """``rough`` corners choose which ones are taken; without them all are, and they are expected where the rough
-        calibration has them.  Raises :class:`CalibrationError`.
+        """``rough`` corners select the ones to measure; without them all are measured, where the rough calibration
+        predicts them.  Raises :class:`CalibrationError`.
         """
         gripper, opening_m, camera = self.gripper, self.jaw_opening_m, make_camera(self.camera.lens)
         points_m = gripper.points_grip_m(opening_m)
@@ -99,7 +99,7 @@ class KnownGripper:
 
 @dataclass(frozen=True, slots=True)
 class UnknownGripper:
-    """Calibrates with rough outlines alone; the gripper comes out, too.  ``target``: the plate, whose print is then
+    """Calibrates with rough outlines alone, and infers the gripper, too.  ``target``: the plate, so that its print is
     distinguished from the fingers.
     """
 
@@ -120,8 +120,8 @@ class UnknownGripper:
 
 @dataclass(frozen=True, slots=True)
 class HandEyeOnPlate:
-    """``fit`` of all images together; ``images``: what each gives; ``not_used``: images that give nothing, and
-    why; ``notes``: what was assumed; ``shown``: the first image that was used.
+    """``fit`` of all images together; ``images``: the result of each; ``not_used``: images without a result, and why;
+    ``notes``: what was assumed; ``shown``: the first image used.
     """
 
     fit: PlaneCalibration
@@ -133,17 +133,17 @@ class HandEyeOnPlate:
 
     @property
     def cam_T_grip(self) -> Array:
-        """(4, 4)."""
+        """The calibrated pose (4, 4)."""
         return self.fit.cam_T_grip
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of its error: position of the TCP, then rotation, camera axes."""
+        """Covariance (6, 6) of its error: position of the TCP, then rotation, camera axes."""
         return self.fit.covariance
 
     @property
     def inferred(self) -> bool:
-        """Whether the gripper comes from the same images."""
+        """Whether the gripper is inferred from the same images."""
         return isinstance(self.method, UnknownGripper)
 
     def gripper(
@@ -153,12 +153,12 @@ class HandEyeOnPlate:
         jaw_opening_m: float | None = None,
         provenance: Provenance | None = None,
     ) -> Gripper:
-        """The gripper: the known one, or the one that the images show (``jaw_range_m`` in which its jaws move)."""
+        """The gripper: the known one, or the one inferred from the images (``jaw_range_m``: the range of its jaw)."""
         if isinstance(self.method, KnownGripper):
             return self.method.gripper
         outlines = [image.outline for image in self.images if image.outline is not None]
         outline, camera = outlines[0], make_camera(self.method.camera.lens)
-        # Corners from all images jointly, ends of edges by their mean.
+        # Corners from all images jointly, ends of edges as their mean.
         alike = [one.points for one in outlines if one.names == outline.names]
         points_m = np.mean([points_in_gripper(camera, outline, uv_px, self.cam_T_grip) for uv_px in alike], axis=0)
         points_m[list(outline.corners)] = self.fit.corners_m
@@ -168,7 +168,7 @@ class HandEyeOnPlate:
             raise CalibrationError(f"what the corners show is not a gripper: {error}") from None
 
     def document(self, gripper: Gripper, provenance: Provenance) -> HandEyeCalibration:
-        """What a file holds of it."""
+        """The content of the calibration's file."""
         opening_m = self.method.jaw_opening_m if isinstance(self.method, KnownGripper) else None
         if opening_m is None and gripper.has_jaw:
             opening_m = gripper.jaw_nominal_m
@@ -252,8 +252,8 @@ def calibrate_plane(
     """``cam_T_grip`` from images of the gripper standing on a calibration plate (the Plane Coincidence Constraint).
 
     Where to look for the gripper: rough ``corners`` (name: (u, v) in px; for all images or for each), or a rough
-    calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, whose
-    names stand at :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` in the images; nominal if None.
+    calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, named as in
+    :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
@@ -337,7 +337,7 @@ def _sighting(image: Image, target: Target, name: str) -> Sighting:
 
 
 def gripper_values(model: GripperModel) -> dict[str, Any]:
-    """A gripper as a file has it: without keys that have their default."""
+    """A gripper as in its file: without keys that have their default."""
     out: dict[str, Any] = msgspec.to_builtins(model)
     out["fingers"] = {
         name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()
@@ -357,18 +357,18 @@ def measure_tracked(
     jaw_opening_m: float | None = None,
     taught_edges: TaughtEdges | None = None,
 ) -> tuple[Pose, tuple[str, ...]]:
-    """``cam_T_grip`` as the monitor measures it in images of one pose before different backgrounds, from where it is
-    ``expected``; and what is doubtful about it.  Images that contradict the others are left out.
+    """``cam_T_grip`` as the monitor measures it in images of one pose in front of different backgrounds, starting at
+    the ``expected`` pose; and what is doubtful about it.  Images that contradict the others are left out.
     """
     taken = _of_camera(images, camera)
     made = make_camera(camera)
     cam_T_grip, covariance = expected
-    # Where the camera has moved, an image that begins at the calibration may end at a wrong place.  So once more, from
-    # where most of them end.
+    # Where the camera has moved, a fit that starts at the calibration may end at a wrong pose.  So a second pass starts
+    # where most fits ended.
     for _ in range(2):
         found, reasons = {}, []
         for number, (name, image) in enumerate(taken):
-            # Each image by itself: what a monitor learns from the last one is for a camera that stands still meanwhile.
+            # Each image by itself: a monitor learns from the last frame only for a camera that stands still.
             flat = tuple(covariance.ravel().tolist())
             reference = ReferenceRecord("verify", 0, 0, "configuration", to_record(cam_T_grip), flat)
             monitor = Monitor(made, gripper, settings or MonitorSettings(), reference, taught_edges)

@@ -1,4 +1,4 @@
-"""The picture of a gripper made from images."""
+"""The picture of a gripper file made from images."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _ENLARGED = 50.0
 
 
 def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Image:
-    """Outlines by finger, corners as circles, inner edges; across each vertex its scatter, three standard deviations,
-    enlarged.
+    """Draw outlines by finger, corners as circles, and inner edges; at each vertex its scatter, three standard
+    deviations, enlarged.
     """
     canvas = Canvas(image, 2 if image.shape[1] < 1000 else 1)
     for number, (finger, name) in enumerate(zip(seen.fingers, names, strict=True)):

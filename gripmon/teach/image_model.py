@@ -1,4 +1,4 @@
-"""What images show of fingers, as a gripper file: points, edges, corners, and how the fingers move."""
+"""From what images show of fingers to a gripper file: points, edges, corners, and how the fingers move."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from gripmon.track.edges.ends import PARALLEL_COSINE
 
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0
-"""By which the line of an inner edge may miss the corner of the outline that it runs to, beside its own scatter: on a
-bevel of 0.25 mm, 100 mm away, it lies so far beside it."""
+"""Largest distance, besides its own scatter, by which the line of an inner edge may miss the outline's corner that it
+runs to: on a bevel of 0.25 mm, 100 mm away, it lies this far beside it."""
 LARGEST_GAP = 0.5
-"""Between such an edge and its corner, over its length: its line is then known there as well as along itself."""
+"""Largest gap between such an edge and its corner, over its length: there its line is known as well as along itself."""
 LONG_SIDE = 0.5
-"""Length of a finger's side over that of its longest, from which it is one, and no piece of the curve at its end."""
+"""Least length of a finger's side over its longest side; shorter pieces belong to the curve at its end."""
 LONGEST_SHARE = 0.25
-"""Of a side: at most so much of it before a curve counts with the curve."""
+"""Largest part of a side before a curve that counts with the curve."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """``depth_m`` of the TCP; ``moved`` by opening: each finger's motion."""
+    """What images show of a gripper.  ``depth_m`` of the TCP; ``moved``: by opening, each finger's motion."""
 
     camera: Camera
     opening: OpeningSeen
@@ -47,7 +47,7 @@ class Seen:
 
 
 def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
-    """One for each finger, all its chains in one."""
+    """One outline per finger, all its chains combined."""
     count = len(seen.fingers)
     names = {1: ["finger"], 2: ["left", "right"]}.get(count, [f"finger{k + 1}" for k in range(count)])
     out = []
@@ -71,7 +71,7 @@ def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
 
 
 def tip_width(placed: Placed) -> float:
-    """Of a fingertip across the jaws at unit depth: mean over the fingers."""
+    """Width of a fingertip across the jaws at unit depth: mean over the fingers."""
     widths = [float(np.ptp(across)) for across in _tips_across(placed)]
     if not min(widths) > 0.0:
         raise NoResultError("no fingertip's width is seen; --distance M, or --reference FILE")
@@ -81,7 +81,7 @@ def tip_width(placed: Placed) -> float:
 def as_gaps(
     placed: Placed, moved: Mapping[float, Sequence[FingerMoved]], depth_m: float
 ) -> tuple[float, dict[float, Sequence[FingerMoved]]]:
-    """The gap between the fingertips (m) that was shown, and the motions by the gaps at the other openings."""
+    """The gap between the fingertips (m) at the first opening, and the motions by the gaps at the other openings."""
     first, *_, last = _tips_across(placed)
     gap = float(last.min() - first.max())
     by_gap = {}
@@ -92,17 +92,17 @@ def as_gaps(
 
 
 def _tips_across(placed: Placed) -> list[Array]:
-    """Where the vertices of each finger's tip lie across the jaws, at unit depth."""
+    """Positions of the vertices of each finger's tip across the jaws, at unit depth."""
     out = []
     for points in placed.points:
         local = (points[np.isfinite(points).all(axis=1)] - placed.tcp) @ placed.rotation
-        # What lies within a tenth of the finger's length of its tip.
+        # The tip is what lies within a tenth of the finger's length of its end.
         out.append(local[local[:, 2] > local[:, 2].max() - 0.1 * float(np.ptp(local[:, 2])), 0])
     return out
 
 
 def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: list[str]) -> GripperModel:
-    """The gripper file.  Raises :class:`NoResultError`; ``notes`` grow by what was left out."""
+    """The gripper file.  Raises :class:`NoResultError`; adds to ``notes`` what was left out."""
     points: dict[str, PointModel] = {}
     edges: dict[str, EdgeModel] = {}
     dropped = inner_dropped = 0
@@ -147,8 +147,8 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:
-    """Pieces in turn between which no corner is, as a round fingertip has them, without the fingers' long sides: those
-    are straight, and an edge of their own, so that it is seen where the finger ends.
+    """Runs of consecutive pieces without a corner between them, as on a round fingertip, without the fingers' long
+    sides: these are straight and edges of their own, so that the end of the finger is seen.
     """
     way = np.array([local[b] - local[a] for a, b in placed]).reshape(-1, 3)
     length = np.linalg.norm(way, axis=1)
@@ -167,7 +167,7 @@ def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -
         and runs[-1][-1][1] == runs[0][0][0]
         and not outline.corner[runs[0][0][0]]
     ):
-        runs[0] = runs.pop() + runs[0]  # a closed outline begins anywhere
+        runs[0] = runs.pop() + runs[0]  # a closed outline may begin within a run
     return [run for run in runs if len(run) > 1]
 
 
@@ -179,8 +179,8 @@ def _curve_in_space(
     curve: Sequence[tuple[int, int]],
     straight: Sequence[tuple[int, int]],
 ) -> Array:
-    """Points (n, 3) on a curve between its ends, at unit depth.  Where it goes on from a straight edge it begins on
-    that, where it leaves it: its end in ``places`` (v, 3) moves there.
+    """Points (n, 3) on a curve between its ends, at unit depth.  Where the curve continues a straight edge smoothly, it
+    begins on the edge, at the point where it leaves it: its end in ``places`` (v, 3) is moved there.
     """
     vertices = [curve[0][0], *(b for _, b in curve)]
     of_curve = places[vertices]
@@ -199,7 +199,7 @@ def _curve_in_space(
     uv_px = seen.camera.project(of_curve)
     curve_px, along = smooth_curve(seen.camera, seen.opening, mask, uv_px, (tangent[0], tangent[1]))
     rays = np.column_stack([seen.camera.undistort(curve_px), np.ones(len(curve_px))])
-    # In one plane the inverse depth is linear over the image.
+    # In a plane the inverse depth is linear over the image.
     points = rays / np.interp(along, np.arange(len(of_curve)), 1.0 / of_curve[:, 2])[:, None]
     for side, end in enumerate((vertices[0], vertices[-1])):
         if tangent[side]:
@@ -208,7 +208,7 @@ def _curve_in_space(
 
 
 def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEdge) -> tuple[int, int] | None:
-    """The vertex among ``known`` that an inner edge runs to, and the edge's end that is next to it; None for none."""
+    """The vertex among ``known`` that an inner edge runs to, and the edge's end next to it; None if there is none."""
     uv = seen.camera.distort(outline.xy[list(known)])
     way = edge.uv_px[1] - edge.uv_px[0]
     length = float(np.linalg.norm(way))
@@ -226,7 +226,7 @@ def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEd
 def _inner_in_space(
     seen: Seen, outline: Outline, places: Array, start: tuple[int, int] | None, edge: InnerEdge
 ) -> Array | None:
-    """Both ends (2, 3) at unit depth; None where nothing tells how deep it lies."""
+    """Both ends (2, 3) at unit depth; None where the depth can't be determined."""
     xy = seen.camera.undistort(edge.uv_px)
     rays = np.column_stack([xy, np.ones(2)])
     if seen.placed.flat:
@@ -266,7 +266,7 @@ def _add_inner(
 
 
 def _jaw(seen: Seen) -> tuple[dict[str, FingerModel], JawModel | None]:
-    """How the fingers move: a line between two openings, a table with more."""
+    """Motion of the fingers as a table over the openings."""
     names = [outline.name for outline in seen.outlines]
     if seen.opening_m is None or not seen.moved:
         return {name: FingerModel() for name in names}, None

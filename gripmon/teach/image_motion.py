@@ -1,4 +1,4 @@
-"""How fingers move with the jaw's opening, from images at several openings: it tells their distance, too."""
+"""How fingers move with the jaw's opening, from images at several openings; the motion also gives their distance."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from gripmon.teach.silhouette import FOLDS, Stations, in_image, inner_side, meas
 from gripmon.teach.straight_pieces import WORST_RMS_PX, jackknife_sigma
 
 SAME_OPENING_M = 5e-5
-"""Openings this close are one: some 0.2 px of each finger, 100 mm away."""
+"""Openings closer than this count as one: about 0.2 px of each finger, 100 mm away."""
 FEWEST_STATIONS = 20
 STATIONS = 40
-"""On each edge."""
+"""Number of stations on each edge."""
 TIP_SHARE = 0.35
-"""Of a finger's length: its tip, which is at one depth."""
+"""Part of a finger's length that is its tip, which is at one depth."""
 MOST_TOGETHER = 0.55
-"""Mean motion of fingers over that between them: where one jaw is fixed it is a half, and known to a tenth."""
+"""Largest mean motion of the fingers over their relative motion: with one fixed jaw it is 0.5, known to a tenth."""
 ROUGH_STEP_PX = 2.0
-"""Of a shift that is only roughly known: it is found in images of half the size."""
+"""Resolution of a roughly known shift, which is searched for in images of half the size."""
 _FAR_PX = 260
-"""How far a finger is searched for, each way."""
+"""Search range for a finger, each way."""
 
 
 @dataclass(frozen=True)
 class FingerMoved:
-    """``shift`` (3,) of a finger over the depth of its tip, camera axes, and the same by folds of images (f, 3);
-    ``rms_px`` of the edge points about that motion.
+    """``shift`` (3,) of a finger over the depth of its tip, camera axes; ``folds`` (f, 3), the same from each fold of
+    the images; ``rms_px`` of the edge points about that motion.
     """
 
     shift: Array
@@ -56,8 +56,8 @@ def motion_of(
     first: OpeningSeen,
     other: OpeningSeen,
 ) -> FingerMoved | None:
-    """The motion of a finger from one opening to another: its ``mask`` (h, w), ``outwards`` (2,) and ``points`` (v, 3)
-    at unit depth of the first, camera frame.  None where the other opening doesn't show it.
+    """The motion of a finger from one opening to another: its ``mask`` (h, w), ``outwards`` (2,) and ``points`` (v, 3),
+    at unit depth, of the first opening, camera frame.  None where the other opening doesn't show it.
     """  # fmt: skip
     rough = rough_shift_px(mask, outwards, first, other)
     at = _samples(points, pieces)
@@ -80,8 +80,8 @@ def motion_of(
 
 
 def check_opened(moved: Mapping[float, Sequence[FingerMoved]], counts: Sequence[int]) -> None:
-    """Raise :class:`~gripmon.model.errors.NoResultError` where sets of so many images (``counts``), which stay the same
-    in different places, aren't of one gripper at several openings: at those its fingers move against each other.
+    """Raise :class:`~gripmon.model.errors.NoResultError` if sets of images (``counts`` images each), each with other
+    static parts, don't show one gripper at several openings: then its fingers would move against each other.
     """
     if len(moved) + 1 < len(counts):
         raise sets_refused(counts)
@@ -104,8 +104,8 @@ def rough_shift_px(
     other: OpeningSeen,
     part: tuple[float, float] = (0.0, TIP_SHARE),
 ) -> Array:
-    """Whole pixels by which a part of the finger moved, of its length from its tip on: what is nearer to the camera
-    moves by more.
+    """Shift (2,), to :data:`ROUGH_STEP_PX`, of a ``part`` of the finger, given as a range of its length from the tip:
+    closer parts move by more in the image.
     """
     ahead = np.indices(mask.shape)[::-1].transpose(1, 2, 0) @ outwards
     behind = (float(ahead[mask].max()) - ahead) / float(np.ptp(ahead[mask]))
@@ -131,7 +131,7 @@ def rough_shift_px(
 
 
 def _samples(points: Array, pieces: tuple[tuple[int, int], ...]) -> Array:
-    """Rows of a point in space and the direction of its edge (n, 6), evenly along the edges."""
+    """Rows (n, 6) of a point in space and the direction of its edge, evenly spaced along the edges."""
     out = []
     for a, b in pieces:
         share = np.linspace(0.03, 0.97, STATIONS)[:, None]
@@ -141,7 +141,7 @@ def _samples(points: Array, pieces: tuple[tuple[int, int], ...]) -> Array:
 
 
 def normals(camera: Camera, at: Array, mask: NDArray[np.bool_]) -> Array:
-    """Across the edges in the image (n, 2), away from the finger."""
+    """Normals (n, 2) of the edges in the image, away from the finger."""
     uv, d_uv = camera.project_with_jacobian(at[:, :3])
     tangent = np.einsum("nij,nj->ni", d_uv, at[:, 3:])
     tangent /= np.linalg.norm(tangent, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""Images of one jaw opening to the outlines of fingers in them; what moved, is blurred or contradicts is left out."""
+"""From images of one jaw opening to outlines of fingers; images that moved, are blurred or contradict are left out."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from gripmon.teach.silhouette import Stations, Transitions, measure_transitions,
 from gripmon.teach.straight_pieces import Chain, fit_chain, runs, without_outliers
 
 BORDER_PX = 9.0
-"""Outlines nearer to the image's border aren't measured: search lines reach out of the image there."""
+"""Distance from the image's border below which outlines aren't measured: search lines would leave the image."""
 SHORTEST_CONTOUR_PX = 60
 MOST_SHIFT_PX = 0.5
-"""By which an image may show the gripper elsewhere: what teaching allows, too."""
+"""Largest shift of the gripper in an image against the others, as in teaching."""
 MOST_BLUR_PX = 2.5
-"""Of an outline's transition: farther out of focus the background's edges run into the fingers' (see Limits)."""
+"""Largest blur of an outline's transition: beyond it the background's edges merge with the fingers' (see Limits)."""
 LEAST_SHARPNESS = 0.6
-"""Of an image's transitions over those of all: blurred to 1.7 times the others' width it is less."""
+"""Least sharpness of an image's transitions over that of all: blurred to 1.7 times the others' width it is less."""
 MOST_PARTS = 6
-"""Separate parts of a gripper in view: five fingers and a palm."""
+"""Most separate parts of a gripper in view: five fingers and a palm."""
 _FEWEST_STATIONS = 60
 
 
 @dataclass(frozen=True)
 class FingerSeen:
     """A connected part of the gripper: its ``mask`` (h, w), the ``chains`` of its outline, ``inner`` edges, and
-    ``outwards`` (2,), the way to its tip in the image.
+    ``outwards`` (2,), the direction to its tip in the image.
     """
 
     mask: NDArray[np.bool_]
@@ -45,7 +45,7 @@ class FingerSeen:
 
 @dataclass(frozen=True)
 class OpeningSeen:
-    """What the images of one opening show.  ``left_out``: why images aren't used, by their index."""
+    """What the images of one opening show.  ``left_out``: by their index, why images aren't used."""
 
     matte: Matte
     fingers: tuple[FingerSeen, ...]
@@ -59,7 +59,7 @@ def see_opening(
     least_noise: float,
     step: Callable[[], None] = lambda: None,
 ) -> OpeningSeen:
-    """The outlines in ``images`` (h, w), grey levels of 0 to 255.  Raises :class:`NoResultError`."""
+    """Measure the outlines in ``images`` (h, w), grey levels of 0 to 255.  Raises :class:`NoResultError`."""
     matte = find_matte(images, least_noise, step)
     left_out = dict(matte.left_out)
     for turn in range(3):
@@ -90,8 +90,8 @@ def see_opening(
 def see_parts(
     camera: Camera, seen: OpeningSeen, parts: Sequence[NDArray[np.bool_]], outwards: Sequence[Array]
 ) -> OpeningSeen:
-    """The same images with ``parts`` (h, w) of what stays as the fingers, and the ways (2,) to their tips: where one
-    is cut off from the rest isn't outline.
+    """The same images with given ``parts`` (h, w) of what is static as the fingers, and the directions (2,) to their
+    tips.  The cut between a part and the rest isn't outline.
     """
     contours = [(part, contour) for part in parts for contour in trace(part, SHORTEST_CONTOUR_PX)]
     rest = seen.matte.still & ~np.any(parts, axis=0)
@@ -106,7 +106,7 @@ def _parts(still: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
 
 
 def _around(matte: Matte) -> tuple[Stations, Transitions, list[tuple[NDArray[np.bool_], Array]]]:
-    """Stations along all contours, what they show, and the contours of each part."""
+    """Stations along all contours, the transitions measured there, and the contours with their parts."""
     contours = [(part, contour) for part in _parts(matte.still) for contour in trace(part, SHORTEST_CONTOUR_PX)]
     if not contours:
         raise NoResultError("nothing that stays has an outline; a gripper of which the fingertips are in view")
@@ -126,7 +126,7 @@ def _around(matte: Matte) -> tuple[Stations, Transitions, list[tuple[NDArray[np.
 
 
 def _unlike(matte: Matte, stations: Stations, found: Transitions) -> dict[int, str]:
-    """Images that show the outline elsewhere, or blurred, by their index in the matte."""
+    """Images that show the outline displaced or blurred: the reason by their index in the matte."""
     out = {}
     chosen = found.usable
     normal, centre = stations.normal[chosen], stations.uv_px[chosen].mean(axis=0)
@@ -160,8 +160,8 @@ def _fingers(
     step: Callable[[], None],
     rest: NDArray[np.bool_] | None = None,
 ) -> tuple[FingerSeen, ...]:
-    """Each part with its chains, those with one at least, from left to right (or from top to bottom); ``rest`` (h, w)
-    of what stays, that a part was cut off from.
+    """The parts with at least one chain, from left to right (or from top to bottom); ``rest`` (h, w) of what is static,
+    from which a part was cut off.
     """
     chains: dict[int, list[Chain]] = {}
     masks: dict[int, NDArray[np.bool_]] = {}
@@ -199,7 +199,7 @@ def _fingers(
 
 
 def _outwards(mask: NDArray[np.bool_]) -> Array:
-    """Way (2,) in the image from where a part leaves the image to its farthest point."""
+    """Direction (2,) in the image from where a part leaves the image to its farthest point."""
     points = np.argwhere(mask)[:, ::-1].astype(float)
     last = np.array([mask.shape[1] - 1.0, mask.shape[0] - 1.0])
     border = ((points <= 0.0) | (points >= last)).any(axis=1)
@@ -215,9 +215,9 @@ def _outwards(mask: NDArray[np.bool_]) -> Array:
 
 
 def outwards_from(mask: NDArray[np.bool_], root: Array) -> Array:
-    """Way (2,) in the image from a part's root (2,) to what is farthest from there."""
+    """Direction (2,) in the image from a part's root (2,) to its farthest points."""
     points = np.argwhere(mask)[:, ::-1].astype(float)
-    # The outermost hundredth: one pixel is not a tip.
+    # The farthest hundredth of the pixels: a single pixel is not a tip.
     away = np.linalg.norm(points - root, axis=1)
     tip = points[away >= np.quantile(away, 0.99)].mean(axis=0)
     return np.asarray((tip - root) / np.linalg.norm(tip - root))

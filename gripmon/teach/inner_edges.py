@@ -1,7 +1,7 @@
-"""Edges within a finger that stay in all images: creases, two tones, pads, screws' straight sides.
+"""Edges within a finger that are the same in all images: creases, borders of two tones, pads, straight sides of screws.
 
-They show in the mean over the images, where noise and reflections of the background have averaged out; found by line
-segments (Grompone von Gioi et al., LSD, 2010), then measured as the outline is, by the steepest place across them.
+They are searched for in the mean over the images, in which noise and reflections of the background average out: found
+as line segments (Grompone von Gioi et al., LSD, 2010), then measured like the outline, by the steepest place across.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from gripmon.teach.silhouette import FOLDS, from_ideal_px, to_ideal_px
 from gripmon.teach.straight_pieces import jackknife_sigma
 
 SHORTEST_PX = 20.0
-"""Texture has short lines of its own: scratches, brush marks."""
+"""Least length of an edge: texture has shorter lines, scratches and brush marks."""
 LEAST_CONTRAST = 6.0
-"""Step over a pixel's noise: a search line of three rows then shows it at ten sigma."""
+"""Least step over a pixel's noise: a search line averaged over three rows then shows it at ten sigma."""
 SEEN_SHARE = 0.7
-"""Part of its length along which an edge must have one step, of one sign."""
+"""Least part of an edge's length along which its step has one sign."""
 FROM_OUTLINE_PX = 5.0
-"""Nearer to the outline the background shines in."""
+"""Least distance from the outline, where the background shines in."""
 _REACH_PX = 3.0
 _STEP_PX = 0.25
 _SAME_PX, _SAME_COS = 3.0, 0.996
@@ -33,8 +33,8 @@ _SAME_PX, _SAME_COS = 3.0, 0.996
 
 @dataclass(frozen=True)
 class InnerEdge:
-    """Its ends (2, 2) in the image, the same without a tenth of the images each (f, 2, 2), the ``step`` in grey levels
-    (positive: brighter to the right of who walks from the first end), ``rms_px`` of its points.
+    """Its ends (2, 2) in the image, ``folds_px`` (f, 2, 2), the same without a tenth of the images each, the ``step``
+    in grey levels (positive: brighter to the right when going from the first end), ``rms_px`` of its points.
     """
 
     uv_px: Array
@@ -44,12 +44,12 @@ class InnerEdge:
 
     @property
     def sigma_px(self) -> float:
-        """Standard deviation across it by the scatter over the images."""
+        """Standard deviation across the edge, from the scatter over the images."""
         return float(jackknife_sigma(self.folds_px).max())
 
 
 def find_inner_edges(camera: Camera, matte: Matte, mask: NDArray[np.bool_]) -> list[InnerEdge]:
-    """The edges inside of a part of the gripper, longest first."""
+    """The edges within a part of the gripper, longest first."""
     size = 2 * int(FROM_OUTLINE_PX) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     inside = np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderValue=1), np.uint8)
@@ -71,7 +71,7 @@ def find_inner_edges(camera: Camera, matte: Matte, mask: NDArray[np.bool_]) -> l
 
 
 def _inside_part(segment: Array, inside: NDArray[np.uint8]) -> Array | None:
-    """The longest part of a segment (2, 2) well inside, if it is long enough."""
+    """The longest part of a segment (2, 2) well inside the mask; None if it is too short."""
     length = float(np.linalg.norm(segment[1] - segment[0]))
     count = max(int(length), 2)
     points = segment[0] + np.linspace(0.0, 1.0, count)[:, None] * (segment[1] - segment[0])
@@ -127,20 +127,20 @@ def _measured(camera: Camera, means: list[NDArray[np.float32]], ends: Array, noi
 
 
 def _steps(slope: Array, s: Array) -> tuple[Array, Array]:
-    """Place of the steepest slope (stations,) and the step there, in grey levels."""
+    """Position of the steepest slope (stations,), and the step there in grey levels."""
     near = np.abs(s) <= _REACH_PX
     height = np.where(near[None], np.abs(slope), 0.0)
     at = np.clip(height.argmax(axis=1), 1, len(s) - 2)
     row = np.arange(len(slope))
     low, mid, high = height[row, at - 1], height[row, at], height[row, at + 1]
     bend = np.maximum(2.0 * mid - low - high, 1e-9)
-    # A step blurred by the lens and here, 1.2 px together, has this height over its slope.
+    # The step over the slope of an edge with a Gaussian blur of 1.2 px, by the lens and the filter together.
     step = slope[row, at] * 1.2 * (2.0 * np.pi) ** 0.5
     return s[at] + 0.5 * _STEP_PX * np.clip((high - low) / bend, -1.0, 1.0), step
 
 
 def _different(edges: list[InnerEdge]) -> list[InnerEdge]:
-    """Without shorter ones beside a longer one."""
+    """Drop edges beside a longer one in the same direction."""
     out: list[InnerEdge] = []
     for edge in edges:
         way = edge.uv_px[1] - edge.uv_px[0]

@@ -1,5 +1,5 @@
-"""The line that one edge shows in the teaching images, among everything else that looks like an edge beside it; what
-all edges have in common; and how deep an edge lies.
+"""The line of one edge in the teaching images, among everything else that looks like an edge next to it; what all edges
+have in common; and the depth of an edge.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from gripmon.model.records import Array
 from gripmon.track.edges.prediction import STRETCH
 from gripmon.track.edges.robust_fit import GATE_PX
 
-_START_PX = 1.0  # half width of a line while it is looked for: two lines closer than this are one to a blurred image
-_FLOOR_PX = 0.05  # the scatter of edge points is never taken to be less: pixels are that coarse
+_START_PX = 1.0  # half width of a line in the search: two lines closer than this are one in a blurred image
+_FLOOR_PX = 0.05  # least assumed scatter of edge points: pixels are that coarse
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
 _FEWEST = 6
@@ -26,11 +26,11 @@ _SETTLED_PX = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class EdgePoints:
-    """Edge candidates of one edge in all images, against the reference's prediction.
+    """Edge points of one edge in all images, against the reference's prediction.
 
     ``way`` (k,) from 0 to 1 along the sampled part, ``offset_px`` (k,), ``step`` (k,) grey-level step, ``profile`` (k,)
-    number of the profile, ``image`` (k,) of the image, ``candidate`` (k,) number among that image's candidates;
-    ``profiles`` (i,) how many profiles each image has on this edge.
+    number of the search line, ``image`` (k,) of the image, ``candidate`` (k,) number among that image's edge points;
+    ``profiles`` (i,) number of search lines on this edge in each image.
     """
 
     way: Array
@@ -46,8 +46,8 @@ class EdgePoints:
 class Line:
     """An edge's offset at both ends of its sampled part, px, with its covariance (2, 2) from the points' scatter.
 
-    ``inlier`` (k,) which points belong to it, ``rms_px`` their scatter, ``seen`` the part of the profiles that show it,
-    ``rival_px``: distance of another line that nearly as many profiles show, None if there is none.
+    ``inlier`` (k,): which points belong to it; ``rms_px``: their scatter; ``seen``: the part of the search lines that
+    show it; ``rival_px``: distance to another line that nearly as many search lines show, None if there is none.
     """
 
     ends_px: Array
@@ -59,10 +59,10 @@ class Line:
 
 
 def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line | None:
-    """The line that most profiles of all images show within ``reach_px`` of the expected one (2,); None if there is
+    """The line that most search lines of all images show within ``reach_px`` of the expected one (2,); None if there is
     none.
 
-    Of lines that are shown alike the one nearer to the expected line is taken.
+    Of two lines seen equally well, the one closer to the expected line is taken.
     """
     if len(points.way) < _FEWEST:
         return None
@@ -85,7 +85,7 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
 
 def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None) -> Line | None:
     """Robust straight line (Tukey's biweight, its width from the points' own scatter) from a start (2,); None if too
-    few points lie there.  ``worth`` (k,): the points' information, on average 1; all the same if None.
+    few points lie there.  ``worth`` (k,): the points' information, 1 on average; equal if None.
     """
     given = np.ones(len(points.way)) if worth is None else worth
     root = np.sqrt(given)
@@ -111,7 +111,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
     inlier = np.abs(residual) < width
     if np.count_nonzero(inlier) < _FEWEST:
         return None
-    # Neighbours see the same pixels and the same texture: a whole stretch of them is worth one.
+    # Neighbours see the same pixels and the same texture: a whole stretch of them counts as one point.
     rms_px = float(np.sqrt(np.mean(np.square(residual[inlier]))))
     covariance = np.linalg.inv(design[inlier].T @ design[inlier]) * max(rms_px, scale) ** 2 * STRETCH
     shown = np.unique(points.profile[np.abs(residual) < GATE_PX])
@@ -135,7 +135,7 @@ def of_image(points: EdgePoints, image: int) -> EdgePoints:
 
 
 def _votes(points: EdgePoints, starts: Array) -> Array:
-    """(s,) sum of a weight that falls with the distance of each point to each line (s, 2)."""
+    """Sum (s,) over all points of a weight that decreases with their distance from each line (s, 2)."""
     lines = starts[:, :1] * (1.0 - points.way) + starts[:, 1:] * points.way
     nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
     return np.asarray(nearness.sum(axis=1))
@@ -143,8 +143,8 @@ def _votes(points: EdgePoints, starts: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """Offsets ``ends_m`` (e, 2) and their covariances (e, 2, 2), ``own_m`` (e, 2) what of them is the edges' own,
-    ``usual_own_m`` (g,) its standard deviation over edges of a kind, ``common`` (m,) what is common and
+    """Offsets ``ends_m`` (e, 2) and their covariances (e, 2, 2); ``own_m`` (e, 2), the part that is the edges' own, and
+    ``usual_own_m`` (g,), its standard deviation over edges of a kind; ``common`` (m,), the common unknowns, with
     ``common_covariance`` (m, m).
     """
 
@@ -159,9 +159,10 @@ class Pooled:
 def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array) -> Pooled:
     """Posterior of the offsets ``ends_m`` (e, 2), whose noise has ``covariance_m2`` (e, 2, 2).
 
-    ``rows`` (e, 2, m): metres of offset by what is common, which is known to ``prior_covariance`` (m, m) about zero.
-    ``kind`` (e,): edges of a kind (outlines, creases) have a standard deviation of their own in common, both ends of an
-    edge the same offset but for half of it; estimated by restricted maximum likelihood (expectation maximisation).
+    ``rows`` (e, 2, m): derivatives, metres of offset by the common unknowns, which have a prior ``prior_covariance``
+    (m, m) about zero.  ``kind`` (e,): the own offsets of edges of a kind (outlines, creases) share one standard
+    deviation, and correlate by a half between both ends of an edge; it is estimated by restricted maximum likelihood
+    (expectation maximisation).
     """
     own_shape = np.array([[1.0, 0.5], [0.5, 1.0]])
     inverse_shape = np.linalg.inv(own_shape)
@@ -175,7 +176,7 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
         information = np.einsum("eim,eij,ejn->mn", rows, weight, rows) + np.linalg.inv(prior_covariance)
         common_covariance = np.linalg.inv(information)
         common = common_covariance @ np.einsum("eim,eij,ej->m", rows, weight, ends_m)
-        gain = shape @ weight  # of what isn't common this much is the edge's own
+        gain = shape @ weight  # of what isn't common, the part that is the edge's own
         own = np.einsum("eij,ej->ei", gain, ends_m - np.einsum("eim,m->ei", rows, common))
         mean = np.einsum("eim,m->ei", rows, common) + own
         rest = np.eye(2) - gain
@@ -193,23 +194,23 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
 
 
 LARGEST_SLOPE = 5.0
-"""Depth for each metre of offset at most: a face that is seen more grazingly than 11° shows no depth."""
+"""Largest depth per metre of offset: a face seen at less than 11° shows no depth."""
 
 UNKNOWN_SLOPE = 2.0
-"""Standard deviation of the depth, for each metre of offset, where faces don't show it."""
+"""Standard deviation of the depth per metre of offset where faces don't show it."""
 
 SLOPE_SHARE = 0.5
-"""Standard deviation of a depth that faces show, as a share of it: a rounding's line lies less deep than a bevel's."""
+"""Standard deviation of a depth from faces, as a share of it: the line of a rounding lies less deep than a bevel's."""
 
 
 def slopes(
     gripper: Gripper, points_grip_m: Array, crease: NDArray[np.bool_], axes: tuple[Array, Array], offset_m: Array
 ) -> Array:
-    """(e,) depth of an edge's rim for each metre of its offset across the line of sight (e,); NaN where the gripper
-    file has no two faces at the edge.
+    """Depth (e,) of an edge's rim per metre of its offset (e,) across the line of sight; NaN where the gripper file has
+    no two faces at the edge.
 
-    ``axes`` as :func:`sight_axes` gives them.  An outline of equal bevels is the rim that lies
-    farther out, a crease shows the rim on the side to which it is shifted.
+    ``axes`` as from :func:`sight_axes`.  The rim of an outline with equal bevels is the outer one, that of a crease
+    the one on the side to which it is shifted.
     """
     across, depth = axes
     out = np.full(len(gripper.edge_ids), np.nan)

@@ -1,8 +1,8 @@
-"""What stays the same in images before changing backgrounds: the gripper, and how sure that is.
+"""What stays the same in images in front of changing backgrounds, the gripper, and how certain that is.
 
-Light and exposure change between images, so each is first brought to the others' grey levels by a gain and an offset,
-which the pixels that change least tell.  A pixel of the gripper then shows the same grey level but for noise; one of
-the background doesn't.  Robust statistics over images throughout: a shadow or a hand in a few of them does no harm.
+Light and exposure change between images, so each is first adjusted to the others' grey levels by a gain and an offset,
+computed from the pixels that change least.  A pixel of the gripper then keeps its grey level but for noise, a pixel of
+the background doesn't.  All statistics over images are robust: a shadow or a hand in a few of them does no harm.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from gripmon.model.records import Array, Image
 from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 10
-"""Images of one opening: the scatter of ten is known to 24 % (1 / sqrt(2 (n - 1)))."""
+"""Fewest images of one opening: the scatter of ten is known to 24 % (1 / sqrt(2 (n - 1)))."""
 NOISE_FACTOR = 4.0
-"""Scatter over that of the gripper from which a pixel is background (no unit): with ten images noise alone exceeds it
-in none of a million pixels (chi-squared)."""
+"""Scatter over the gripper's own from which a pixel is background (no unit): with ten images noise alone exceeds it in
+none of a million pixels (chi-squared)."""
 MOST_STILL_SHARE = 0.9
-"""Of the image: a gripper that hides more than this of a wrist camera's view leaves no background to be told from."""
+"""Largest static part of the image: a gripper that hides more of a wrist camera's view leaves too little background."""
 FEWEST_STILL_SHARE = 0.005
-"""Of the image: less is not a fingertip that could be tracked (0.5 % of 640 x 480 px is 40 x 38 px)."""
+"""Least static part of the image: less is not a trackable fingertip (0.5 % of 640 x 480 px is 40 x 38 px)."""
 ALIKE_SHARE = 0.8
-"""Part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
+"""Least part of the gripper's pixels that an image must show as the others do; a shadow takes some."""
 MOST_DILUTION = 0.01
-"""Of a gain, by noise, which makes a slope less steep: over 100 grey levels between a finger's faces one grey level."""
+"""Largest relative error of a gain by noise, which flattens a slope: one grey level of 100 between a finger's faces."""
 _AROUND = np.ones((3, 3), np.uint8)
 _STEP = 3
 _ROUNDS = 3
@@ -43,11 +43,12 @@ _MAD = 1.4826
 
 @dataclass(frozen=True)
 class Matte:
-    """``mean`` (h, w) grey levels of what stays, ``scatter`` (h, w) its standard deviation over the images, robustly;
-    ``still`` (h, w): part of the gripper; ``noise``: usual scatter there, in grey levels of 0 to 255.
+    """The static pixels of images: ``mean`` (h, w) grey levels; ``scatter`` (h, w), their robust standard deviation over
+    the images; ``still`` (h, w), which pixels belong to the gripper; ``noise``, the usual scatter of these, in grey
+    levels of 0 to 255.
 
-    ``images`` (n, h, w) float32 at common grey levels, ``kept`` (n,) indices of those that were given, ``left_out``
-    why others weren't.
+    ``images`` (n, h, w) float32 at common grey levels, ``kept`` (n,) their indices among those given, ``left_out`` why
+    others weren't used.
     """
 
     mean: NDArray[np.float32]
@@ -60,7 +61,7 @@ class Matte:
 
 
 def grey_levels(image: Image) -> NDArray[np.float32]:
-    """An image as (h, w) float32 from 0 to 255, colour (blue first) as the measurement sees it."""
+    """An image as (h, w) float32 from 0 to 255; colour (blue first) is converted as in the measurement."""
     pixels = image.astype(np.float32) * np.float32(255.0 / full_scale(image))
     if pixels.ndim == 3:
         pixels = pixels @ GREY_BGR
@@ -68,15 +69,15 @@ def grey_levels(image: Image) -> NDArray[np.float32]:
 
 
 def smallest_noise(image: Image) -> float:
-    """What rounding alone makes of a pixel, in grey levels of 0 to 255."""
+    """Standard deviation of a pixel by rounding alone, in grey levels of 0 to 255."""
     return 255.0 * quantum(image) / full_scale(image) / 12.0**0.5
 
 
 def find_matte(
     images: Sequence[NDArray[np.float32]], least_noise: float, step: Callable[[], None] = lambda: None
 ) -> Matte:
-    """The matte of ``images`` (h, w) at one jaw opening.  Raises :class:`NoResultError`: too few alike, nothing changes
-    behind the gripper, or nothing stays.
+    """The matte of ``images`` (h, w) at one jaw opening.  Raises :class:`NoResultError` if too few are alike, nothing
+    changes behind the gripper, or nothing is static.
     """
     stack = np.stack(images)
     kept = np.arange(len(stack))
@@ -107,7 +108,7 @@ def find_matte(
 
 
 def sets_refused(counts: Sequence[int]) -> NoResultError:
-    """Of so many images each, that are not of one gripper."""
+    """The refusal of sets of images (``counts`` images each) that don't show one gripper."""
     said = " and ".join(map(str, counts))
     return NoResultError(
         f"the images fall into {len(counts)} sets, of {said}, in which different parts stay the same; images of one "
@@ -116,13 +117,13 @@ def sets_refused(counts: Sequence[int]) -> NoResultError:
 
 
 def image_sets(images: Sequence[NDArray[np.float32]], least_noise: float) -> list[list[int]]:
-    """Indices of images (h, w) in which the same stays, the largest set first: of several jaw openings, as a rule.
-    A set has :data:`FEWEST_IMAGES` at least; fewer that are unlike all others stay with some, whose matte names them.
+    """Indices of images (h, w) with the same static part, the largest set first; usually a set per jaw opening.  A set
+    has at least :data:`FEWEST_IMAGES`; fewer images unlike all others stay with a set, whose matte rejects them.
     """
     small = np.stack([image[:: _STEP + 1, :: _STEP + 1] for image in images])
     noise = _levelled(small, least_noise)[3]
     if len(images) > FEWEST_IMAGES:
-        # What is noise shows within a set: by the images most like one of them.
+        # The noise shows within a set: in one image and those most like it.
         alike = _alikeness(small, noise)
         core = np.argsort(-alike, axis=1)[:, : FEWEST_IMAGES - 1]
         first = int(np.take_along_axis(alike, core, axis=1).sum(axis=1).argmax())
@@ -131,8 +132,8 @@ def image_sets(images: Sequence[NDArray[np.float32]], least_noise: float) -> lis
 
 
 def _sets(small: NDArray[np.float32], noise: float) -> list[list[int]]:
-    """The same of images (n, h, w) at common grey levels: merged from the most alike on, but for two sets of enough
-    images each of which stays the same in places where the other one doesn't.
+    """The same for images (n, h, w) at common grey levels.  Merges the most similar first, but never two sets of enough
+    images, each of which is static in places where the other one isn't.
     """
     apart = 1.0 - _alikeness(small, noise)
     np.fill_diagonal(apart, 0.0)
@@ -152,7 +153,7 @@ def _sets(small: NDArray[np.float32], noise: float) -> list[list[int]]:
 
 
 def _differ(one: NDArray[np.float32], other: NDArray[np.float32], limit: float) -> bool:
-    """Whether more stays the same in each of two sets of images (n, p) than in both."""
+    """Whether each of two sets of images (n, p) has more static pixels than both together."""
     if min(len(one), len(other)) < FEWEST_IMAGES:
         return False
     least = min(_still_share(one, limit), _still_share(other, limit))
@@ -161,8 +162,8 @@ def _differ(one: NDArray[np.float32], other: NDArray[np.float32], limit: float) 
 
 
 def _alikeness(small: NDArray[np.float32], noise: float) -> Array:
-    """(n, n) part of two images (n, h, w) that is the same.  Backgrounds agree in a pixel here and there, by chance;
-    what stays does with those around it.
+    """Part (n, n) of two images (n, h, w) that is the same.  Backgrounds agree in single pixels by chance; static pixels
+    agree together with their neighbours.
     """
     alike = np.zeros((len(small), len(small)))
     for i, j in itertools.combinations(range(len(small)), 2):
@@ -172,7 +173,7 @@ def _alikeness(small: NDArray[np.float32], noise: float) -> Array:
 
 
 def _still_share(part: NDArray[np.float32], limit: float) -> float:
-    """Of the pixels (n, p) those that stay the same in all but a tenth of the images."""
+    """Part of the pixels (n, p) that stay the same in all but a tenth of the images."""
     last = max(int(0.9 * len(part)), 2)
     off = _partitioned(np.abs(part - _median(part)), last - 1)[..., last - 1]
     return float((off < limit).mean())
@@ -181,7 +182,7 @@ def _still_share(part: NDArray[np.float32], limit: float) -> float:
 def _statistics(
     stack: NDArray[np.float32], least_noise: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
-    """Mean, scatter, what is still, and noise; ``stack`` is brought to common grey levels, in place."""
+    """Mean, scatter, static pixels, and noise; adjusts ``stack`` to common grey levels, in place."""
     mean, scatter, still, noise = _levelled(stack, least_noise)
     share = float(still.mean())
     if share > MOST_STILL_SHARE:
@@ -201,7 +202,7 @@ def _statistics(
 def _levelled(
     stack: NDArray[np.float32], least_noise: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
-    """The same of each pixel alone."""
+    """The same, each pixel by itself."""
     quiet = None
     for _ in range(_ROUNDS):
         _level(stack, quiet)
@@ -214,7 +215,7 @@ def _levelled(
 
 
 def _level(stack: NDArray[np.float32], quiet: NDArray[np.bool_] | None) -> None:
-    """Gain and offset of each image so that the quiet pixels agree with their median, in place."""
+    """Adjust each image in place by a gain and an offset, so that the quiet pixels agree with their median."""
     small = stack[:, ::_STEP, ::_STEP].reshape(len(stack), -1)
     middle = _median(small)
     if quiet is None:
@@ -233,14 +234,14 @@ def _level(stack: NDArray[np.float32], quiet: NDArray[np.bool_] | None) -> None:
 
 
 def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
-    """Gain and offset that bring grey levels (p,) of an image to those of all images, robustly."""
+    """Robust gain and offset that adjust grey levels (p,) of an image to those of all images."""
     weight, gain, offset = np.ones(len(seen)), 1.0, 0.0
     for _ in range(6):
         total = float(weight.sum())
         centre = float(weight @ seen) / total, float(weight @ wanted) / total
         spread = float(weight @ np.square(seen - centre[0])) / total
         noise = _MAD * float(np.median(np.abs(gain * seen + offset - wanted)))
-        # Without a spread of grey levels only the product of the two is known: a gain it is.  Noise is no spread.
+        # Without a spread of grey levels, beyond noise, only one of the two can be determined: the gain.
         if spread > noise**2 / MOST_DILUTION:
             gain = float(weight @ ((seen - centre[0]) * (wanted - centre[1]))) / total / spread
             offset = centre[1] - gain * centre[0]
@@ -252,21 +253,21 @@ def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
 
 
 def _partitioned(values: NDArray[np.float32], kth: int) -> NDArray[np.float32]:
-    """Partitioned along the first axis, which becomes the last one: contiguous it takes a fraction of the time."""
+    """Partition along the first axis, which becomes the last: contiguous data takes a fraction of the time."""
     turned = np.ascontiguousarray(np.moveaxis(values, 0, -1))
     turned.partition(kth, axis=-1)
     return turned
 
 
 def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Along the first axis; the upper one of two middle values."""
+    """Median along the first axis; the upper of two middle values."""
     middle = len(values) // 2
     return np.asarray(_partitioned(values, middle)[..., middle])
 
 
 def _robust(stack: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Median and scatter (h, w) over images, by rows to save memory: the root mean square of the middle nine tenths of
-    the deviations tells background that seldom differs better than their median does.
+    """Median and scatter (h, w) over images, by rows to save memory.  The scatter is the root mean square of the
+    smallest nine tenths of the deviations, which detects background that seldom differs better than their median.
     """
     mean, scatter = np.empty_like(stack[0]), np.empty_like(stack[0])
     rows = max(1, int(4e6 / (stack.shape[0] * stack.shape[2])))
@@ -282,13 +283,13 @@ def _robust(stack: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
 def _noise(
     scatter: NDArray[np.float32], mean: NDArray[np.float32], clipped: NDArray[np.bool_], least_noise: float
 ) -> float:
-    """Scatter of the gripper's pixels: the mode of the small ones."""
+    """Scatter of the gripper's pixels: the first mode of the histogram of scatters."""
     usable = np.log(np.maximum(scatter[~clipped], 0.5 * least_noise))
     if not usable.size:
         return least_noise
     counts, ends = np.histogram(usable, bins=np.arange(np.log(0.4 * least_noise), np.log(128.0), 0.08))
     smooth = np.convolve(counts, np.ones(3), mode="same")
-    # The first mode that holds what the smallest fingertip would.
+    # The first mode with as many pixels as the smallest fingertip has.
     enough = smooth >= 0.25 * FEWEST_STILL_SHARE * scatter.size
     peaks = enough & (smooth >= np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1))
     first = int(np.flatnonzero(peaks)[0]) if peaks.any() else int(smooth.argmax())
@@ -296,7 +297,7 @@ def _noise(
 
 
 def _cleaned(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Without specks and holes: a background pixel may stay the same by chance, its neighbourhood doesn't."""
+    """Remove specks and holes: a background pixel may stay the same by chance, its neighbourhood doesn't."""
     mask = cv2.medianBlur(still.astype(np.uint8) * 255, 7)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel)
@@ -316,7 +317,7 @@ def _alike(
     still: NDArray[np.bool_],
     noise: float,
 ) -> Array:
-    """(n,) part of the gripper's pixels that each image shows as the others do."""
+    """Part (n,) of the gripper's pixels that each image shows as the others do."""
     inside = cv2.erode(still.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     inside = inside if inside.sum() > 100 else still
     limit = NOISE_FACTOR * np.maximum(scatter[inside], noise)

@@ -1,11 +1,11 @@
-"""What a gripper's edges look like in images at the reference calibration: the measuring half of ``gripmon teach``.
+"""How a gripper's edges look in images at the reference calibration: the measuring half of ``gripmon teach``.
 
-By definition the gripper stands in the teaching images at the reference, its jaws open as reported.  So the
-taught offsets hold everything by which the images differ from the sharp model there: bevels, shading and blur, but
-also what the reference and the reported opening are off by.  All of it cancels later, as it does for the method's own
-reference corners, which are measured in the reference image.  A reference or an opening that is off by more than its
-stated deviation and a plausible bevel allow is refused: it would be carried along, and the offsets' part along the
-line of sight, which can't be seen, would grow with it.
+By definition the gripper in the teaching images is at the reference, its jaws open as reported.  So the taught offsets
+contain everything in which the images differ from the sharp model there: bevels, shading and blur, but also the errors
+of the reference and of the reported opening.  All of it cancels later, as with the method's own reference corners,
+which are measured in the reference image.  A reference or an opening with a larger error than its stated standard
+deviation and a plausible bevel allow is refused: the error would persist, and with it would grow the offsets' part
+along the line of sight, which can't be measured.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdg
 T = TypeVar("T")
 
 SEEN_SHARE = 0.6
-"""Part of an edge's profiles that must show its line, in at least half of the images."""
+"""Least part of an edge's search lines that must show its line, in at least half of the images."""
 
 CLOSED_PX = 0.3
-"""How far the gripper may show from the reference when the images are measured again with what was taught; farther only
-if that measurement is as uncertain."""
+"""Largest distance of the gripper from the reference when the images are measured with what was taught; it may be
+larger only if that measurement is as uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Taught:
-    """What was learnt.  ``untaught``: for each other edge in view why not; ``notes``: what a person should know.
+    """What was learnt.  ``untaught``: for each other edge in view the reason; ``notes``: what a person should know.
 
-    ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most.
-    ``left_out``: the images that contradict the others, by their numbers, and why.
+    ``closure_px``: largest distance of the gripper from the reference when the images are measured with what was
+    taught.  ``left_out``: the images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -64,16 +64,16 @@ class Taught:
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
-        """Of what belongs to the images given that of those taught from."""
+        """Of one item per given image, those of the images taught from."""
         return [one for number, one in enumerate(images) if number not in self.left_out]
 
 
 def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> Taught:
     """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
 
-    Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
-    image alone a straight line of the background beside an outline may be taken for it.  An image that contradicts the
-    others is left out while most of them remain.
+    Several images with different backgrounds are averaged, and their scatter gives the standard deviations; in a single
+    image a straight line of the background next to an outline may be taken for it.  An image that contradicts the
+    others is left out as long as most of them remain.
     """
     assert images, "nothing to teach from"
     viewer = Viewer(rig, reference, images)
@@ -102,7 +102,7 @@ def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> Teac
 
 
 def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
-    """What these images teach; where that fails, an image that shows the gripper elsewhere is the likelier reason."""
+    """Teach from these images; if that fails, an image that shows the gripper displaced is the more likely reason."""
     try:
         return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
     except ImageRefused:
@@ -124,7 +124,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     notes = _notes(viewer, lines, len(images), doubt)
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
-    # Once more from where the edges really are: the profiles then lie even to both sides of them.
+    # Repeat with the search lines centred on the real edges.
     views = [viewer.view(view.image, None, arrays, view.candidates.zoom) for view in views]
     lines, lost = _lines(viewer, views, search=False)
     seen = {gripper.edge_ids[index]: one._asdict() for index, one in _appearances(viewer, views, lines).items()}
@@ -142,7 +142,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
 
 
 def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:
-    """Lines of all edges that some image samples, and why creases have none: outlines then come without a line."""
+    """Lines of all edges that some image samples, and why others have none; outlines are included without a line."""
     lines, untaught = {}, {}
     for edge in sorted({e for view in views for e in view.prediction.layout.edges.tolist()}):
         if viewer.gripper.edge_curved[edge]:
@@ -160,7 +160,7 @@ def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[in
 
 
 def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
-    """An edge's line in all images together and in each, or why there is none."""
+    """An edge's line in all images together and in each, or the reason why there is none."""
     points, expected_px = seen.points, seen.expected_px
     line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)
     if line is None:
@@ -178,7 +178,7 @@ def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
 
 
 def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
-    """How far the gripper shows from the reference in images that are measured with what they taught, px at most."""
+    """Largest distance (px) of the gripper from the reference in images measured with what they taught."""
     worst_px, refused_px = 0.0, 0.0
     refused: ImageRefused | None = None
     for image in images:
@@ -197,7 +197,7 @@ def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtE
 
 
 def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[str, TaughtCorner]:
-    """Where taught edges meet in the image: least squares of their offsets at the corner, weighted."""
+    """Where taught edges meet in the image: weighted least squares of their offsets at the corner."""
     gripper, camera = viewer.gripper, viewer.rig.camera
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     points_cam_m = points_grip_m @ viewer.ref_cam_T_grip[:3, :3].T + viewer.ref_cam_T_grip[:3, 3]
@@ -227,11 +227,11 @@ def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[
     return corners
 
 
-_LARGEST_CONDITION = 100.0  # edges that meet at less than some 10° make no corner
+_LARGEST_CONDITION = 100.0  # edges that meet at less than about 10° form no corner
 
 
 def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: str | None) -> tuple[str, ...]:
-    """What can be doubted about what was taught."""
+    """Doubts about what was taught."""
     notes = [] if doubt is None else [doubt]
     found = {index: edge.line for index, edge in lines.items() if edge.line is not None and not viewer.crease[index]}
     rivals = {index: line.rival_px for index, line in found.items() if line.rival_px is not None}
@@ -242,10 +242,10 @@ def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: s
 
 
 NEAR_PX, FAR_PX = 1.5, 3.0
-"""Where a side's grey level is taken: beyond the edge's blur, before the next feature (px, times the zoom)."""
+"""Range in which a side's grey level is taken: beyond the edge's blur, before the next feature (px, times the zoom)."""
 
 AGREEING_SHARE = 0.95
-"""Part of the edge points of all images that must have the same side brighter."""
+"""Least part of the edge points of all images that must have the same side brighter."""
 
 Side = Literal["left", "right", "any"]
 
@@ -259,7 +259,7 @@ class _Appearance(NamedTuple):
 
 
 class _Sides(NamedTuple):
-    """Grey levels (k,) to the left and to the right of an edge's points, their steps (k,) and images (k,)."""
+    """Grey levels (k,) left and right of an edge's points, their steps (k,) and images (k,)."""
 
     left: Array
     right: Array
@@ -270,7 +270,7 @@ class _Sides(NamedTuple):
 def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> dict[int, _Appearance]:
     """The appearance of all edges that have lines.
 
-    Levels count relative to the median over all edges of an image, which takes exposure out.
+    Levels are relative to the median over all edges of an image, which cancels the exposure.
     """
     sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
     gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
@@ -280,7 +280,7 @@ def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
         inside, crease = viewer.inside[index], viewer.crease[index]
         left = _look(side.left / gain) if crease or inside < 0.0 else None
         right = _look(side.right / gain) if crease or inside > 0.0 else None
-        # Beside an outline the background decides, and there are others than the teaching images'.
+        # Next to an outline the background decides, and it will differ from that of the teaching images.
         found[index] = _Appearance(_brighter(side.step) if crease else "any", left, right)
     return found
 
@@ -293,7 +293,7 @@ def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:
         candidate = points.candidate[inlier & (points.image == number)]
         found, grey = view.candidates, view.profiles
         sample, step = found.sample[candidate], found.step[candidate]
-        # Samples lie farther apart where the image is measured on a coarser scale, and edges are wider there.
+        # On a coarser scale the samples are farther apart, and edges are wider.
         middle = grey.shape[1] // 2 + found.offset_px[candidate] / (STEP_PX * found.zoom)
         near, far = NEAR_PX / STEP_PX, FAR_PX / STEP_PX
         levels = [_level(grey[sample], middle + side * near, middle + side * far) for side in (-1.0, 1.0)]
@@ -302,7 +302,7 @@ def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:
 
 
 def _level(grey: NDArray[np.float32], start: Array, end: Array) -> Array:
-    """(k,) mean of each row of ``grey`` (k, s) between two places on it, samples; NaN where they leave it."""
+    """Mean (k,) of each row of ``grey`` (k, s) between two positions on it, in samples; NaN where they leave it."""
     places = np.linspace(start, end, 4)
     low = np.floor(places).astype(int)
     outside = (low < 0) | (low + 1 >= grey.shape[1])

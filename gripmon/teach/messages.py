@@ -1,5 +1,5 @@
-"""What the teaching page and its server send each other: JSON, typed on the server's side.  Lengths in metres, angles
-in radians, image coordinates in px (centre of the first pixel: 0, 0), as everywhere.
+"""Messages between the teaching page and its server: JSON, typed on the server's side.  Lengths in metres, angles in
+radians, image coordinates in px (centre of the first pixel: 0, 0), as everywhere.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ Opening = Annotated[float, Meta(ge=0.0, le=0.5)]
 
 
 class BadRequest(ValueError):
-    """A request that can't be met; one line says why."""
+    """A request that can't be met; the text gives the reason in one line."""
 
 
 class SavingRefused(Exception):
-    """Nothing was written; one line says why."""
+    """Nothing was written; the text gives the reason in one line."""
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of what the page asks."""
+    """Base of the page's requests."""
 
 
 class Put(Request, frozen=True):
-    """Corners put by hand in one image; those ``by_hand`` count as they stand.  ``image`` None: what is live now."""
+    """Corners set by hand in one image; those ``by_hand`` are used as they are.  ``image`` None: the live image."""
 
     corners: Annotated[dict[str, Place], Meta(max_length=1000)]
     by_hand: Annotated[tuple[str, ...], Meta(max_length=1000)] = ()
@@ -41,7 +41,7 @@ class Put(Request, frozen=True):
 
 
 class SaveOrder(Request, frozen=True):
-    """What is to be written.  ``replace``: the person has agreed that files which are there are replaced."""
+    """What to write.  ``replace``: the person has agreed to replace existing files."""
 
     put: Put
     robot: Key
@@ -53,7 +53,7 @@ class SaveOrder(Request, frozen=True):
 
 
 class Nothing(Request, frozen=True):
-    """An order without particulars."""
+    """A request without parameters."""
 
 
 class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,7 +63,7 @@ class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the page begins with.  ``corners_only``: there is no gripper, nothing snaps; ``saves``: what can be saved;
+    """What the page starts with.  ``corners_only``: there is no gripper, nothing snaps; ``saves``: what can be saved;
     ``back``: where the page goes when the person is done.
     """
 
@@ -91,7 +91,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``model_px``: where the pose has it; the rest as in :class:`gripmon.teach.snapping.SnappedCorner`."""
+    """``model_px``: where the pose projects it; the rest as in :class:`gripmon.teach.snapping.SnappedCorner`."""
 
     name: str
     model_px: Place | None
@@ -103,11 +103,11 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
+    """Expected of one frame; vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
     ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
-    drift test notices; ``promise``: bounds on its error beside the alert limits, in words, ``reachable``: it keeps
-    them.  ``delay_frames``: after how many frames it notices a step of the TCP by 0.1 mm along x, y and z, None for
-    never.  ``recalibration``: why the corners in view give no new pose, None if they do.
+    drift test detects.  ``promise``: bounds on its error and the alert limits, as a text; ``reachable``: it keeps them.
+    ``delay_frames`` until the test detects a step of the TCP by 0.1 mm along x, y and z, None for never.
+    ``recalibration``: why the corners in view give no new pose, None if they do.
     """
 
     edges: int
@@ -133,7 +133,7 @@ class ReferenceReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """What follows from corners put by hand."""
+    """What follows from corners set by hand."""
 
     corners: tuple[CornerReply, ...]
     outlines_px: dict[str, tuple[Place, ...]]
@@ -148,8 +148,8 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Saved(msgspec.Struct, frozen=True, kw_only=True):
-    """``refused``: why nothing was written; ``exists``: files in the way, nothing was written then either; else
-    ``written`` (path: what it is, in words), ``notes`` and the command that comes ``next``.
+    """``refused``: why nothing was written; ``exists``: files in the way, for which nothing was written either;
+    otherwise ``written`` (path: what it is, as a text), ``notes`` and the ``next`` command.
     """
 
     refused: str | None = None
@@ -164,7 +164,7 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def encoded(image: Image, ending: str) -> bytes:
-    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
+    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits, more are scaled to the image's own range."""
     grey = image
     if image.dtype != np.uint8:
         low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()

@@ -1,9 +1,9 @@
-"""Where outlines of two fingers lie in space, by how they move with the jaws: for fingers that are tapered or curved.
+"""Outlines of two fingers in space, from their motion with the jaws: for fingers that are tapered or curved.
 
-A point moves by ``T / depth`` in the image where its finger moves by T (camera turned neither way), so that each piece
-of the outline across that motion tells its depth; along straight edges the inverse depth is linear in the image.  Taken
-for granted: both fingers move equally far, against each other, along the line between them.  What moves along
-itself, as an edge across the jaws does, tells nothing; it lies near the plane of the rest.
+Where a finger moves by T (camera not turned), a point of it moves by ``T / depth`` in the image.  So each piece of the
+outline across that motion shows its depth; along straight edges the inverse depth is linear in the image.  Assumption:
+both fingers move equally far, in opposite directions, along the line between them.  Edges that move along themselves,
+such as those across the jaws, show no depth; they are placed near the plane of the rest.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from gripmon.teach.silhouette import Stations, in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX
 
 UNLIKE = 0.2
-"""Sum of both fingers' motions over their difference, at most: jaws of which one is fixed have 1, tips at different
-depths that move alike some hundredths."""
+"""Largest sum of both fingers' motions over their difference: jaws of which one is fixed have 1, tips at different
+depths that move alike a few hundredths."""
 OFF_PLANE = 0.05
-"""Standard deviation of an outline's points from one plane, over their distance: half of a finger 10 mm thick, 100 mm
+"""Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
 away."""
 INDEPENDENT_PX = 4.0
-"""Neighbouring edge points err together: one in so many px counts (as where chains are split)."""
+"""Neighbouring edge points have correlated errors: one per this length counts (as where chains are split)."""
 TIP = 0.1
-"""Of a finger's length: its tip."""
+"""Part of a finger's length that is its tip."""
 _TURNS = 8
 _ROUGHLY_PX = 30
-"""Where the border of what stays is searched for, each way, before it is measured."""
+"""Range, each way, in which the border of what is static is searched for before it is measured."""
 _PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
-"""Of a finger's length from its tip on: how far each moved is where the search begins."""
+"""Parts of a finger's length, from its tip, whose motions start the search."""
 
 
 @dataclass
 class _Unknowns:
-    """Inverse depth ``q`` (v,) of all fingers' vertices, finger after finger; ``shift`` (o, 2): half of how far the
-    tips move apart to each opening, x and y, at unit depth; ``slope_sigma`` (fingers, 2) of q's slopes over x and y.
+    """Inverse depth ``q`` (v,) of all fingers' vertices, finger after finger; ``shift`` (o, 2): half of the tips'
+    relative motion to each opening, x and y, at unit depth; ``slope_sigma`` (fingers, 2): of q's slopes over x and y.
     """
 
     q: Array
@@ -58,8 +58,8 @@ def place_by_motion(
     around: Sequence[OpeningSeen],
     pose: tuple[Array, Array] | None,
 ) -> Placed | None:
-    """Two fingers in space; with ``pose``, the rotation (3, 3) and the TCP (3,) at unit depth, where a calibration has
-    them.  None where the openings don't tell: another number of fingers, or they don't move against each other.
+    """Two fingers in space; with ``pose``, the rotation (3, 3) and the TCP (3,) at unit depth, as a calibration has
+    them.  None where this can't be determined: not two fingers, or fingers that don't move against each other.
     """
     if len(fingers) != 2 or not around:
         return None
@@ -83,7 +83,7 @@ def place_by_motion(
 
 
 def _roughly(finger: Outline, shift: Array, of_parts: Array) -> Array:
-    """Inverse depths (v,): by how far its parts moved (p, 2) where its tip moved by ``shift`` (2,), linear along it."""
+    """Inverse depths (v,), linear along the finger, from its parts' motions (p, 2) over the tip's ``shift`` (2,)."""
     middles = [0.5 * (near + far) for near, far in _PARTS]
     by_part = of_parts @ shift / float(shift @ shift)
     slope, at_tip = np.polyfit(middles, by_part, 1)
@@ -102,7 +102,7 @@ def _tips(finger: Outline) -> NDArray[np.intp]:
 
 
 def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
-    """Way (3,) from the first finger to the other, which look alike."""
+    """Vector (3,) from the middle of the first finger to that of the other, which looks alike."""
     middles = []
     for finger, of_finger in zip(fingers, q, strict=True):
         points, ends = _rays(finger) / of_finger[:, None], np.reshape(finger.pieces, (-1, 2))
@@ -113,14 +113,14 @@ def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
 def _solve(
     camera: Camera, fingers: Sequence[Outline], seen: OpeningSeen, around: Sequence[OpeningSeen], half: Array, q: Array
 ) -> _Unknowns | None:
-    """Gauss and Newton, measured again in each turn."""
+    """Gauss-Newton with a new measurement in each iteration."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     count, openings = int(first[-1]), len(around)
     size = count + 3 * len(fingers) + 2 * openings
     shift, sigma, rise = half, np.zeros((2, 2)), np.zeros(2)
     for turn in range(_TURNS):
         way = _between(fingers, [q[first[k] : first[k + 1]] for k in range(2)])
-        # Motion that rises makes the depths that are found fall by as much: half of it is where both agree.
+        # A motion with a slope in depth lowers the depths found by the same slope: half of it makes both agree.
         rise = 0.5 * (rise + way[2] * way[:2] / float(way[:2] @ way[:2]))
         rows, values = _expected(fingers, first, q, size)
         for o, other in enumerate(around):
@@ -148,14 +148,14 @@ def _solve(
 
 
 def _slope_sigma(finger: Outline, covariance: Array) -> Array:
-    """Of the inverse depths' slopes over x and y (2,), from their covariance (v, v)."""
+    """Standard deviations (2,) of the slopes of the inverse depths over x and y, from their covariance (v, v)."""
     slopes = np.linalg.pinv(np.column_stack([np.ones(len(finger.xy)), finger.xy]))[1:]
     return np.asarray(np.sqrt(np.diag(slopes @ covariance @ slopes.T)))
 
 
 def _expected(fingers: Sequence[Outline], first: Array, q: Array, size: int) -> tuple[list[Array], list[Array]]:
-    """Rows on the steps to come: inverse depths near a plane of each finger (its constant and slopes follow them among
-    the unknowns), 1 in the mean.
+    """Prior rows on the next step: inverse depths near a plane of each finger (whose constant and slopes are unknowns,
+    too), with mean 1.
     """
     count = int(first[-1])
     row, value = np.zeros((count, size)), np.zeros(count)
@@ -182,8 +182,8 @@ def _measured(
     rise: Array,
     roughly: bool,
 ) -> tuple[Array, Array, Array] | None:
-    """How the edge points of a finger at another opening depend on its inverse depths (n, v) and on the shift (n, 2),
-    and how far they are from where they were expected (n,); each over its standard deviation.
+    """Derivatives of a finger's edge points at another opening by its inverse depths (n, v) and by the shift (n, 2),
+    and their offsets (n,) from the prediction; each over its standard deviation.
     """
     pieces = np.reshape(finger.pieces, (-1, 2))
     share = np.tile(np.linspace(0.03, 0.97, STATIONS), len(pieces))[:, None]
@@ -222,7 +222,7 @@ def _measured(
 
 
 def _border(still: NDArray[np.bool_], stations: Stations) -> Array:
-    """How far (n,) along the normals what stays ends, nearest to the stations, whole pixels; infinite where nowhere."""
+    """Distance (n,) along the normals to the nearest end of what is static, whole pixels; infinite without one."""
     steps = np.arange(-_ROUGHLY_PX, _ROUGHLY_PX + 1)
     at = np.rint(stations.uv_px[:, None] + steps[:, None] * stations.normal[:, None]).astype(int)
     at = np.clip(at, 0, np.array(still.shape[::-1]) - 1)
@@ -233,7 +233,7 @@ def _border(still: NDArray[np.bool_], stations: Stations) -> Array:
 
 
 def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Array] | None) -> Placed:
-    """With axes: x as the jaws move, z along the fingers."""
+    """The result, with axes: x as the jaws move, z along the fingers."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     q = [found.q[first[k] : first[k + 1]] for k in range(len(fingers))]
     points = [_rays(f) / qf[:, None] for f, qf in zip(fingers, q, strict=True)]
@@ -251,7 +251,7 @@ def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Arr
         tcp = tcp + along * (max(float((p @ along).max()) for p in points) - float(along @ tcp))
     else:
         rotation, tcp = pose
-        # As far out as the TCP.
+        # The outermost point lies as far out as the TCP.
         scale = float(rotation[:, 2] @ tcp) / max(float((p @ rotation[:, 2]).max()) for p in points)
         points = [p * scale for p in points]
     points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
@@ -261,7 +261,7 @@ def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Arr
 
 
 def _along(finger: Outline, points: Array) -> Array:
-    """Unit way (3,) along a finger: its long sides', so that a taper is the same to both sides."""
+    """Unit vector (3,) along a finger: the mean of its long sides, so that a taper is symmetric to it."""
     total = np.zeros(3)
     for (a, b), length in zip(finger.pieces, finger.length_px.tolist(), strict=True):
         way, shown = points[b] - points[a], finger.xy[b] - finger.xy[a]

@@ -31,8 +31,8 @@ _INK, _FAINT, _PAPER, _MARK, _NOTHING = (20, 20, 20), (95, 95, 95), (255, 255, 2
 
 
 class _Map(NamedTuple):
-    """A heat map: a value for each trial (r, c), NaN for none, how to write it, and what of it is coloured: more is
-    better.
+    """A heat map: ``values`` for each trial (r, c), NaN for none, ``digits`` to write them with, and ``goodness``, which
+    is coloured: more is better.
     """
 
     title: str
@@ -80,7 +80,7 @@ def draw_sweep(
 
 
 def encoded(picture: Pictures.Image, suffix: str) -> bytes:
-    """The picture in the format that a file's ending says, ``.png``, ``.jpg`` or ``.jpeg``."""
+    """The picture in the format given by a file's ending, ``.png``, ``.jpg`` or ``.jpeg``."""
     out = BytesIO()
     picture.save(out, "PNG" if suffix.lower() == ".png" else "JPEG", quality=82)
     return out.getvalue()
@@ -145,7 +145,7 @@ def _geometry(rows: list[list[Trial]], left: int) -> tuple[int, int, float]:
 
 
 def _mark(draw: ImageDraw.ImageDraw, trial: Trial, rows: list[list[Trial]], left: int, star: bool) -> None:
-    """A star or a ring where a mount lies in the map, between cells if need be; nothing beyond the map."""
+    """Draw a star or a ring where a mount lies in the map, also between cells; nothing outside of the map."""
     along = _index(np.array([t.mount.distance_m for t in rows[0]]), trial.mount.distance_m)
     up = _index(np.array([row[0].mount.tilt_rad for row in rows[::-1]]), trial.mount.tilt_rad)
     if along is None or up is None:
@@ -162,7 +162,7 @@ def _mark(draw: ImageDraw.ImageDraw, trial: Trial, rows: list[list[Trial]], left
 
 
 def _index(ascending: Array, value: float) -> float | None:
-    """Position between ascending values, half a step beyond them at most."""
+    """Position among ascending values, interpolated; None beyond them by more than a quarter of a step."""
     if len(ascending) == 1:
         return 0.0 if math.isclose(value, ascending[0], rel_tol=1e-6) else None
     slack = 0.25 * min(ascending[1] - ascending[0], ascending[-1] - ascending[-2])
@@ -175,7 +175,7 @@ def _seen(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Pictures.Image
     """A simulated image with the corners marked: visible ones green, others red."""
     try:
         finger_solids(rig.gripper)
-    except ValueError:  # a gripper that was inferred from images has edges alone
+    except ValueError:  # a gripper inferred from images has only edges
         grey = _edges(rig, trial, jaw_opening_m)
     else:
         grey = _simulated(rig, trial, jaw_opening_m)
@@ -209,7 +209,7 @@ def _edges(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
     thickness = max(round(camera.width_px / 250), 1)
     for outline_m in gripper.outlines_m(points_m, np.arange(len(gripper.edge_ids)), 50, trial.cam_T_grip[:3, :3]):
         uv = camera.project(outline_m)
-        # What lies far outside of the image overflows OpenCV's integers.
+        # Points far outside of the image overflow OpenCV's integers.
         seen = np.all(np.isfinite(uv) & (np.abs(uv) < 1e5), axis=1)
         whole = np.rint(np.where(seen[:, None], uv, 0.0)).astype(int).tolist()
         for k in np.flatnonzero(seen[:-1] & seen[1:]):
@@ -218,7 +218,7 @@ def _edges(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
 
 
 def _caption(trial: Trial) -> list[tuple[str, tuple[int, int, int]]]:
-    """At most four lines, and their colours."""
+    """At most four lines, with their colours."""
     sight, travel = trial.sight, f"{100.0 * trial.share:.0f} % of the jaw's travel"
     lines = [(f"{sight.corners} corners, {sight.edges} edges; {travel}", _FAINT)]
     if trial.measurable is not None:
@@ -230,7 +230,7 @@ def _caption(trial: Trial) -> list[tuple[str, tuple[int, int, int]]]:
 
 
 def _degrees(angle_rad: float) -> str:
-    """Without a minus before nought."""
+    """In whole degrees, without a minus sign before zero."""
     return f"{round(math.degrees(angle_rad)) + 0}°"
 
 

@@ -1,5 +1,5 @@
-"""Camera mounts by numbers that a person with a drill can set (distance, tilt, side, roll), and what the monitor would
-see from each of a grid of them: before a hole is drilled.
+"""Camera mounts, described by numbers that can be set up with a drill (distance, tilt, side, roll), and what the monitor
+would see from each mount of a grid: before a hole is drilled.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from gripmon.teach.accuracy import AccuracyForecast, Promise, forecast_frame
 from gripmon.teach.visibility import Rig, Sight, border, moved_camera, see, sideways_m
 
 OPENINGS = 25
-"""Openings over the jaw's travel at which a mount's view is checked."""
+"""Number of openings over the jaw's travel at which a mount's view is checked."""
 
 ACCURACY_OPENINGS = 3
-"""Of them those at which accuracy and shifts are computed, beside the usual one."""
+"""Number of these at which accuracy and shifts are computed, besides the usual opening."""
 
 
 class Mount(NamedTuple):
-    """Where a camera is against the gripper.
+    """Pose of a camera against the gripper, but for where in the image the TCP is.
 
     ``distance_m`` from the camera's centre to the TCP.  ``tilt_rad`` (0 to pi) between the camera's optical axis and
-    the gripper's z axis: 0 looks along the fingers.  ``side_rad``: on which side of the gripper the camera sits,
+    the gripper's z axis: 0 looks along the fingers.  ``side_rad``: the side of the gripper on which the camera is,
     counted about the gripper's z axis: 0 at -y, +pi/2 at +x; without tilt it has no meaning and is 0.  ``roll_rad``
-    about the optical axis: by how much the picture is turned clockwise.
+    about the optical axis: the angle by which the picture is turned clockwise.
 
     The rotation is ``cam_R_grip = Rz(roll) Rx(tilt) Rz(-side)``.
     """
@@ -50,7 +50,7 @@ class Mount(NamedTuple):
 
     @classmethod
     def of(cls, cam_T_grip: Array) -> Mount:
-        """The mount that a pose (4, 4) is; what it leaves out is where in the image the TCP shows."""
+        """The mount of a pose (4, 4); it doesn't include where in the image the TCP is."""
         rotation = cam_T_grip[:3, :3]
         tilt = math.atan2(math.hypot(rotation[2, 0], rotation[2, 1]), rotation[2, 2])
         if math.sin(tilt) < 1e-6:
@@ -76,9 +76,9 @@ def towards(camera: Camera, uv_px: tuple[float, float]) -> Array:
 
 
 def with_focal(camera: Camera, focal_px: float) -> Camera:
-    """The same sensor behind a lens of another focal length, without distortion: that of a lens that isn't calibrated
-    isn't known.  (A fisheye stays one: its ideal form has all coefficients zero.)  At the focal length that the camera
-    has it is the calibrated lens.  ValueError for an impossible focal length.
+    """The same sensor behind a lens of another focal length, without distortion, since that of an uncalibrated lens is
+    unknown.  (A fisheye lens remains one: in its ideal form all coefficients are zero.)  At the camera's own focal length
+    it is the calibrated lens.  ValueError for an impossible focal length.
     """
     settings = camera.settings
     if math.isclose(focal_px, settings.fx_px, rel_tol=1e-9):
@@ -94,7 +94,7 @@ def with_focal(camera: Camera, focal_px: float) -> Camera:
 
 
 def field_of_view_rad(camera: Camera) -> float:
-    """The angle that the image's middle row spans, with the lens's distortion; NaN where the lens ends before."""
+    """The angle that the image's middle row spans, with the lens's distortion; NaN where the lens doesn't reach it."""
     row = 0.5 * (camera.height_px - 1.0)
     ends = camera.undistort(np.array([[0.0, row], [camera.width_px - 1.0, row]]))
     left, right = np.column_stack([ends, np.ones(2)])
@@ -103,7 +103,7 @@ def field_of_view_rad(camera: Camera) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """All combinations are tried.  ``rigs`` differ in their lens; ``towards`` (one for each): where the TCP shows."""
+    """All combinations to try.  ``rigs`` differ in their lens; ``towards`` (one for each): direction of the TCP."""
 
     distances_m: tuple[float, ...]
     tilts_rad: tuple[float, ...]
@@ -117,7 +117,7 @@ class Grid:
         return math.prod(map(len, axes))
 
     def mounts(self) -> Iterator[tuple[Mount, int]]:
-        """Mount and number of its lens."""
+        """Each mount with the number of its lens."""
         lenses = range(len(self.rigs))
         for k, *angles, distance_m in itertools.product(
             lenses, self.rolls_rad, self.sides_rad, self.tilts_rad, self.distances_m
@@ -126,7 +126,7 @@ class Grid:
 
 
 class Fault(NamedTuple):
-    """Why a mount would not work: ``kind`` in general, ``text`` with its numbers."""
+    """Why a mount would not work: ``kind`` without numbers, ``text`` with them."""
 
     kind: str
     text: str
@@ -134,13 +134,14 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Measurable:
-    """Of a mount from which the monitor can measure at the usual opening, all there unless stated otherwise.
+    """Results for a mount from which the monitor can measure at the usual opening; all for that opening unless stated
+    otherwise.
 
-    ``frame``: the accuracy of one.  ``worst_sigma_m``: standard deviation of the TCP along its least certain direction,
-    the largest at some openings, ``worst_at_m``.  ``promise`` of a frame; ``smallest`` (6,) steps that are noticed,
-    ``delay_frames`` for a step of the TCP by the policy's ``warn_m`` along the worst axis (None: never noticed);
-    ``margin_px`` of the visible corners from the border; ``shift_m`` that the camera may shift sideways until the
-    monitor can't measure, infinite for any.
+    ``frame``: the accuracy of one frame.  ``worst_sigma_m``: standard deviation of the TCP along its least certain
+    direction, the largest over some openings, found at ``worst_at_m``.  ``promise`` of a frame; ``smallest`` (6,) steps
+    that are detected; ``delay_frames`` to detect a step of the TCP by the policy's ``warn_m`` along the worst axis
+    (None: never); ``margin_px`` of the visible corners to the border; ``shift_m``: sideways shift of the camera up to
+    which the monitor can measure, infinite for any.
     """
 
     frame: AccuracyForecast
@@ -157,9 +158,9 @@ class Measurable:
 class Trial:
     """What the monitor would see from one mount.
 
-    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,) at ``openings_m`` (n,), ``share`` of these openings at
-    which the monitor can measure; ``measurable`` None where it can't at the usual one.  ``faults``: why this mount
-    would not work, the gravest first; none if it would.
+    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,): their numbers at ``openings_m`` (n,); ``share``: part of
+    these openings at which the monitor can measure; ``measurable`` None where it can't at the usual one.  ``faults``: why
+    this mount would not work, the most serious first; empty if it would.
     """
 
     mount: Mount
@@ -179,12 +180,12 @@ class Trial:
 
     @property
     def noticed_m(self) -> float:
-        """The smallest step of the TCP that is noticed along every axis; infinite where nothing can be measured."""
+        """The smallest step of the TCP that is detected along every axis; infinite where nothing can be measured."""
         return float("inf") if self.measurable is None else float(self.measurable.smallest[:3].max())
 
     @property
     def rank(self) -> tuple[float, ...]:
-        """Smaller is better: first what works, then what has more of the jaw's travel, then what notices more."""
+        """Sort key, smaller is better: first mounts that work, then more of the jaw's travel, then smaller steps."""
         return (0.0, 0.0, self.noticed_m) if self.works else (1.0, -self.share, self.noticed_m)
 
 
@@ -196,8 +197,8 @@ def try_mount(
     jaw_opening_m: float | None,
     travel_m: tuple[float, float] | None = None,
 ) -> Trial:
-    """The view from one mount; ``jaw_opening_m`` is the usual one, None for a gripper without jaw.  ``travel_m``: the
-    jaw's travel that counts, all of it if None.
+    """The view from one mount.  ``jaw_opening_m`` is the usual one, None for a gripper without jaw; ``travel_m``: the
+    part of the jaw's travel that counts, all if None.
     """
     gripper = rig.gripper
     usual_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
@@ -229,13 +230,13 @@ def try_mount(
 
 
 def tried(grid: Grid, jaw_opening_m: float | None, travel_m: tuple[float, float] | None = None) -> Iterator[Trial]:
-    """Every mount of a grid, one after the other."""
+    """Try every mount of a grid, one after the other."""
     for mount, k in grid.mounts():
         yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m, travel_m)
 
 
 def _measurable(rig: Rig, cam_T_grip: Array, usual_m: float, sight: Sight, openings_m: list[float]) -> Measurable:
-    """With the worst standard deviation of the usual and more ``openings_m``."""
+    """The results, with the worst standard deviation over the usual opening and ``openings_m``."""
     policy = rig.settings.policy
     frame, nearest = forecast_frame(rig, cam_T_grip, usual_m), border(rig, sight)
     assert nearest is not None, "enough in view has corners in view"
@@ -273,7 +274,7 @@ def _too_little_in_view(openings_m: Array, sights: list[Sight], sight: Sight) ->
 
 
 def _after_a_shift(rig: Rig, cam_T_grip: Array, openings_m: list[float]) -> tuple[Fault, ...]:
-    """Whether a camera that has shifted sideways by the policy's limit, either way, sees too little."""
+    """Whether a camera shifted sideways by the policy's limit, in any direction along an axis, sees too little."""
     limit_m = rig.settings.policy.limit_m
     for axis in (*np.eye(6)[:2], *-np.eye(6)[:2]):
         moved = moved_camera(cam_T_grip, limit_m * axis)
@@ -286,7 +287,7 @@ def _after_a_shift(rig: Rig, cam_T_grip: Array, openings_m: list[float]) -> tupl
 
 
 def _inexact(rig: Rig, found: Measurable, usual_m: float) -> tuple[Fault, ...]:
-    """Whether what is measured would never be valid, or leave no way back past the limit."""
+    """Whether no measured transform would be valid, or recalibration past the limit would be impossible."""
     faults, settings, gripper = [], rig.settings, rig.gripper
     if not found.promise.reachable:
         where = f" at {1e3 * usual_m:.1f} mm of opening" if gripper.has_jaw else ""

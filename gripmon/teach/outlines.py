@@ -1,8 +1,8 @@
-"""Fingertips of a gripper that isn't known: how their corners are named, which edges meet in them, and the gripper file
-that follows.
+"""Fingertips of an unknown gripper: how their corners are named, which edges meet in them, and the resulting gripper
+file.
 
-Names are FINGER_POINT.  FINGER is ``left`` or ``right``: the gripper's x axis points from left to right.  POINT is,
-seen with the left finger on the left in the image (turn the image in mind if it isn't):
+Names are FINGER_POINT.  FINGER is ``left`` or ``right``: the gripper's x axis points from left to right.  POINT is, with
+the left finger on the left in the image (imagine the image turned if it isn't):
 
     inner_near, inner_far   where the fingertip's contact face ends on the other finger's side; near is the upper one
                             in the image, far the lower one
@@ -58,8 +58,8 @@ class Outline:
 
 
 def outlines_of(rough: Mapping[str, tuple[float, float]]) -> Outline:
-    """The outlines of both fingertips from rough corners by name.  :class:`CalibrationError` for names that are none,
-    or too few of them.
+    """The outlines of both fingertips from rough corners by name.  :class:`CalibrationError` for unknown names, or too
+    few of them.
     """
     known = [f"{finger}_{kind}_{side}" for finger in FINGERS for kind in POINTS for side in SIDES]
     strange = [name for name in rough if name not in known]
@@ -97,8 +97,8 @@ def _edges_of(finger: str, rough: Mapping[str, tuple[float, float]]) -> list[tup
 
 
 def points_in_gripper(camera: Camera, outline: Outline, uv_px: Array, cam_T_grip: Array) -> Array:
-    """The outline's points (p, 3) in the gripper's frame: in the contact plane z = 0, but those on rising edges where
-    their line of sight passes nearest to the parallel of z through the corner that they rise from.
+    """The outline's points (p, 3) in the gripper's frame: in the contact plane z = 0; those on rising edges where their
+    line of sight is nearest to the parallel of z through the corner from which the edge rises.
     """
     xy = camera.undistort(uv_px)
     eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
@@ -122,7 +122,7 @@ def inferred_model(
 ) -> GripperModel:
     """The gripper file for ``points_m`` (p, 3), the outline's points in the gripper's frame.
 
-    With a range of the jaw both fingers move by half of it; ``jaw_opening_m`` is what the robot reports for these
+    With a range of the jaw each finger moves by half of it; ``jaw_opening_m`` is what the robot reports for these
     coordinates, the distance between the fingers if None.  :class:`CalibrationError` for an opening out of its range.
     """
     jaw = None
@@ -156,7 +156,7 @@ def inferred_model(
 
 
 def _edge_name(outline: Outline, a: int, b: int) -> str:
-    """By what lies at its outer end: left_inner, left_near (the side's edge), left_rise_near and so on."""
+    """Name by the point at its outer end: left_inner, left_near (the side's edge), left_rise_near and so on."""
     finger, kind_a, side_a = outline.names[a].split("_")
     _, kind_b, side_b = outline.names[b].split("_")
     if side_a != side_b:
@@ -214,7 +214,7 @@ def measure_known(
     jaw_opening_m: float | None,
     wanted: Mapping[str, object] | None = None,
 ) -> tuple[FingerCorners, dict[str, str]]:
-    """The corners of a known gripper about an expected pose, all or the ``wanted`` ones, and why others are missing.
+    """The corners of a known gripper near an expected pose, all or the ``wanted`` ones, and why others are missing.
 
     Raises :class:`CalibrationError` where the gripper isn't seen.
     """

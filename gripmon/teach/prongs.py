@@ -1,4 +1,4 @@
-"""Fingers that hang together in the image, by a palm: told apart by how they move with the jaw's opening."""
+"""Fingers that are connected in the image, by a palm: separated by how they move with the jaw's opening."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from gripmon.teach.image_outline import OpeningSeen, outwards_from, see_parts
 from gripmon.teach.matte import FEWEST_STILL_SHARE
 
 _STEP_PX = 4
-"""Between places where a part is cut across: half of what the shortest edge is long."""
+"""Distance between cuts across a part: half the length of the shortest edge."""
 ABOUT_AS_LARGE = 0.85
-"""A finger may lose so much to a cut that runs across both of them, and not along their body."""
+"""A cut may take this much less from the largest small part found, so that it runs across both fingers, not along their
+body."""
 _TURN_RAD, _TURN_STEP_RAD = math.radians(30.0), math.radians(3.0)
-"""Between the way to a part's farthest point and the cut: by up to 30 degrees with two fingers as long as they are
-apart; a step of 3 degrees is 4 px on a finger 80 px wide."""
+"""Largest angle between the direction to a part's farthest point and the normal of the cut: 30 degrees for two fingers
+as long as they are apart; a step of 3 degrees is 4 px on a finger 80 px wide."""
 
 
 def apart_by_motion(camera: Camera, seen: OpeningSeen, around: Iterable[OpeningSeen]) -> OpeningSeen | None:
-    """What the images show with the prongs of its parts as fingers, where these move against each other from one
-    opening to another, and the body that joins them left out; None where none do.
+    """The images' result with the prongs of its parts as fingers, where these move against each other from one opening
+    to another, and without the body that joins them; None where none do.
     """
     others = list(around)
     parts, ways, found = [], [], False
@@ -52,8 +53,8 @@ def _against_each_other(own: list[NDArray[np.bool_]], ways: list[Array], seen: O
 
 
 def prongs(mask: NDArray[np.bool_], outwards: Array) -> list[NDArray[np.bool_]]:
-    """Parts into which a mask falls where it is cut straight across, about square to ``outwards`` (2,): by the shortest
-    of all cuts that leave the smallest part about as large as can be; itself alone where it is one everywhere.
+    """Parts into which a mask is divided by a straight cut about square to ``outwards`` (2,): the shortest of all cuts
+    that leave the smallest part about as large as possible; the mask alone where no cut divides it.
     """
     small = mask[::_STEP_PX, ::_STEP_PX]
     at = np.indices(small.shape)[::-1].transpose(1, 2, 0)

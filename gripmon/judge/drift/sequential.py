@@ -244,7 +244,9 @@ class SequentialTest:
         self._surge += rate * (np.minimum(normalised / 6.0, LARGEST_SQUARE) - self._surge)
 
     def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
-        """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over the normal one."""
+        """Follow, relative to the normal value, the size that one in a hundred differences (k, s) exceeds (Robbins and
+        Monro).
+        """
         share = np.minimum(LEARN_EVERY / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
         beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
