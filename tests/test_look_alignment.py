@@ -67,7 +67,8 @@ def random_patches(rng: np.random.Generator, patches: int = 12, pixels: int = 36
     values[2] = rng.uniform(0.0, 255.0, pixels)
     values[3, 4] = np.nan  # partly outside the image
     weight[4] = 0.0
-    return values, mean, weight, jacobian, np.array([0.0] * 6 + [1e2])
+    known = np.array([0.0] * 6 + [0.05])
+    return values, mean, weight, jacobian, np.array([0.0] * 6 + [1e2]), known
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -27,8 +27,11 @@ from gripmon.model.records import (
     ReferenceRecord,
     Severity,
 )
+from gripmon.monitor.answers import gripper_astray
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.standing import Standing
+from gripmon.monitor.weigher import swinging
+from gripmon.track.edges import agreeing_fingers
 from gripmon.track.look import (
     BLOCK_PX,
     GripperLook,
@@ -49,10 +52,13 @@ what they grasp for seconds or a minute.
 
 
 class _Pending(NamedTuple):
-    """A frame that may be learnt: its image, pose (4, 4), opening, times, and what the look measured in it."""
+    """A frame that may be learnt: its image, pose (4, 4), covariance (6, 6) of the edges' errors that are others before
+    another background, opening, times, and what the look measured in it.
+    """
 
     image: Image
     cam_T_grip: Array
+    of_background: Array
     jaw_opening_m: float | None
     now_s: float
     stamp_ns: int
@@ -73,14 +79,17 @@ class FinerLook:
         reference: ReferenceRecord,
         edges: str = "",
     ):
-        self._names, self._has_jaw = gripper.finger_ids, gripper.has_jaw
+        self._gripper = gripper
         self._look, self._floor, self._edges = look, floor, edges
         self._reference = reference
         self._alignment = LookAlignment(camera, gripper)
         self._fusion = LookFusion(float(np.linalg.norm(gripper.points_grip_m(None), axis=1).mean()))
         self._pending: _Pending | None = None
         self._behind: NDArray[np.float32] | None = None
-        self._since_s = np.full(len(self._names) + 1, np.inf)  # each finger, and all of it
+        self._last_T: Array | None = None
+        self.swing: Array = np.zeros(6)
+        """(6,) variance of the way between one refined pose and the next, m² and rad²."""
+        self._since_s = np.full(len(gripper.finger_ids) + 1, np.inf)  # each finger, and all of it
         self._since_ns: list[int | None] = [None] * len(self._since_s)
         self._due: list[Alert] = []
         self._number, self._origin, self._reported = 1, "start", False
@@ -118,23 +127,32 @@ class FinerLook:
         self._since_ns = list(record.different_since_ns)
         self._since_s = np.array([np.inf if since is None else 0.0 for since in self._since_ns])
 
-    def refine(self, frame: Frame, standing: Standing, now_s: float) -> Standing:
+    def refine(self, frame: Frame, standing: Standing, now_s: float, swing: Array) -> Standing:
         """The same with the pose as edges and look have it together, and bounds that are by as much wider as that is
-        from the edges'; unchanged where the look has nothing to say, or contradicts them.
+        from the edges'; unchanged where the look has nothing to say, contradicts them, or isn't that of a rigid
+        gripper: a finger or the jaw isn't where it should be.  ``swing`` (6,): as the edges show it.
         """
         self._pending = None
-        if not standing.believed or frame.image is None:
+        measurement = standing.measurement
+        astray = gripper_astray(measurement, agreeing_fingers(measurement, self._gripper))
+        if astray or not standing.believed or frame.image is None:
             return standing
         refined, (opening_m, sigma_m) = None, self._opening(frame, standing)
         motion = self._alignment.measure(frame.image, standing.cam_T_grip, opening_m, sigma_m)
+        of_background = standing.covariance - self._floor
         if motion is not None:
-            of_background = standing.covariance - self._floor
             refined = self._fusion.fuse(standing.cam_T_grip, of_background, motion)
         pose = standing.cam_T_grip if refined is None else refined.cam_T_grip
         # A copy: learning can wait, and the caller may read the next image into the same memory.
-        self._pending = _Pending(frame.image.copy(), pose, opening_m, now_s, frame.stamp_ns, motion)
+        self._pending = _Pending(frame.image.copy(), pose, of_background, opening_m, now_s, frame.stamp_ns, motion)
         if refined is None:
             return standing
+        if self._last_T is None:
+            self.swing = swing
+        else:
+            way = perturbation_between(self._last_T, pose)
+            self.swing = swinging(self.swing, way, 2.0 * refined.of_change.diagonal())
+        self._last_T = pose
         away = perturbation_between(standing.cam_T_grip, pose)
         wider = reaching(standing.protection, away, standing.protection.hypothesis)
         return replace(standing, cam_T_grip=pose, protection=wider, finer=refined)
@@ -150,9 +168,12 @@ class FinerLook:
         if before is not None and len(before) == len(behind) and not another_background(behind, before):
             self._behind = before
             return
-        if pending.motion is not None:
-            self._fusion.learn()
+        measured, views = self._alignment.ready, self._alignment.views
         self._alignment.learn(*where)
+        if measured and pending.motion is not None:
+            self._fusion.learn()
+        elif not measured and self._alignment.views > views:
+            self._fusion.place(pending.cam_T_grip, pending.of_background, pending.jaw_opening_m)
         self._count(pending.stamp_ns)
         self._tell(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
 
@@ -172,7 +193,7 @@ class FinerLook:
     def _opening(self, frame: Frame, standing: Standing) -> tuple[float | None, float]:
         """The jaw's opening with its standard deviation, m: as earlier frames showed it, which errs alike in all."""
         measurement = standing.measurement
-        if not self._has_jaw:
+        if not self._gripper.has_jaw:
             return None, 0.0
         if frame.jaw_opening_m is None:
             return measurement.jaw_opening_m, math.sqrt(measurement.covariance[6, 6])
@@ -197,7 +218,8 @@ class FinerLook:
         since_ns = min(
             since for since, now in zip(self._since_ns, long.tolist(), strict=True) if now and since is not None
         )
-        names = [f"finger {name}" for name, now in zip(self._names, long[:-1].tolist(), strict=True) if now]
+        fingers = self._gripper.finger_ids
+        names = [f"finger {name}" for name, now in zip(fingers, long[:-1].tolist(), strict=True) if now]
         text = f"the gripper looks different: {', '.join(names)}, since {_clock(since_ns)}"
         self._origin = f"{', '.join(names)} looked different"
         if long[-1]:

@@ -60,6 +60,7 @@ class Integrity:
         self._finer = None
         if settings.look.enabled:
             self._finer = FinerLook(camera, gripper, self._look, tracker.floor, reference, tracker.taught_digest)
+        self._finer_swing: Array | None = None
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
@@ -76,8 +77,8 @@ class Integrity:
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
-        return self._weigher.swing
+        """(6,) variance of the way between proven poses, m² and rad²: vibration; of refined ones, if the newest is."""
+        return self._weigher.swing if self._finer_swing is None else self._finer_swing
 
     def refer(self, reference: ReferenceRecord) -> None:
         """The reference in force."""
@@ -137,8 +138,16 @@ class Integrity:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
         if self._finer is not None and standing is not None:
-            standing = self._finer.refine(frame, standing, now_s)
+            standing = self._refined(self._finer, frame, standing, now_s)
         return standing
+
+    def _refined(self, look: FinerLook, frame: Frame, standing: Standing, now_s: float) -> Standing:
+        """The same as the look refines it, unless that would make it worth less: finer, but past an alert limit."""
+        finer = look.refine(frame, standing, now_s, self._weigher.swing)
+        if past_alert_limit(finer.protection, self._policy) and not past_alert_limit(standing.protection, self._policy):
+            finer = standing
+        self._finer_swing = None if finer.finer is None else look.swing
+        return finer
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
         weigh = self._weigher.weigh

@@ -65,6 +65,15 @@ CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
 
 
+def swinging(swing: Array, way: Array, noise: Array) -> Array:
+    """(6,) variance of the way between one pose and the next, after one more ``way`` (6,) that the poses' own errors,
+    of variances ``noise`` (6,), are part of.
+    """
+    # A knock is not a vibration, but what rings after it is.
+    most = CONTRADICTION_SQUARE * (noise + swing)
+    return np.asarray(swing + (np.minimum(np.square(way), most) - swing) / VIBRATION_FRAMES)
+
+
 class Weigher:
     """Bounds for one monitor's measurements, and the anchor that they rest on."""
 
@@ -184,10 +193,8 @@ class Weigher:
         rows = self._about(trust.fits.edges)[1]
         self._slid = trust.may_have_slid
         if self.anchor is not None:
-            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
-            # A knock is not a vibration, but what rings after it is.
-            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, CONTRADICTION_SQUARE * noise) - self.swing) / VIBRATION_FRAMES
+            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
+            self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while no one watched, or marks on the fingers, or a wrong model: a person has to say.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)

@@ -197,13 +197,14 @@ class LookAlignment:
         known_m = 0.0 if jaw_opening_m is None or start[1] is None else jaw_opening_m - start[1]
         prior[6] = 1.0 / max(jaw_sigma_m, 1e-8) ** 2
         motion = self._measured.motion_to(*start)
-        here = motion.copy()
-        here[6] += known_m
+        known = motion.copy()
+        known[6] += known_m
+        here = known
         try:
             for _ in range(READINGS):
                 values = kernel.read(*grey, self._measured.base_px, self._measured.flow, here)
                 step, information, pulls, share, scatter = kernel.align(
-                    values, self._mean_in, self._weight_in, self._jacobian, prior
+                    values, self._mean_in, self._weight_in, self._jacobian, prior, known - here
                 )
                 here = here + step
                 if self._measured.moved_px(step) <= CLOSE_PX:
@@ -339,7 +340,7 @@ def warm_up() -> None:
     nothing = np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 7)), np.zeros(7)
     for shape in ((8, 8), (8, 8, 3)):
         values = kernel.read(*_channels(np.zeros(shape, dtype=np.uint8)), *nothing)
-    kernel.align(values, values, values, np.zeros((1, 7, 1)), np.ones(7))
+    kernel.align(values, values, values, np.zeros((1, 7, 1)), np.ones(7), np.zeros(7))
 
 
 def _channels(image: Image) -> tuple[Image, Array]:

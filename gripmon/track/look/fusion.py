@@ -1,8 +1,9 @@
 """Edges and look in one estimate: the edges know where the gripper is, the look by how much it has moved.
 
 What the look has too much, its bias, is where the edges had the gripper on average while it was learnt, and what its
-model of the fingers has wrong.  The edges show it a little in every frame, and their own errors are others before every
-background.  A motion is seen by both, so that it never becomes bias, however slow it is.
+model of the fingers has wrong.  Against the edges it so begins at zero, as uncertain as that average.  The edges show it
+a little in every frame, and their own errors are others before every background.  A motion is seen by both, so that it
+never becomes bias, however slow it is.
 """
 
 from __future__ import annotations
@@ -111,12 +112,29 @@ class LookFusion:
         of_bias = share @ self._covariance @ share.T
         return Fused(perturb(cam_T_grip, share @ innovation), _symmetric(of_change), _symmetric(of_bias), self._share)
 
+    def place(self, cam_T_grip: Array, covariance: Array, jaw_opening_m: float | None) -> None:
+        """A new background's frame is learnt where the edges have the gripper, with errors of a ``covariance`` (6, 6),
+        before the look measures: as far as one can tell, it has no bias against them.
+        """
+        self._follow(np.zeros(6), covariance, np.zeros((6, 6)), cam_T_grip, jaw_opening_m or 0.0)
+
     def learn(self) -> None:
-        """Learn the bias from the newest frame, whose background is a new one: a Kalman update."""
+        """Learn the bias from the newest frame, whose background is a new one."""
         if self._pending is None:
             return
-        difference, of_edges, of_look, cam_T_grip, opening_m = self._pending
+        difference, of_edges, of_look, _, _ = pending = self._pending
         self._pending = None
+        self._follow(*pending)
+        if self.contradicts:
+            return
+        if self._before is not None:
+            way = difference - self._before
+            differing = float(way @ np.linalg.solve(2.0 * (of_edges + of_look), way)) / 6.0
+            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / PATIENCE
+        self._before = difference
+
+    def _follow(self, difference: Array, of_edges: Array, of_look: Array, cam_T_grip: Array, opening_m: float) -> None:
+        """A Kalman update of the bias by a ``difference`` (6,) from edges to look."""
         self.backgrounds += 1
         if self._at is None:
             self._bias, self._covariance = difference, of_edges + of_look
@@ -124,15 +142,10 @@ class LookFusion:
             return
         innovation = difference - self._bias
         known = self._uncertainty(cam_T_grip, opening_m)
-        if float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation)) > CONTRADICTION_SQUARE:
-            self.contradicts = True
+        square = float(innovation @ np.linalg.solve(known + of_edges + of_look, innovation))
+        self.contradicts = square > CONTRADICTION_SQUARE
+        if self.contradicts:
             return
-        self.contradicts = False
-        if self._before is not None:
-            way = difference - self._before
-            differing = float(way @ np.linalg.solve(2.0 * (of_edges + of_look), way)) / 6.0
-            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / PATIENCE
-        self._before = difference
         correlation = min(max(self._correlation, 0.0), MOST_CORRELATED)
         alike = (1.0 + correlation) / (1.0 - correlation)
         gain = np.linalg.solve(known + alike * of_edges + of_look, known).T

@@ -133,7 +133,7 @@ def _pull(of_motion: Array, off: Array) -> float:
 
 @compiled
 def align(
-    values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array
+    values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array, known: Array
 ) -> tuple[Array, Array, Array, Array, float]:
     """The motion (7,) of the learned pixels that shows best in ``values`` (p, n): iteratively re-weighted least squares
     with Tukey's weight, each patch having its own gain and offset of light, taken out of the residuals with the present
@@ -141,9 +141,9 @@ def align(
 
     ``mean`` (p, n) as learnt; ``weight`` (p, n) one over the variances, 0 for what doesn't count; ``jacobian``
     (p, 7, n) by how much a motion changes what is seen where the gripper was, less what light could; ``prior`` (7,)
-    information that the motion is zero.  Also the information (7, 7), the sum (7, 7) of squares of what each patch
-    pulls, the share (p,) of each patch's weight that agrees, and the scatter of the residuals over what was learnt, at
-    least 1.
+    information that the motion is ``known`` (7,).  Also the information (7, 7), the sum (7, 7) of squares of what each
+    patch pulls, the share (p,) of each patch's weight that agrees, and the scatter of the residuals over what was
+    learnt, at least 1.
     """
     patches, pixels = values.shape
     motion, scatter = np.zeros(7), 1.0
@@ -175,7 +175,7 @@ def align(
                 for j in range(7):
                     pulls[i, j] += own[i] * own[j]
         for i in range(7):
-            pull[i] -= prior[i] * motion[i]
+            pull[i] += prior[i] * (known[i] - motion[i])
             for j in range(i + 1):
                 information[i, j] = information[j, i] = sums[i, j].sum()
             information[i, i] += prior[i]

@@ -33,7 +33,7 @@ def _taps(x: Array) -> Array:
 
 
 def align(
-    values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array
+    values: Array, mean: Array, weight: Array, jacobian: Array, prior: Array, known: Array
 ) -> tuple[Array, Array, Array, Array, float]:
     """See :func:`gripmon.track.look.kernel.align`: iteratively re-weighted least squares.
 
@@ -49,7 +49,7 @@ def align(
         pull_of_patch = np.einsum("pn,pni->pi", robust * np.where(counted, residual, 0.0), jacobian)
         information = np.einsum("pn,pni,pnj->ij", robust, jacobian, jacobian) + np.diag(prior)
         if turn < ROUNDS:
-            motion = motion + np.linalg.solve(information, pull_of_patch.sum(axis=0) - prior * motion)
+            motion = motion + np.linalg.solve(information, pull_of_patch.sum(axis=0) + prior * (known - motion))
     whole = weight.sum(axis=1)
     share = np.divide(robust.sum(axis=1), whole, out=np.zeros(len(whole)), where=whole > 0.0)
     return motion, information, pull_of_patch.T @ pull_of_patch, share, scatter
