@@ -21,6 +21,7 @@ import numpy as np
 from scipy import signal, stats
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from gripmon.analyse.smoothing import CHI2_MEDIAN
 from gripmon.model.records import Array
 
 SIDE_FRAMES = (4, 8, 16)
@@ -95,7 +96,7 @@ def squared_changes(y: Array, length: int) -> Array:
 def _mahalanobis(moved: Array) -> Array:
     """By the covariance of the calm part, made right for normal numbers."""
     dof = moved.shape[1]
-    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + MIN_NOISE_VARIANCE)
+    covariance: Array = np.diag(np.median(moved * moved, axis=0) / CHI2_MEDIAN + MIN_NOISE_VARIANCE)
     for _ in range(6):
         squared = np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True)
         calm = squared <= np.quantile(squared, CALM_FRACTION)
@@ -162,7 +163,7 @@ def _place(y: Array, index: int, length: int) -> Found | None:
 def _own_noise(part: Array) -> Array:
     """Variance (a,) of frames about their neighbours."""
     step = np.diff(part, axis=0)
-    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + MIN_NOISE_VARIANCE)
+    return np.asarray(np.median(step * step, axis=0) / CHI2_MEDIAN / 2.0 + MIN_NOISE_VARIANCE)
 
 
 SPECTRUM_FRAMES, SPECTRUM_STEP_FRAMES = 256, 64

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.smoothing import Bools, Ints, Smoothed, mean_squares, step_of
+from gripmon.analyse.smoothing import CHI2_MEDIAN, Bools, Ints, Smoothed, mean_squares, step_of
 from gripmon.model.geometry import skew
 from gripmon.model.records import Array
 
@@ -115,8 +115,8 @@ def wild_frames(run: Run) -> Bools:
         return out
     y = run.y[good]
     off = y - median_filter(y, size=(WILD_WINDOW_FRAMES, 1), mode="nearest")
-    usual = np.sqrt(np.median(off * off, axis=0) / 0.4549) + 1e-9
-    local = np.sqrt(median_filter(off * off, size=(65, 1), mode="nearest") / 0.4549)
+    usual = np.sqrt(np.median(off * off, axis=0) / CHI2_MEDIAN) + 1e-9
+    local = np.sqrt(median_filter(off * off, size=(65, 1), mode="nearest") / CHI2_MEDIAN)
     far = (np.abs(off) > WILD_SIGMAS * np.maximum(usual, local)).any(axis=1)
     far &= (off * off / run.claimed[good]).max(axis=1) > 4.0
     crowd = np.convolve(far, np.ones(17), mode="same")

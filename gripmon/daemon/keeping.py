@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import threading
-from typing import Protocol
 
 import msgspec
 
 from gripmon.io.publish.presence import CLOSE_WITHIN_S
+from gripmon.judge.statefile import StateFile
 from gripmon.model.records import MonitorState, ReferenceRecord
 
 RETRY_S = 1.0
 """Pause before a state that could not be written is tried again."""
 
 
-class StateSink(Protocol):
-    """Where states go, e.g. :class:`gripmon.judge.statefile.StateFile`; ``failure`` is empty while all is well."""
-
-    @property
-    def failure(self) -> str: ...
-    def write(self, state: MonitorState) -> bool: ...
-    def close(self) -> None: ...
-
-
 class StateKeeper:
     """Writes states, the newest wins.  ``None`` in place of a sink: keeps nothing."""
 
-    def __init__(self, sink: StateSink | None) -> None:
+    def __init__(self, sink: StateFile | None) -> None:
         self._sink = sink
         self._writing = threading.Lock()  # held while a state is written: an older one never replaces a newer one
         self._changed = threading.Condition()  # guards what follows

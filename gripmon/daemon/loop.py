@@ -15,7 +15,7 @@ from gripmon.daemon.neighbours import JawFeed
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Beside, Loop
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish.publisher import Publisher
+from gripmon.io.publish import Publisher
 from gripmon.io.sources import Source
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
@@ -54,7 +54,6 @@ class Daemon(Loop):
     ) -> None:
         super().__init__(source, publisher, recorder, settings, stop, **beside)
         self._monitor = monitor
-        self._publisher = publisher
         self._estimates = estimates
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)

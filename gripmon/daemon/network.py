@@ -5,23 +5,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable
-from typing import Any, Generic, TypeVar
 
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_network
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
+from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import ZenohCommands
 from gripmon.io.publish.inputs import ZenohJaw, ZenohPulses, opening_of_joints
 from gripmon.io.publish.presence import Presence, in_words
-from gripmon.io.publish.publisher import (
-    NullPublisher,
-    Publisher,
-    Publishers,
-    SpotPublisher,
-    ZenohPublisher,
-    ZenohSpotPublisher,
-)
+from gripmon.io.publish.publisher import Publishers, ZenohPublisher, ZenohSpotPublisher
 from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
 from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
 from gripmon.io.ros2.publisher import Ros2Publisher
@@ -38,42 +30,44 @@ class NameTakenError(NoResultError):
     exit_code = 4
 
 
-_P = TypeVar("_P", Publisher, SpotPublisher)
-
-
 @dataclasses.dataclass(frozen=True)
-class Network(Generic[_P]):
+class Network:
     """The session (None: nothing is published), the publisher, where the jaw opening (None: with the frames) and a
     laser's pulses come from, where commands come from, and what the state message says of all this.
     """
 
     link: Link | None
-    publisher: _P
+    publisher: Publisher
     jaw: JawFeed | None = None
     pulses: ZenohPulses | None = None
     commands: ZenohCommands | None = None
     reports: Reports = dataclasses.field(default_factory=Reports)
 
 
-def open_network(config: Config, *, take_over: bool = False) -> Network[Publisher]:
+def open_network(config: Config | SecondConfig, *, take_over: bool = False) -> Network:
     """Open all of it.  Raises :class:`ConfigError` where it can't be opened as configured, and :class:`NameTakenError`
     where the robot's and camera's name is another monitor's, unless it is to ``take_over``.
     """
-    jaw = _FixedJaw(config.jaw_opening_m) if config.settings.jaw.source == "fixed" else None
-    network = _joined(config, lambda link, who: _on_link(config, link, jaw, who), take_over=take_over)
-    return _with_metrics(config, network or Network(None, NullPublisher(), jaw), Publishers)
+    jaw = None
+    if isinstance(config, Config) and config.settings.jaw.source == "fixed":
+        jaw = _FixedJaw(config.jaw_opening_m)
+    network = Network(None, Publisher(), jaw)
+    link = _open_link(config)
+    if link is not None:
+        settings = config.settings
+        with contextlib.ExitStack() as failed:
+            failed.callback(link.close)  # a process must not end while its session is being opened
+            presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
+            if isinstance(config, SecondConfig):
+                network = _second_on_link(config, link, presence)
+            else:
+                network = _on_link(config, link, jaw, presence)
+            failed.pop_all()
+    return _with_metrics(config, network)
 
 
-def open_second_network(config: SecondConfig, *, take_over: bool = False) -> Network[SpotPublisher]:
-    """The same for a second camera."""
-    network = _joined(config, lambda link, who: _second_on_link(config, link, who), take_over=take_over)
-    return _with_metrics(config, network or Network(None, NullPublisher()), Publishers)
-
-
-def _joined(
-    config: Config | SecondConfig, begin: Callable[[Link, Presence], Network[_P]], *, take_over: bool
-) -> Network[_P] | None:
-    """What ``begin`` makes of a session of which no other monitor has the name; None if nothing is published."""
+def _open_link(config: Config | SecondConfig) -> Link | None:
+    """The session, None if nothing is published."""
     check_network(config)
     settings = config.settings
     if not settings.publish.enabled:
@@ -82,14 +76,9 @@ def _joined(
     if publish != settings.publish:
         _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(publish.connect))
     try:
-        link = Link(publish, config.directory)
+        return Link(publish, config.directory)
     except PublishError as error:
         raise ConfigError(config.path, "", str(error)) from None
-    with contextlib.ExitStack() as failed:
-        failed.callback(link.close)  # a process must not end while its session is being opened
-        network = begin(link, _alone(link, settings.robot, settings.camera_name, take_over=take_over))
-        failed.pop_all()
-    return network
 
 
 def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
@@ -103,7 +92,7 @@ def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
     return presence
 
 
-def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network[Publisher]:
+def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
     settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
@@ -120,7 +109,7 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
     return Network(link, publishers, jaw, None, commands, reports)
 
 
-def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Network[SpotPublisher]:
+def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Network:
     settings = config.settings
     publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name, presence)
     pulses = ZenohPulses(link, publisher.keys["pulse"]) if settings.laser.pulses is None else None
@@ -131,9 +120,7 @@ def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Net
     return Network(link, publisher, None, pulses, commands, reports)
 
 
-def _with_metrics(
-    config: Config | SecondConfig, network: Network[_P], together: Callable[[_P, dict[str, Any]], _P]
-) -> Network[_P]:
+def _with_metrics(config: Config | SecondConfig, network: Network) -> Network:
     """With the server for Prometheus beside the publisher where the configuration wants one.  Raises
     :class:`ConfigError` where it can't listen.
     """
@@ -146,7 +133,7 @@ def _with_metrics(
         network.publisher.close()
         raise ConfigError(config.path, "", str(error)) from None
     _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return dataclasses.replace(network, publisher=together(network.publisher, {"metrics": metrics}))
+    return dataclasses.replace(network, publisher=Publishers(network.publisher, {"metrics": metrics}))
 
 
 def with_source(reports: Reports, source: Source) -> Reports:

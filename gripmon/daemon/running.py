@@ -23,8 +23,8 @@ from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.supervised import Beside
 from gripmon.daemon.watch import DaemonSettings
+from gripmon.io.publish import Publisher
 from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.io.publish.publisher import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
 from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
@@ -75,7 +75,7 @@ def run(
 def run_second(
     pulsed: PulsedWatch,
     source: Source,
-    publisher: SpotPublisher,
+    publisher: Publisher,
     recorder: Recorder,
     settings: DaemonSettings,
     *,
@@ -102,7 +102,7 @@ def run_second(
 @contextlib.contextmanager
 def _closing(
     source: Source,
-    publisher: StatePublisher,
+    publisher: Publisher,
     recorder: Recorder,
     settings: DaemonSettings,
     lines: Path | None,

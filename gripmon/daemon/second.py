@@ -14,8 +14,8 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Beside, Loop
 from gripmon.daemon.watch import DaemonSettings, Judged
+from gripmon.io.publish import Publisher
 from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.io.publish.publisher import SpotPublisher
 from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.matching import ReportedPulse, Shown
@@ -57,7 +57,7 @@ class SecondCamera(Loop):
         self,
         pulsed: PulsedWatch,
         source: Source,
-        publisher: SpotPublisher,
+        publisher: Publisher,
         recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
@@ -74,7 +74,7 @@ class SecondCamera(Loop):
         """
         super().__init__(source, publisher, recorder, settings, stop, **beside)
         self._pulsed = pulsed
-        self._publisher, self._lines = publisher, lines
+        self._lines = lines
         self._table, self._feed = table, feed
         self._no_spot_s = no_spot_alert_after_s
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)

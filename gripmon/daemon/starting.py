@@ -19,7 +19,7 @@ from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, 
 from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.network import open_network, open_second_network, with_source
+from gripmon.daemon.network import open_network, with_source
 from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
 from gripmon.daemon.running import run, run_second
 from gripmon.daemon.service import log_to_stderr
@@ -179,7 +179,7 @@ def _run_second(
     live = None if view is None else LiveView(settings.view, view, config.path)
     with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()
-        network = open_second_network(config, take_over=take_over)
+        network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         source = open_configured(config, network.link)
         opened.callback(source.close)

@@ -17,9 +17,9 @@ from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
+from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import PendingCommand, ZenohCommands
 from gripmon.io.publish.presence import in_words
-from gripmon.io.publish.publisher import StatePublisher
 from gripmon.io.sources import Source, Waiting
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
@@ -76,7 +76,7 @@ class Loop(ABC):
     def __init__(
         self,
         source: Source,
-        publisher: StatePublisher,
+        publisher: Publisher,
         recorder: Recorder,
         settings: DaemonSettings,
         stop: StopRequest,
@@ -89,7 +89,7 @@ class Loop(ABC):
         notices: Sequence[Alert] = (),
     ) -> None:
         self._source = source
-        self._told, self._recorder = publisher, recorder
+        self._publisher, self._recorder = publisher, recorder
         self._settings = settings
         self._robot, self._camera = robot, camera
         self._commands = commands
@@ -265,7 +265,7 @@ class Loop(ABC):
             revision=self._in_force[1],
             **msgspec.structs.asdict(alert),
         )
-        self._deliver("alert", self._told.alert, message)
+        self._deliver("alert", self._publisher.alert, message)
         if not recorded:
             self._deliver("alert's recording", self._recorder.alert, message)
 
@@ -310,7 +310,7 @@ class Loop(ABC):
             _log.info("%s", line)
             self._service.status(line)
         self._said = self._state_record(verdict, message, now_s, alone=not several)
-        self._deliver("state", self._told.state, self._said)
+        self._deliver("state", self._publisher.state, self._said)
         self._deliver("state's recording", self._recorder.state, self._said)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s

@@ -22,6 +22,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 import msgspec
 from msgspec import Meta
 
+from gripmon.io.publish import Publisher
 from gripmon.model.errors import InputError
 from gripmon.model.records import (
     AlertEvent,
@@ -29,7 +30,6 @@ from gripmon.model.records import (
     AlertRecord,
     Cause,
     FrameRecord,
-    ReferenceRecord,
     Severity,
     State,
     StateRecord,
@@ -51,7 +51,7 @@ _BOUNDS_NS = tuple(round(1e9 * bound) for bound in LATENCY_BOUNDS_S)
 _COUNTED = (AlertEvent.RAISED, AlertEvent.NOTED)  # an update or the end is no further alert
 
 
-class Tally:
+class Tally(Publisher):
     """A publisher that only counts and keeps the newest.  One thread puts; others read, at worst a frame apart."""
 
     def __init__(self) -> None:
@@ -78,12 +78,6 @@ class Tally:
         if record.event in _COUNTED:
             key = (record.kind, record.cause, record.severity)
             self.alerts[key] = self.alerts.get(key, 0) + 1
-
-    def reference(self, record: ReferenceRecord) -> None:
-        """The state names it."""
-
-    def close(self) -> None:
-        """Nothing to let go of."""
 
 
 class MetricsError(InputError):

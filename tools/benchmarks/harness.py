@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from benchmarks.scene import FPS, Ring
 from gripmon.daemon.config import Config
 from gripmon.daemon.running import run
-from gripmon.io.publish.publisher import Publisher, ZenohPublisher
+from gripmon.io.publish import Publisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, State, StateRecord, Verdict
 from gripmon.monitor import Monitor, warm_up

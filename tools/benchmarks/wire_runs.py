@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from benchmarks import harness, scene
 from benchmarks.wire_others import Crowd, RouterProcess, Staller, free_endpoint
-from gripmon.io.publish.publisher import Publisher, ZenohPublisher
+from gripmon.io.publish import Publisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 

@@ -16,3 +16,30 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 "Late joiners get the last one" holds both ways that people ask: a plain ``get`` on the key (a queryable answers it),
 and an advanced subscriber with history (``zenoh.ext``).
 """
+
+from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord
+
+
+class Publisher:
+    """Where a loop puts what it has to say; no method waits for the network.  This one says nothing.
+
+    A wrist camera's loop has transforms and references, a second camera's has spots.
+    """
+
+    def transform(self, record: FrameRecord) -> None:
+        """One frame's record."""
+
+    def reference(self, record: ReferenceRecord) -> None:
+        """The reference that is in force from now on."""
+
+    def spot(self, record: SpotRecord) -> None:
+        """What became of a pulse."""
+
+    def state(self, record: StateRecord) -> None:
+        """The newest state."""
+
+    def alert(self, record: AlertRecord) -> None:
+        """An alert, of a frame or of none."""
+
+    def close(self) -> None:
+        """Let go of what is held.  Calling it twice does nothing more."""

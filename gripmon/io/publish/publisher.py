@@ -7,11 +7,12 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import msgspec
 import zenoh
 
+from gripmon.io.publish import Publisher
 from gripmon.io.publish.presence import Answers, Presence
 from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, in_zenohs_thread, steady_ns
 from gripmon.model.errors import one_line
@@ -33,39 +34,7 @@ _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no
 _HEARTBEAT_S = 1.0
 
 
-class StatePublisher(Protocol):
-    """Where every loop puts what it has to say.  No method waits for the network."""
-
-    def state(self, record: StateRecord) -> None: ...
-    def alert(self, record: AlertRecord) -> None: ...
-    def close(self) -> None: ...
-
-
-class Publisher(StatePublisher, Protocol):
-    """Where the loop of a wrist camera puts what it has to say."""
-
-    def transform(self, record: FrameRecord) -> None: ...
-    def reference(self, record: ReferenceRecord) -> None: ...
-
-
-class SpotPublisher(StatePublisher, Protocol):
-    """Where the loop of a second camera puts what it has to say."""
-
-    def spot(self, record: SpotRecord) -> None: ...
-
-
-class NullPublisher:
-    """Says nothing."""
-
-    def transform(self, record: FrameRecord) -> None: ...
-    def state(self, record: StateRecord) -> None: ...
-    def alert(self, record: AlertRecord) -> None: ...
-    def reference(self, record: ReferenceRecord) -> None: ...
-    def spot(self, record: SpotRecord) -> None: ...
-    def close(self) -> None: ...
-
-
-class _ZenohStates:
+class _ZenohStates(Publisher):
     """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
 
     def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
@@ -286,15 +255,15 @@ class _Wire:
         self._answers.close()
 
 
-class Publishers:
+class Publishers(Publisher):
     """Hands each record to the first publisher and then to those of the others that take such records.
 
     What the first raises is raised, after the others had the record.  What another one raises never reaches the caller:
     it is logged once, until it changes, and :meth:`fault` says it.
     """
 
-    def __init__(self, first: Any, others: Mapping[str, StatePublisher]) -> None:
-        """``first``: a :class:`Publisher` or a :class:`SpotPublisher`; ``others`` by their names in messages."""
+    def __init__(self, first: Publisher, others: Mapping[str, Publisher]) -> None:
+        """``others`` by their names in messages."""
         self._first, self._others = first, others
         self._faults: dict[tuple[str, str], str] = {}  # by publisher and method, of which one may work and one not
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gripmon.io.publish import Publisher
 from gripmon.io.ros2.names import Layout, Qos, Ros2Settings
 from gripmon.io.ros2.node import DIAGNOSTICS, POSE, TF, Node, TopicPublisher, prepare, typestore
 from gripmon.io.wire import Link
@@ -20,7 +21,6 @@ from gripmon.model.records import (
     Array,
     FrameRecord,
     Protection,
-    ReferenceRecord,
     Severity,
     StandingAlert,
     State,
@@ -201,7 +201,7 @@ class _Topics:
     diagnostics: TopicPublisher
 
 
-class Ros2Publisher:
+class Ros2Publisher(Publisher):
     """Publishes one monitor's records as a node on a link that someone else closes.
 
     Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
@@ -253,9 +253,6 @@ class Ros2Publisher:
                 record.alert_id, record.kind, record.severity, record.text, record.since_ns, record.acknowledged
             )
         self._diagnose()
-
-    def reference(self, record: ReferenceRecord) -> None:
-        """Nothing: the next diagnostics name it."""
 
     def close(self) -> None:
         """Leave the graph.  Calling it twice does nothing more."""
