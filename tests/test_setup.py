@@ -352,6 +352,13 @@ def test_a_source_given_with_a_step_is_that_steps_alone(
     assert (kept["source"], kept["plate_source"], kept["standing_source"]) == ("../my pictures", "../my pictures", "")
 
 
+def test_a_file_that_is_no_camera_is_told_as_a_person_named_it(tmp_path: Path):
+    project = Project(tmp_path)
+    project.keep({"source": "setup.yaml"})
+    with pytest.raises(InputError, match=r"^\S+setup.yaml can't be opened as a video; a folder of images, a video f"):
+        project.do("camera")
+
+
 def test_the_command_of_a_page_can_be_typed_where_a_person_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = tmp_path / "my arm"
     (folder / "standing").mkdir(parents=True)
@@ -365,9 +372,10 @@ def test_the_command_of_a_page_can_be_typed_where_a_person_is(tmp_path: Path, ca
 
 def test_what_the_ruler_says_scales_the_target(tmp_path: Path):
     project = Project(tmp_path)
-    project.keep({"bar_measured": "153"})
-    lines = project.do("target")
-    assert lines[-1].text == "the target is circles:12x10:0.00816:0.00408"  # 2 % larger, as the bar of 150 mm
+    for said in ("153,0", "153"):
+        project.keep({"bar_measured": said})
+        lines = project.do("target")
+        assert lines[-1].text == "the target is circles:12x10:0.00816:0.00408"  # 2 % larger, as the bar of 150 mm
     assert read_yaml(tmp_path / "setup.yaml")["values"]["bar_measured"] == "153"
     again = Project(tmp_path)
     assert again.states()[1].progress == "done" and target_in(again.values) == target_in(project.values)

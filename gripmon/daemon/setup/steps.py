@@ -62,7 +62,7 @@ def target_in(values: Values) -> Target:
     if values["have"] != PRINT_IT or not text:
         return target
     try:
-        measured = float(text)
+        measured = float(text.replace(",", "."))  # some rulers are read with a comma
     except ValueError:
         measured = 0.0
     bar_mm = float(nominal or "0") or measured

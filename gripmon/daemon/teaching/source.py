@@ -75,7 +75,10 @@ def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
     """
     settings = named_source(text)
     if not isinstance(settings, NetworkSettings):
-        return OpenedSource(open_source(settings))
+        try:
+            return OpenedSource(open_source(settings))
+        except SourceError as error:  # it names the key of a configuration
+            raise SourceError(f"{str(error).removeprefix('path: ').partition(';')[0]}; {_RIGHT}") from None
     found = _NETWORK.fullmatch(text)
     assert found is not None, "named_source has seen that it is of this form"
     return _Networked(settings, (int(found[2]), int(found[3])), Keys(robot, camera_name))
