@@ -354,7 +354,7 @@ def test_a_source_given_with_a_step_is_that_steps_alone(
 
 def test_a_file_that_is_no_camera_is_told_as_a_person_named_it(tmp_path: Path):
     project = Project(tmp_path)
-    project.keep({"source": "setup.yaml"})
+    project.keep({"source": str(tmp_path / "setup.yaml")})
     with pytest.raises(InputError, match=r"^\S+setup.yaml can't be opened as a video; a folder of images, a video f"):
         project.do("camera")
 
