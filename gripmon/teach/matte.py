@@ -43,9 +43,9 @@ _MAD = 1.4826
 
 @dataclass(frozen=True)
 class Matte:
-    """The static pixels of images: ``mean`` (h, w) grey levels; ``scatter`` (h, w), their robust standard deviation over
-    the images; ``still`` (h, w), which pixels belong to the gripper; ``noise``, the usual scatter of these, in grey
-    levels of 0 to 255.
+    """The static pixels of images: ``mean`` (h, w) grey levels; ``scatter`` (h, w), their robust standard deviation
+    over the images; ``still`` (h, w), which pixels belong to the gripper; ``noise``, the usual scatter of these, in
+    grey levels of 0 to 255.
 
     ``images`` (n, h, w) float32 at common grey levels, ``kept`` (n,) their indices among those given, ``left_out`` why
     others weren't used.
@@ -162,8 +162,8 @@ def _differ(one: NDArray[np.float32], other: NDArray[np.float32], limit: float) 
 
 
 def _alikeness(small: NDArray[np.float32], noise: float) -> Array:
-    """Part (n, n) of two images (n, h, w) that is the same.  Backgrounds agree in single pixels by chance; static pixels
-    agree together with their neighbours.
+    """Part (n, n) of two images (n, h, w) that is the same.  Backgrounds agree in single pixels by chance; static
+    pixels agree together with their neighbours.
     """
     alike = np.zeros((len(small), len(small)))
     for i, j in itertools.combinations(range(len(small)), 2):

@@ -31,8 +31,8 @@ _INK, _FAINT, _PAPER, _MARK, _NOTHING = (20, 20, 20), (95, 95, 95), (255, 255, 2
 
 
 class _Map(NamedTuple):
-    """A heat map: ``values`` for each trial (r, c), NaN for none, ``digits`` to write them with, and ``goodness``, which
-    is coloured: more is better.
+    """A heat map: ``values`` for each trial (r, c), NaN for none, ``digits`` to write them with, and ``goodness``,
+    which is coloured: more is better.
     """
 
     title: str

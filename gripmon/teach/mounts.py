@@ -1,5 +1,5 @@
-"""Camera mounts, described by numbers that can be set up with a drill (distance, tilt, side, roll), and what the monitor
-would see from each mount of a grid: before a hole is drilled.
+"""Camera mounts, described by numbers that can be set up with a drill (distance, tilt, side, roll), and what the
+monitor would see from each mount of a grid: before a hole is drilled.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def towards(camera: Camera, uv_px: tuple[float, float]) -> Array:
 
 def with_focal(camera: Camera, focal_px: float) -> Camera:
     """The same sensor behind a lens of another focal length, without distortion, since that of an uncalibrated lens is
-    unknown.  (A fisheye lens remains one: in its ideal form all coefficients are zero.)  At the camera's own focal length
-    it is the calibrated lens.  ValueError for an impossible focal length.
+    unknown.  (A fisheye lens remains one: in its ideal form all coefficients are zero.)  At the camera's own focal
+    length it is the calibrated lens.  ValueError for an impossible focal length.
     """
     settings = camera.settings
     if math.isclose(focal_px, settings.fx_px, rel_tol=1e-9):
@@ -158,9 +158,9 @@ class Measurable:
 class Trial:
     """What the monitor would see from one mount.
 
-    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,): their numbers at ``openings_m`` (n,); ``share``: part of
-    these openings at which the monitor can measure; ``measurable`` None where it can't at the usual one.  ``faults``: why
-    this mount would not work, the most serious first; empty if it would.
+    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,): their numbers at ``openings_m`` (n,); ``share``: part
+    of these openings at which the monitor can measure; ``measurable`` None where it can't at the usual one.
+    ``faults``: why this mount would not work, the most serious first; empty if it would.
     """
 
     mount: Mount

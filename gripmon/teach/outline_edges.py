@@ -1,9 +1,9 @@
-"""Sub-pixel corners of a rough outline: a straight line for each of its edges, where adjacent ones meet, and how far
-off they may be by what their points show.
+"""Sub-pixel corners of a rough outline: a straight line for each of its edges, the intersections of adjacent lines, and
+their covariance from the edge points.
 
-Unlike :mod:`gripmon.teach.snapping`, which poses a gripper that is known, this knows no gripper.  Lines are
-straight in ideal coordinates; profiles lie along the edge as the lens bends it.  Each edge is looked for on its own, as
-the rough ends may be off by several pixels each in any direction.
+Unlike :mod:`gripmon.teach.snapping`, which poses a known gripper, this knows no gripper.  Lines are straight in ideal
+coordinates; search lines are placed along the edge as the lens bends it.  Each edge is searched for separately, as the
+rough ends may be off by several pixels each in any direction.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from gripmon.track.edges.robust_fit import RobustFitSettings
 REACH_PX = 10.0
 """Search distance from the rough ends of an edge."""
 LARGEST_REACH_SHARE = 0.25
-"""Of the edge's length: beyond that it is more likely another one."""
+"""Largest search distance over the edge's length: farther away it is more likely another edge."""
 FINAL_REACH_PX = 5.0
 END_MARGIN_PX = 4.0
 SEEN_SHARE = 0.4
-"""Part of its profiles that must show an edge."""
+"""Least part of its search lines that must show an edge."""
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
 TELLING = 0.1
-"""Of the most that a profile knows of its edge before a print: what knows less isn't counted."""
+"""Least information of a search line in front of a print, over the most that one has; those with less are dropped."""
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
@@ -65,8 +65,8 @@ class FoundOutline:
 
 @dataclass(frozen=True, slots=True)
 class _Base:
-    """An edge between two rough ends as the lens shows it: ``uv_px`` (n, 2) and ``normal`` (n, 2), to the right of who
-    walks from the first end; ``way`` (n,) from 0 to 1 between ``first`` and ``last``, the two ends of what is sampled.
+    """An edge between two rough ends as the lens shows it: ``uv_px`` (n, 2) and ``normal`` (n, 2), to the right when
+    going from the first end; ``way`` (n,) from 0 to 1 between ``first`` and ``last``, the ends of the sampled part.
     """
 
     uv_px: Array
@@ -75,9 +75,9 @@ class _Base:
 
 
 def find_outline(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> FoundOutline:
-    """The outline on the edges that the image shows; before a known print, which has edges of its own, by
-    :mod:`~gripmon.teach.plate_print`.  Raises :class:`CalibrationError`, which names the corner or edge:
-    outside of the image, not seen, or no corner.
+    """The outline on the edges that the image shows; in front of a known print, which has edges of its own, by
+    :mod:`~gripmon.teach.plate_print`.  Raises :class:`CalibrationError` with the name of the corner or edge that is
+    outside of the image, not seen, or not a corner.
     """
     points = outline.points
     _check_inside(camera, outline)
@@ -115,7 +115,7 @@ def _check_inside(camera: Camera, outline: Outline) -> None:
 
 
 def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) -> tuple[_Base, float]:
-    """Sample points a pixel apart, less a margin at both ends."""
+    """Sample points one pixel apart, without a margin at both ends."""
     length_px = float(np.linalg.norm(end - start))
     if not length_px >= SHORTEST_PX:
         raise CalibrationError(f"{names}: {length_px:.0f} px apart; at least {SHORTEST_PX:g} px, two different corners")
@@ -169,7 +169,7 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
 
 
 def _side(outline: Outline, point: int) -> float:
-    """On which side of its edges the finger of a ``point`` lies: 1 to the right of who walks along them, or -1."""
+    """The side of its edges on which the finger of a ``point`` lies: 1 to the right when going along them, else -1."""
     inner = {name: outline.points[outline.names.index(name)] for name in INNERMOST}
     own = outline.names[point].partition("_")[0]
     other = "right" if own == "left" else "left"
@@ -181,8 +181,8 @@ def _side(outline: Outline, point: int) -> float:
 def _line_before(
     image: Image, printed: PlatePrint, base: _Base, reach_px: float, names: str, finger: float, known_px: float | None
 ) -> SeenEdge:
-    """The edge of a finger on the side ``finger`` of the base before a known print: near it and with its blur, if that
-    is ``known_px``, or else anywhere within reach.
+    """The edge of a finger, on the side ``finger`` of the base, in front of a known print: near the base and with the
+    blur ``known_px`` if that is given, else anywhere within reach.
     """
     scene = look_at(image, printed, base.uv_px, base.normal, reach_px + 6.0, finger)
     ends_px = rough_line(scene, base.way, reach_px) if known_px is None else np.zeros(2)
@@ -219,8 +219,8 @@ def _line_before(
 
 
 def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
-    """The line (2,), its offsets at both ends, that most points by their ``worth`` (k,) support, of those alike the
-    nearest to the rough one.
+    """The line (2,), its offsets at both ends, that most points support, weighted by ``worth`` (k,); of similar ones
+    the closest to the rough line.
     """
     steps = np.arange(-reach_px, reach_px + 0.5 * _GRID_PX, _GRID_PX)
     ends = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -236,7 +236,9 @@ def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
 
 
 def _meet(camera: Camera, outline: Outline, points: Array, bases: list[_Base], ends_px: list[Array]) -> Array:
-    """The outline's points moved to where their edges' lines meet; an end of one edge alone to its foot on the line."""
+    """The outline's points moved to the intersections of their edges' lines; the end of a single edge to its foot on
+    the line.
+    """
     lines = [_ideal_line(camera, base, ends) for base, ends in zip(bases, ends_px, strict=True)]
     out = points.copy()
     for k, name in enumerate(outline.names):
@@ -255,7 +257,7 @@ def _meet(camera: Camera, outline: Outline, points: Array, bases: list[_Base], e
 
 
 def _ideal_line(camera: Camera, base: _Base, ends_px: Array) -> tuple[Array, float]:
-    """Unit normal (2,) and distance from the origin, ideal coordinates."""
+    """Unit normal (2,) and distance from the origin, in ideal coordinates."""
     where = base.uv_px[[0, -1]] + ends_px[:, None] * base.normal[[0, -1]]
     first, last = camera.undistort(where)
     along = (last - first) / np.linalg.norm(last - first)
@@ -264,7 +266,7 @@ def _ideal_line(camera: Camera, base: _Base, ends_px: Array) -> tuple[Array, flo
 
 
 def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Base], seen: list[SeenEdge]) -> Array:
-    """(2c, 2c) of the corners, from their lines'."""
+    """Covariance (2c, 2c) of the corners, from those of their lines."""
     corners = list(outline.corners)
     out = np.zeros((2 * len(corners), 2 * len(corners)))
     ends_px = [edge.line.ends_px for edge in seen]
@@ -282,13 +284,13 @@ def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Ba
 
 
 _LEAST_PX = 0.01
-"""Standard deviation of a point: no image gives it better than that."""
+"""Least standard deviation of a point: no image gives it better."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeenEdge:
-    """A line with the ``points`` (k,) it was chosen from, their edges' ``width_px`` (k,), and what they know of the
-    line (k,), on average 1; None: all the same.
+    """A line with the ``points`` (k,) it was chosen from, their edges' ``width_px`` (k,), and their information
+    ``worth`` (k,), 1 on average; equal if None.
     """
 
     line: Line
@@ -305,20 +307,20 @@ class SeenEdge:
 
 
 def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
-    """(2, 2) of each line's offsets at both ends, px.
+    """Covariance (2, 2) of each line's offsets at both ends, px.
 
-    Neighbouring points err together where there is texture, independently where there is only noise.  Which it is, the
-    residuals' sums over stretches of an edge show it: divided by the root of their counts they have the variance v of a
-    point if all are independent, and up to :data:`STRETCH` times that if those of a stretch are one.  Either way the
-    line's covariance is ``v (A' A)^-1``, A being its design (Huber, "Robust statistics", 1981, section 6.3, for groups
-    that err together).  v comes from all edges together, as one alone has few stretches, or from the edge itself where
-    that shows more.
+    Errors of neighbouring points are correlated where there is texture, independent where there is only noise.  Sums of
+    the residuals over stretches of an edge show which: divided by the square root of their counts, they have the
+    variance v of a point if all points are independent, and up to :data:`STRETCH` times that if a stretch is fully
+    correlated.  In both cases the line's covariance is ``v (A' A)^-1`` with its design A (Huber, "Robust statistics",
+    1981, section 6.3, for correlated groups).  v is taken from all edges together, as a single edge has few stretches,
+    or from the edge itself if that is larger.
 
-    On top comes what all points of an edge share, which no residual shows.
+    The error that all points of an edge share, which residuals don't show, is added.
     """
     squares, freedom = np.array([_stretches(edge) for edge in seen]).T
     free = float(freedom.sum())
-    # Known from few stretches itself: Student's distribution has this variance.
+    # v is known from few stretches only: Student's distribution has this variance.
     student = free / (free - 2.0) if free >= FEWEST_FREE else FEWEST_FREE
     usual_px2 = student * float(squares.sum()) / max(free, 1.0)
     floor_px = RobustFitSettings().edge_floor_px
@@ -339,7 +341,7 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
     member = edge.points.profile[inlier] // STRETCH
     stretch = (member[:, None] == np.unique(member)).astype(np.float64)
     stretch /= np.sqrt(stretch.sum(axis=0))
-    # The line's two unknowns take their part: tr(S' (I - P) S).
+    # The line's two unknowns reduce it: tr(S' (I - P) S).
     basis = np.linalg.qr(design)[0]
     return float(np.square(stretch.T @ residual).sum()), float(stretch.shape[1] - np.square(basis.T @ stretch).sum())
 
@@ -347,7 +349,7 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
 def measure_outlines(
     camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
 ) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of fingertips that aren't known, from their rough outlines; ``printed`` and errors as in
+    """Corners of an unknown gripper's fingertips, from their rough outlines; ``printed`` and errors as in
     :func:`find_outline`.
     """
     snapped = find_outline(camera, image, outline, printed)

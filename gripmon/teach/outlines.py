@@ -1,8 +1,8 @@
 """Fingertips of an unknown gripper: how their corners are named, which edges meet in them, and the resulting gripper
 file.
 
-Names are FINGER_POINT.  FINGER is ``left`` or ``right``: the gripper's x axis points from left to right.  POINT is, with
-the left finger on the left in the image (imagine the image turned if it isn't):
+Names are FINGER_POINT.  FINGER is ``left`` or ``right``: the gripper's x axis points from left to right.  POINT is,
+with the left finger on the left in the image (imagine the image turned if it isn't):
 
     inner_near, inner_far   where the fingertip's contact face ends on the other finger's side; near is the upper one
                             in the image, far the lower one

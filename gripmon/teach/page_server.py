@@ -1,11 +1,11 @@
-"""The page's web server: this machine only unless told otherwise, and only for who knows the address with its token.
+"""The page's web server: reachable only from this machine unless told otherwise, and only with the address's token.
 
-A page of another site that is open in the same browser can send requests here, too, or have its name resolve to
-127.0.0.1 (DNS rebinding).  So every request must name this very host, carry the token in its path, and come from this
-page where the browser names an origin; no header allows other sites anything.
+A page of another site in the same browser can also send requests here, or have its name resolve to 127.0.0.1 (DNS
+rebinding).  So every request must name this host, carry the token in its path, and come from this page if the browser
+names an origin; no header gives other sites access.
 
-By the standard library: with starlette and uvicorn these checks, which are most of this file, would stay the same, and
-five more packages would be installed.
+It uses the standard library: with starlette and uvicorn these checks, most of this file, would be the same, and five
+more packages would be installed.
 """
 
 from __future__ import annotations
@@ -76,13 +76,13 @@ _HEADERS = {
 
 
 Served = tuple[bytes, str]
-"""What is sent, and its media type."""
+"""The content of an answer, and its media type."""
 Action = tuple[type[Any], Callable[[Any], object]]
-"""What a request's body has to be, and what answers it; :class:`BadRequest` from it is sent as one line."""
+"""The type of a request's body, and the function that answers it; its :class:`BadRequest` is sent as one line."""
 
 
 class Site(Protocol):
-    """What a server shows.  Paths are those below the token; both methods may be called from any thread."""
+    """The content of a server.  Paths are those below the token; both methods may be called from any thread."""
 
     def get(self, path: str) -> Served | None:
         """None: there is nothing at this address."""
@@ -94,7 +94,7 @@ class Site(Protocol):
 
 
 def web_files(first: str, *names: str) -> dict[str, Served]:
-    """Files of the folder ``web`` by the path that they are served at; ``first`` at the root."""
+    """Files of the folder ``web`` by the path at which they are served; ``first`` at the root."""
     folder = importlib.resources.files("gripmon.teach") / "web"
     return {
         "" if name == first else name: ((folder / name).read_bytes(), _KINDS[Path(name).suffix])
@@ -103,7 +103,7 @@ def web_files(first: str, *names: str) -> dict[str, Served]:
 
 
 class PageServer:
-    """Serves one site until it is done.  OSError from the constructor if the port is taken, or ``address`` is not
+    """Serves one site until it is done.  The constructor raises OSError if the port is taken, or if ``address`` isn't
     this machine's.
     """
 
@@ -114,7 +114,7 @@ class PageServer:
         self._thread.start()
 
     def close(self) -> None:
-        """No more requests are taken; may be called twice."""
+        """Stop taking requests; may be called twice."""
         self._http.shutdown()
         self._http.server_close()
         self._thread.join()
@@ -129,7 +129,7 @@ def serve(
     look: Callable[[], object] = lambda: None,
     address: str = ADDRESS,
 ) -> None:
-    """Serve it until the person is done.  ``announce`` hears its address; ``look`` is called now and then.
+    """Serve a site until the person is done.  ``announce`` gets its address; ``look`` is called regularly.
 
     Raises :class:`~gripmon.model.errors.InputError` for a port that is taken, or an ``address`` that isn't this
     machine's.
@@ -146,14 +146,14 @@ def serve(
         displayed = sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
         if open_browser and displayed:
             webbrowser.open(server.url)
-        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
+        while not server.done.wait(_LOOK_S):  # returns regularly, to notice an interrupt caught by another thread
             look()
     finally:
         server.close()
 
 
 class _Http(ThreadingHTTPServer):
-    """With what the handlers share."""
+    """A server with what its handlers share."""
 
     daemon_threads = True
     request_queue_size = 32
@@ -168,12 +168,12 @@ class _Http(ThreadingHTTPServer):
         self.url = f"http://{address}:{self.server_port}/{self.token}/"
 
     def server_bind(self) -> None:
-        """Without the look-up of the host's name that the base class makes: it may take seconds."""
+        """Bind without the base class's look-up of the host's name, which may take seconds."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in the middle is nothing to report."""
+        """A browser that disconnects early is no error to report."""
         _log.debug("request of %s failed", client_address, exc_info=True)
 
 
@@ -197,7 +197,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def _answer(self, act: Callable[[str], Served]) -> None:
-        """Every request ends with an answer in one line."""
+        """Answer every request, errors with one line."""
         status, kind = HTTPStatus.OK, "application/json"
         try:
             data, kind = act(self._checked_path())
@@ -208,11 +208,11 @@ class _Handler(BaseHTTPRequestHandler):
         except (ConnectionError, TimeoutError):
             self.close_connection = True
             return
-        except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
+        except Exception as error:  # noqa: BLE001  whatever it is, report it to the page, and go on
             _log.debug("request failed", exc_info=True)
             status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(in_short(error))
         if status is not HTTPStatus.OK:
-            self.close_connection = True  # what is left of its body is not read
+            self.close_connection = True  # the rest of its body is not read
         with contextlib.suppress(ConnectionError, TimeoutError):
             self._send(status, data, kind)
         if self._last:
@@ -233,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.encode(Failure(error=" ".join(text.split())))
 
     def _checked_path(self) -> str:
-        """What is asked for, below the token."""
+        """The requested path below the token."""
         server = self.server
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or hosts[0] not in server.hosts:
@@ -261,7 +261,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.encode(act(self._body(kind))), "application/json"
 
     def _end(self, _order: Nothing) -> None:
-        """The process ends once this has been answered."""
+        """End the process once this request has been answered."""
         self._last = self.close_connection = True
 
     def _body(self, kind: type[_T]) -> _T:
@@ -278,12 +278,12 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.BAD_REQUEST, f"not understood: {error}") from None
 
     def log_message(self, format: str, *args: Any) -> None:
-        """The token stands in every address: nothing of it goes to a log."""
+        """Log nothing: every address contains the token."""
 
 
 class TeachSite:
-    """The teaching page on one session.  ``back``: where the page goes when the person is done, None: nowhere;
-    ``saves``: which files it offers, None: all.
+    """The teaching page for one session.  ``back``: where the page goes when the person is done, None for nowhere;
+    ``saves``: which files it offers, None for all.
     """
 
     def __init__(
@@ -323,10 +323,10 @@ _COLUMNS = {"left": 0.06, "right": 0.8}
 
 
 class OutlineSession:
-    """As :class:`gripmon.teach.session.TeachSession`, without a gripper: one image, whose corners go to ``path``.
+    """Like :class:`gripmon.teach.session.TeachSession`, without a gripper: one image, whose corners go to ``path``.
 
-    ``follows``: the command that reads that file, ``note``: a remark on it; ``saved``: what was last written,
-    None before.
+    ``follows``: the command that reads that file; ``note``: a remark on it; ``saved``: what was last written, None
+    before.
     """
 
     def __init__(self, picture: Picture, path: Path, follows: str, note: str):
@@ -335,10 +335,10 @@ class OutlineSession:
         self.saved: Saved | None = None
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def dark(self) -> tuple[float, str]:
-        """There is no camera that could show nothing."""
+        """Always 0: there is no camera."""
         return 0.0, ""
 
     def state(self) -> State:
@@ -357,7 +357,7 @@ class OutlineSession:
             gripper="no gripper file yet",
             reference=None,
             needed=2 * len(INNERMOST),
-            robot="robot",  # neither name is asked for, nor written
+            robot="robot",  # the page neither asks for these names nor writes them
             camera_name="camera",
             fixed_names=True,
             folder=str(self._path.parent.resolve()),
@@ -384,7 +384,7 @@ class OutlineSession:
         return encoded(self._picture.image, ".png")
 
     def save(self, order: SaveOrder) -> Saved:
-        """Write the corners that were put, if ``calibrate plane --infer`` can use them; else say why not."""
+        """Write the corners if ``calibrate plane --infer`` can use them; otherwise return the reason."""
         corners = order.put.corners
         try:
             outlines_of(corners)
@@ -412,7 +412,7 @@ class OutlineSession:
 
 
 def _columns(width_px: int, height_px: int) -> dict[str, Place | None]:
-    """Where the handles wait: a column for each finger, in the order of its outline."""
+    """First positions of the handles: a column for each finger, in the order of its outline."""
     order = [f"{point}_near" for point in reversed(POINTS)] + [f"{point}_far" for point in POINTS]
     return {
         f"{finger}_{point}": (round(share * width_px, 1), round((k + 0.7) / (len(order) + 0.8) * height_px, 1))

@@ -1,4 +1,4 @@
-"""What a plate's print looks like wherever it may be seen: the background of an outline, known beforehand."""
+"""What a plate's print looks like anywhere in an image: the known background of an outline."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from gripmon.model.targets import Charuco, Chequerboard, Target
 from gripmon.track.edges.profiles import read_profiles
 
 _BESIDE = 0.1
-"""Of a square, from a corner along both axes: a square shows its own colour there, before any mark in it."""
+"""Distance from a corner, in squares, along both axes, at which a square shows its own colour, outside of any mark."""
 _MARK_PX = 12
-"""Size of a mark's cells in the picture that is looked up."""
+"""Size of a mark's cells in the rendered board."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlatePrint:
     """A chequerboard, with or without marks, at ``cam_T_plate`` (4, 4) of ``camera``.
 
-    Squares ``step_m`` long are counted from ``origin_m`` (2,); those from ``first`` (2,) to before ``last`` (2,) are
-    known to be there, and the square (0, 0) is light if ``first_light``.  ``marked``: the whole print from above, if it
-    has marks.  ``light`` and ``dark`` (3,): grey levels, constant and slopes along u and v.
+    Squares ``step_m`` long are counted from ``origin_m`` (2,); those from ``first`` (2,) up to ``last`` (2,),
+    exclusive, are known to exist, and the square (0, 0) is light if ``first_light``.  ``marked``: the whole print from
+    above, if it has marks.  ``light`` and ``dark`` (3,): grey levels, constant and slopes along u and v.
     """
 
     camera: Camera
@@ -42,7 +42,7 @@ class PlatePrint:
     dark: Array
 
     def shown(self, uv_px: Array) -> Array:
-        """(n,) 1 where pixels (n, 2) lie on light print, 0 on dark, nan beyond the pattern."""
+        """1 where pixels (n, 2) lie on light print, 0 on dark, NaN beyond the pattern: (n,)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             sight = np.column_stack([self.camera.undistort(uv_px), np.ones(len(uv_px))])
             depth = (self.cam_T_plate[:3, 2] @ self.cam_T_plate[:3, 3]) / (sight @ self.cam_T_plate[:3, 2])
@@ -67,7 +67,7 @@ class PlatePrint:
 def plate_print(
     camera: Camera, cam_T_plate: Array, sighting: Sighting, target: Target | None, image: Image
 ) -> PlatePrint | None:
-    """The print of a chequerboard or ChArUco board, its colours from the image about its corners; None for discs, whose
+    """The print of a chequerboard or ChArUco board, its grey levels taken near its corners; None for discs, whose
     outlines aren't mistaken for a finger's, and where dark and light can't be distinguished.
     """
     if not isinstance(target, Chequerboard | Charuco) or sighting.disc_radius_m > 0.0:
@@ -99,7 +99,7 @@ def plate_print(
 
 @lru_cache(maxsize=4)
 def _pattern(target: Charuco, first_light: bool) -> NDArray[np.bool_]:
-    """The board from above: of both patterns that OpenCV has had, the one that begins with this colour."""
+    """The board from above: of OpenCV's two patterns, current and legacy, the one that starts with this colour."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     cells = dictionary.markerSize + 2
     square_px = round(_MARK_PX * cells * target.square_m / target.marker_m)
@@ -121,7 +121,7 @@ def _at(image: Image, uv_px: Array) -> Array:
 
 
 def _plane(uv_px: Array, levels: Array) -> Array:
-    """Constant and slopes (3,) of grey levels; half of them, the nearest to their plane, settle it."""
+    """Constant and slopes (3,) of grey levels, by robust least squares."""
     terms = np.column_stack([np.ones(len(uv_px)), uv_px])
     out: Array = np.linalg.lstsq(terms, levels, rcond=None)[0]
     for _ in range(3):
@@ -132,21 +132,21 @@ def _plane(uv_px: Array, levels: Array) -> Array:
 
 
 _FINE = 3
-"""Samples of the prediction a pixel."""
+"""Samples of the prediction per pixel, along each axis."""
 _WINDOW_PX = 2.0
-"""Standard deviation of the weight about the line: the finger's face is of one brightness only nearby."""
+"""Standard deviation of the weight about the line: only close to it is the finger's face uniformly bright."""
 _USUAL_BLUR_PX = 1.0
 _BLURS = np.geomspace(0.5, 3.0, 10)
 _LEAST_DIFFERENCE = 0.1
-"""Of the print's contrast: what levels near the line may differ by from what they were taken to be."""
+"""Least assumed deviation of levels near the line from their model, over the print's contrast."""
 _GRID_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
     """Surroundings of an edge, along it and across: ``seen`` (n, x) of the image with its offsets ``across_px`` (x,);
-    ``print_shown`` (3n, 3x) as :meth:`PlatePrint.shown`; ``light`` and ``dark`` (n,) levels; ``finger``: 1 if it lies
-    on the side of positive offsets, or -1.
+    ``print_shown`` (3n, 3x) as from :meth:`PlatePrint.shown`; ``light`` and ``dark`` (n,) levels; ``finger``: 1 if it
+    lies on the side of positive offsets, or -1.
     """
 
     seen: Array
@@ -159,14 +159,14 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Moves:
-    """``offset_px`` (n,) where each profile has the line, ``worth`` (n,) its information on it (relative)."""
+    """``offset_px`` (n,), each search line's position of the line, and ``worth`` (n,), its relative information."""
 
     offset_px: Array
     worth: Array
 
 
 def look_at(image: Image, printed: PlatePrint, uv_px: Array, normal: Array, aside_px: float, finger: float) -> Scene:
-    """The scene about an edge sampled at ``uv_px`` (n, 2) with its ``normal`` (n, 2)."""
+    """The surroundings of an edge sampled at ``uv_px`` (n, 2) with its ``normal`` (n, 2)."""
     count, half = len(uv_px), int(np.ceil(aside_px))
     across = np.arange(-half, half + 1.0)
     column, row = ((uv_px[:, None, k] + across * normal[:, None, k]).astype(np.float32) for k in (0, 1))
@@ -183,9 +183,8 @@ def look_at(image: Image, printed: PlatePrint, uv_px: Array, normal: Array, asid
 
 
 def rough_line(scene: Scene, way: Array, reach_px: float) -> Array:
-    """The line (2,), its offsets at both ends, that parts what looks like the print from what looks like the finger.
-
-    What a finger looks like is taken from where it must be, beyond the reach of the rough line.
+    """The line (2,), its offsets at both ends, that separates what looks like the print from what looks like the
+    finger.  The finger's level is taken beyond the reach of the rough line, where it must be.
     """
     contrast = float(np.median(scene.light - scene.dark))
     share = _pixels(_blurred(np.nan_to_num(scene.print_shown, nan=1.0), _USUAL_BLUR_PX))
@@ -213,12 +212,12 @@ def rough_line(scene: Scene, way: Array, reach_px: float) -> Array:
 
 
 def moves(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> Moves:
-    """What each profile wants of the line ``ends_px`` (2,)."""
+    """The correction of the line ``ends_px`` (2,) that each search line asks for."""
     line = ends_px[0] * (1.0 - way) + ends_px[1] * way
     fit = _fit(scene, way, line, blur_px)
     step = (_predicted(scene, line + 0.25, blur_px) - _predicted(scene, line - 0.25, blur_px)) / 0.5
     slope, weight, left, finger = fit.applied(step, way), fit.weight, fit.left, fit.finger
-    # The finger's brightness is each profile's own: faces are brushed.
+    # Each search line has its own brightness of the finger: faces are brushed.
     gg, gf, ff = ((weight * a * b).sum(axis=1) for a, b in ((slope, slope), (slope, finger), (finger, finger)))
     gr, fr = ((weight * a * left).sum(axis=1) for a in (slope, finger))
     worth = np.maximum(gg - gf**2 / ff, 0.0)
@@ -239,8 +238,8 @@ def sharpness(scene: Scene, way: Array, ends_px: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """``levels`` (4, 2) of finger, light, dark and unknown background, in the middle and their growth along the edge;
-    what is ``left`` (n, x) of the image, the ``weight`` of its pixels, and the ``finger``'s share in them.
+    """``levels`` (4, 2) of finger, light, dark and unknown background: in the middle, and their change along the edge;
+    ``left`` (n, x), the residual of the image, ``weight`` of its pixels, and the ``finger``'s share in them.
     """
 
     levels: Array
@@ -249,7 +248,7 @@ class _Fit:
     finger: Array
 
     def applied(self, shares: Array, way: Array) -> Array:
-        """The image (n, x) that ``shares`` (n, x, 4) make."""
+        """The image (n, x) that ``shares`` (n, x, 4) give."""
         each = self.levels[:, 0] + self.levels[:, 1] * (way[:, None] - 0.5)
         out: Array = np.einsum("nxk,nk->nx", shares, each)
         return out
@@ -260,14 +259,14 @@ def _fit(scene: Scene, way: Array, line: Array, blur_px: float) -> _Fit:
     weight = np.exp(-0.5 * np.square((scene.across_px - line[:, None]) / _WINDOW_PX))
     root = np.sqrt(weight)
     columns = (np.concatenate([shares, shares * (way[:, None, None] - 0.5)], axis=2) * root[..., None]).reshape(-1, 8)
-    # Some kinds of background may be missing, hence no plain solution.
+    # A kind of background may be absent, hence the pseudo-inverse.
     levels = np.linalg.pinv(columns.T @ columns, rcond=1e-6, hermitian=True) @ (columns.T @ (scene.seen * root).ravel())
     fit = _Fit(levels.reshape(2, 4).T, scene.seen, weight, shares[..., 0])
     return replace(fit, left=scene.seen - fit.applied(shares, way))
 
 
 def _predicted(scene: Scene, line: Array, blur_px: float) -> Array:
-    """Shares (n, x, 4) of the finger, and of light, dark and unknown background, in what each pixel sees."""
+    """Shares (n, x, 4) of the finger, and of light, dark and unknown background, in each pixel."""
     fine = (np.arange(_FINE) - 0.5 * (_FINE - 1)) / _FINE
     at = np.interp(np.add.outer(np.arange(len(line)), fine).ravel(), np.arange(len(line)), line)
     aside = np.add.outer(scene.across_px, fine).ravel()
@@ -286,5 +285,5 @@ def _blurred(fine: Array, blur_px: float) -> Array:
 
 
 def _pixels(fine: Array) -> Array:
-    """Of three samples the middle one: the blur holds the pixel's own extent."""
+    """The middle one of three samples: the blur includes the pixel's own extent."""
     return fine[_FINE // 2 :: _FINE, _FINE // 2 :: _FINE]

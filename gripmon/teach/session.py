@@ -1,8 +1,8 @@
-"""One gripper before one camera while a person teaches it: images, corners put by hand, what follows from them down to
-the accuracy to expect, and the session behind the page's requests.  Nothing here knows HTTP.
+"""One gripper in front of one camera while a person teaches it: images, corners set by hand, what follows from them up
+to the expected accuracy, and the session behind the page's requests.  Nothing here knows HTTP.
 
-Corners put by hand stay with the page, so that two pages that are open don't disturb each other; images that were
-taken from a live camera belong to all of them.
+Corners set by hand stay with the page, so that two open pages don't disturb each other; images taken from a live camera
+are shared by all pages.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ from gripmon.track.edges import TaughtEdges
 
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
-_STEP_M = 1e-4  # of the TCP, for which the delay is given
+_STEP_M = 1e-4  # step of the TCP for which the delay is given
 
 
 class Evaluation(NamedTuple):
-    """Everything that follows from corners put by hand in one image: the reference that it gives (or is known), None
-    with a reason in words; ``expected`` None where too few edges are in view to measure anything.
+    """Everything that follows from corners set by hand in one image: the resulting (or known) ``reference``, None with
+    the reason as a text; ``expected`` None where too few edges are in view to measure anything.
     """
 
     snapped: Snapped
@@ -93,13 +93,13 @@ class Setup:
     camera_error: CameraError | None = None
 
     def prior(self, jaw_opening_m: float | None) -> Prior:
-        """Where the gripper is before any corner is put."""
+        """The expected pose of the gripper before any corner is set."""
         if self.reference is not None:
             return prior_of(self.reference)
         return usual_view(self.camera, self.gripper, jaw_opening_m)
 
     def first_places(self, jaw_opening_m: float | None) -> dict[str, Array]:
-        """Where a person finds the corners before any is put, px."""
+        """Positions at which the page first shows the corners, px."""
         here = place(self.camera, self.gripper, jaw_opening_m, {}, self.prior(jaw_opening_m))[0].cam_T_grip
         points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]
         uv_px = self.camera.project(points_m @ here[:3, :3].T + here[:3, 3])
@@ -108,10 +108,10 @@ class Setup:
     def evaluate(
         self, image: Image, put_px: Mapping[str, Array], by_hand: Sequence[str], jaw_opening_m: float | None
     ) -> Evaluation:
-        """Snap, then the reference, then what may be expected.
+        """Snap, then compute the reference, then the expected accuracy.
 
-        ``put_px`` (name: (2,)): corners put by hand; those of them that are ``by_hand`` count as they stand, the others
-        are only where the search begins.
+        ``put_px`` (name: (2,)): corners set by hand; those listed in ``by_hand`` are used as they are, the others only
+        start the search.
         """
         known = self.reference is not None
         snapper = Snapper(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m)
@@ -152,14 +152,14 @@ class Setup:
         )
 
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
-        """What the images show of every edge.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
+        """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
         found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
         return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
 
 
 def _reference_of(pose: CornerPose) -> ReferenceRecord:
-    """A pose by corners as the reference; numbers as a file holds them."""
+    """A pose from corners as the reference, rounded as in a file."""
     transform = to_record(pose.cam_T_grip)
     rounded = msgspec.structs.replace(
         transform,
@@ -175,7 +175,7 @@ class Saving(Protocol):
     """Writes what was taught."""
 
     def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
-        """Raises :class:`SavingRefused`; a file in the way is reported, not replaced, unless that was agreed."""
+        """Raises :class:`SavingRefused`; an existing file is reported, and replaced only if that was agreed."""
         ...
 
 
@@ -203,7 +203,7 @@ class TeachSession:
         self._newest: Picture | None = None
         self._why_dark: str | None = None
         self._seen_s = time.monotonic()
-        self._lock = threading.Lock()  # one computes at a time: OpenCV and NumPy would only hinder each other
+        self._lock = threading.Lock()  # one computation at a time: OpenCV and NumPy would only slow each other down
         self._arrived = threading.Condition()
         self._ended = False
         self._reader: threading.Thread | None = None
@@ -212,7 +212,7 @@ class TeachSession:
             self._reader.start()
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         with self._arrived:
             self._ended = True
             self._arrived.notify_all()
@@ -261,7 +261,7 @@ class TeachSession:
         return self._infos()
 
     def save(self, order: SaveOrder) -> Saved:
-        """Write what was taught, or say why not.  Raises :class:`BadRequest`."""
+        """Write what was taught, or return the reason why not.  Raises :class:`BadRequest`."""
         if not self._pictures:
             self.take()
         number = order.put.image if order.put.image is not None else len(self._pictures) - 1
@@ -281,7 +281,7 @@ class TeachSession:
         return encoded(self._picture(None).image, ".jpg")
 
     def dark(self) -> tuple[float, str]:
-        """For how long the live camera has shown nothing that can be used (s), and why; 0 without one."""
+        """For how long (s) the live camera has delivered no usable image, and why; 0 without a live camera."""
         with self._arrived:
             if self._live is None or self._newest is not None:
                 return 0.0, ""
@@ -323,7 +323,7 @@ class TeachSession:
         while not self._ended:
             try:
                 frame = live.read()
-            except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
+            except Exception as error:  # noqa: BLE001  whatever a driver raises, report it to the page
                 frame = Waiting(f"{self._labels.live}: {error}; start gripmon teach again")
                 self._ended = True
             if frame is None:
@@ -350,7 +350,7 @@ class TeachSession:
 
 
 def reply(found: Evaluation) -> Reply:
-    """As JSON has it."""
+    """The evaluation as a message."""
     snapped = found.snapped
     return Reply(
         corners=tuple(_corner(corner) for corner in snapped.corners),

@@ -1,16 +1,15 @@
-"""The outline of what stays in images before changing backgrounds, to a fraction of a pixel.
+"""The outline of what is static in images in front of changing backgrounds, to a fraction of a pixel.
 
 Across the outline an image k shows ``D = (1 - alpha(s)) (B_k(s) - F)``: how much of the background B_k, against the
-finger's grey level F, still comes through at a distance s.  One image can't tell the matte ``alpha`` from the
-background's own texture.  Many can: weighted by each image's contrast ``c_k`` a few pixels outside, the textures, which
-differ, average out, and the transition, which doesn't, remains::
+finger's grey level F, shows through at a distance s.  A single image can't separate the matte ``alpha`` from the
+background's own texture, but many images can.  Weighted by each image's contrast ``c_k`` a few pixels outside, the
+textures, which differ, average out, and the transition, which is the same, remains::
 
     T(s) = sum_k c_k D_k(s) / sum_k c_k²  =  Phi((s - e) / blur) (a + b s) + Phi((e - s) / blur) (c + d s)
 
-a and b hold how fast the background forgets its own grey level, c and d the finger's shading, e is the edge's place.
- The scatter of e over the images
-is found by leaving out a tenth of them at a time (the delete-a-group jackknife), which also holds what neighbouring
-points err together.
+a and b describe how fast the background decorrelates from its grey level at c_k, c and d the finger's shading; e is the
+position of the edge.  The scatter of e over the images follows from leaving out a tenth of them at a time (the
+delete-a-group jackknife), which includes correlated errors of neighbouring points.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ from gripmon.model.records import Array
 FOLDS = 10
 BLURS_PX = tuple(np.arange(0.5, 4.01, 0.1).tolist())
 FEWEST_CONTRASTS = 6.0
-"""Over the noise, root of the sum of squares over images: less locates no edge to a sixth of its blur."""
+"""Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
+"""
 _STEP_PX = 0.5
 _WIDE_PX, _NARROW_PX = 8.0, 5.0
 _GRID_PX = 0.125
@@ -39,7 +39,7 @@ _SMOOTH_PX = 3.0
 
 @dataclass(frozen=True)
 class Stations:
-    """Places along an outline: ``uv_px`` (s, 2) and ``normal`` (s, 2) away from the gripper; ``inside`` (s,): the
+    """Points along an outline: ``uv_px`` (s, 2), ``normal`` (s, 2) away from the gripper; ``inside`` (s,): whether the
     search line lies in the image.
     """
 
@@ -52,9 +52,10 @@ class Stations:
 class Transitions:
     """What the images show across an outline.
 
-    ``offset_px`` (s,) of the edge along the normals, ``folds_px`` (f, s) the same without one f-th of the images each,
-    ``usable`` (s,), ``blur_px`` of the transition; ``shift_px`` (n, s): how far an image shows the edge farther out
-    than all do, with the ``worth`` (n, s) of that, 1/px²; ``sharpness`` (n,): of each image's transitions over all's.
+    ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same without one f-th of the images each;
+    ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the edge
+    than all images do, with the information ``worth`` (n, s), 1/px²; ``sharpness`` (n,) of each image's transitions
+    over that of all.
     """
 
     offset_px: Array
@@ -67,7 +68,7 @@ class Transitions:
 
 
 def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
-    """Closed contours (k, 2) of a mask's regions and holes, a point a pixel, smoothed; px."""
+    """Closed contours (k, 2) of a mask's regions and holes, one point per pixel, smoothed; px."""
     found, _ = cv2.findContours(still.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     out = []
     for contour in found:
@@ -94,7 +95,7 @@ def stations_along(contour: Array, still: NDArray[np.bool_], margin_px: float) -
 
 
 def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
-    """(n,) above zero where the normals (n, 2) point into a mask."""
+    """Positive (n,) where the normals (n, 2) point into a mask."""
     soft = cv2.GaussianBlur(still.astype(np.float32), (0, 0), 2.0)
     at = [(uv_px + s * normal).astype(np.float32) for s in (-3.0, 3.0)]
     behind, ahead = (cv2.remap(soft, p[:, :1], p[:, 1:], cv2.INTER_LINEAR)[:, 0] for p in at)
@@ -102,7 +103,7 @@ def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
 
 
 def in_image(uv_px: Array, shape: tuple[int, ...], margin_px: float) -> NDArray[np.bool_]:
-    """(n,) which points lie at least a margin inside an image of a shape."""
+    """Mask (n,) of points at least a margin inside of an image of this shape."""
     limit = np.array([shape[1] - 1.0, shape[0] - 1.0]) - margin_px
     return np.asarray(((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1))
 
@@ -110,8 +111,8 @@ def in_image(uv_px: Array, shape: tuple[int, ...], margin_px: float) -> NDArray[
 def measure_transitions(
     images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float | None = None
 ) -> Transitions:
-    """The edge's place at each station in ``images`` (n, h, w): ``wide`` within 4 px, else within 2 px and more
-    exactly.  ``blur_px`` None: found here.
+    """The edge's position at each station in ``images`` (n, h, w); ``wide`` searches within 4 px, otherwise within 2 px
+    and more exactly.  ``blur_px`` is estimated if None.
     """
     reach = _WIDE_PX if wide else _NARROW_PX
     search = 4.0 if wide else 2.0
@@ -122,10 +123,10 @@ def measure_transitions(
         within, beyond = (s <= -2.0) & (s >= -4.0), (s >= 2.0) & (s <= 4.0)
     finger = _finger_levels(profiles, s, wide=wide)
     d = profiles - finger[None]
-    # An image that shows another grey level on the finger (a shadow, a hand) says nothing of this station.
+    # An image with another grey level on the finger (a shadow, a hand) is not used at this station.
     sound = np.abs(d[:, :, within].mean(axis=2)) < 4.0 * max(noise, 1.0)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
-    # Beyond a few times the usual one a contrast tells no more: what is wrong then is wrong by a share of it.
+    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
     weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
     shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
     weight = weight - shading * weight.mean(axis=0)
@@ -151,8 +152,8 @@ def measure_transitions(
 
 
 def _finger_levels(profiles: NDArray[np.float32], s: Array, *, wide: bool) -> Array:
-    """Grey levels (stations, samples) of the finger, to be taken off: where it surely is what it shows in most images,
-    and the last of these across the edge and beyond.
+    """Grey levels (stations, samples) of the finger, to be subtracted: inside of it, its median over the images; across
+    the edge and beyond, the last of these.
     """
     usual = np.median(profiles, axis=0)
     last = int(np.flatnonzero(s <= (-4.5 if wide else -1.5))[-1])
@@ -161,8 +162,8 @@ def _finger_levels(profiles: NDArray[np.float32], s: Array, *, wide: bool) -> Ar
 
 
 def _shading(profiles: NDArray[np.float32], d: Array, contrast: Array, s: Array, search_px: float) -> float:
-    """How much of the contrasts' mean is left out, 0 to 1: it also sees the finger's own shading, which is the same in
-    all images, where their differences see the background alone.  The shading's variance t² against that of the
+    """Part, 0 to 1, of the contrasts' mean to leave out.  The mean also contains the finger's own shading, which is the
+    same in all images; the contrasts' differences contain only the background.  With the shading's variance t² and the
     backgrounds' texture v, known from n images: ``n t² / (n t² + v)`` (the shrinkage of a random intercept).
     """
     own = np.median(profiles[:, :, s <= -search_px], axis=0)
@@ -184,7 +185,7 @@ def _read(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[
 
 @lru_cache(maxsize=128)
 def _bases(samples: tuple[float, ...], blur_px: float, search_px: float) -> tuple[Array, list[Array]]:
-    """Places that are tried (g,), and an orthonormal basis (samples, 4) of the transitions there."""
+    """Positions to try (g,), and an orthonormal basis (samples, 4) of the transition at each."""
     s = np.array(samples)
     grid = np.arange(-search_px, search_px + 0.5 * _GRID_PX, _GRID_PX)
     bases = []
@@ -209,7 +210,7 @@ def _usual_blur(transition: Array, s: Array, search_px: float) -> float:
 
 
 def _edge(transition: Array, s: Array, blur_px: float, search_px: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Place (stations,) by least squares, and whether it lies inside of what was searched."""
+    """Position (stations,) by least squares, and whether it lies inside of the search range."""
     grid, cost = _misfit(transition, s, blur_px, search_px)
     best = cost.argmin(axis=0)
     inner = (best > 0) & (best < len(grid) - 1)
@@ -223,7 +224,7 @@ def _edge(transition: Array, s: Array, blur_px: float, search_px: float) -> tupl
 def _of_each(
     d: Array, contrast: Array, s: Array, offset: Array, blur_px: float, usable: NDArray[np.bool_]
 ) -> tuple[Array, Array, Array]:
-    """To first order, how far each image shows the edge from where all do, what that is worth, and how sharp it is."""
+    """To first order: shift of the edge in each image against all, its information, and each image's sharpness."""
     away = (s[None] - offset[:, None]) / blur_px
     near = np.abs(away) < 2.5
     rise, slope = ndtr(away), np.where(near, np.exp(-0.5 * away**2) / (blur_px * (2.0 * np.pi) ** 0.5), 0.0)
@@ -231,7 +232,7 @@ def _of_each(
     rest = d - contrast[:, :, None] * rise[None]
     shift = -np.einsum("nij,ij->ni", rest, slope) / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3) / strength
     worth = np.where(usable[None], np.square(contrast), 0.0)
-    # The transition's slope in each image, over the one expected.
+    # The transition's slope in each image over the expected one.
     steep = np.gradient(d, s, axis=2)
     own = np.einsum("nij,ij,ni->n", steep, slope, np.where(usable, contrast, 0.0))
     expected = np.einsum("ij,ni->n", np.square(slope), worth)
@@ -239,10 +240,10 @@ def _of_each(
 
 
 def to_ideal_px(camera: Camera, uv_px: Array) -> Array:
-    """Image coordinates (n, 2) without the lens's distortion, in its pixels: straight edges are straight there."""
+    """Image coordinates (n, 2) without the lens's distortion, in pixels: there straight edges are straight."""
     return np.asarray(camera.undistort(uv_px) * camera.fx_px)
 
 
 def from_ideal_px(camera: Camera, ideal_px: Array) -> Array:
-    """Back to the image."""
+    """The inverse of :func:`to_ideal_px`."""
     return np.asarray(camera.distort(ideal_px / camera.fx_px))

@@ -1,7 +1,7 @@
-"""From corners put by hand to the edges and corners that the image really shows, with what is wrong where it isn't.
+"""From corners set by hand to the real edges and corners in the image, or to the reason why they aren't found.
 
-The corners are only rough; many poses that agree with them are tried, coarsely first, and what is
-measured at the best one is what the monitor itself would measure there.
+The corners are only rough.  Many poses that agree with them are tried, coarsely first; the measurement at the best one
+is what the monitor itself would measure there.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 from gripmon.track.edges.settling import ZOOMS, Expected
 
 FEWEST_PUT = 4
-"""Corners that must be put by hand before edges are looked for, where there is no reference."""
+"""Corners that must be set by hand before edges are searched for, where there is no reference."""
 
 SURE_SHARE = 0.8
-"""Share of agreeing profiles from which no other pose is tried."""
+"""Inlier ratio from which no other pose is tried."""
 
 FARTHEST_SIGMAS = 6.0
-"""How far the gripper may show from the corners put by hand, in their standard deviations (root mean square)."""
+"""Largest distance of the gripper from the corners set by hand, in their standard deviations (root mean square)."""
 
 MISFIT_SIGMAS = (4.0, 12.0)
-"""Distance of a corner from where all together put it, in its standard deviations: from which it is named where nothing
-is found, and from which it must have another one's name.
+"""Distance of a corner from where all together predict it, in its standard deviations: from which it is named if
+nothing is found, and from which it must be mislabelled.
 """
 
 CLEARLY = 1.25
-"""How many times more has to agree with mirrored corners before they are reported as exchanged."""
+"""Factor by which mirrored corners must fit better before they are reported as exchanged."""
 
-_SPREAD = 24  # poses about that of the corners
-_KEPT = (6, 3)  # of them, that are followed to the next finer zoom
-_OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; the gain in χ² from which another is taken
+_SPREAD = 24  # number of poses around that of the corners
+_KEPT = (6, 3)  # how many of them continue to the next finer zoom
+_OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; gain in χ² needed to take another one
 _ALIKE = 0.25  # of the smallest distance between two corners
 
 ON_A_LINE = (
@@ -48,7 +48,7 @@ ON_A_LINE = (
 )
 MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
 NOTHING_SEEN = "no fingers are seen here; corners nearer to the tips"
-"""Why nothing was found, and what would help."""
+"""Reasons why nothing was found, with what would help."""
 
 REASONS = {
     CornerFault.OUTSIDE: "outside of the image",
@@ -62,7 +62,7 @@ REASONS = {
 
 
 class Snapper:
-    """Finds one gripper in the images of one camera from corners put by hand."""
+    """Finds one gripper in the images of one camera from corners set by hand."""
 
     def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
         self.camera, self.gripper, self._settings, self._jaw_sigma_m = camera, gripper, settings, jaw_sigma_m
@@ -70,10 +70,10 @@ class Snapper:
     def snap(
         self, image: Image, put_px: Mapping[str, Array], jaw_opening_m: float | None, prior: Prior, known: bool
     ) -> Snapped:
-        """Look for the gripper.
+        """Search for the gripper.
 
-        ``put_px`` (name: (2,)) the corners put by hand; ``jaw_opening_m`` None where it isn't reported; ``known``: the
-        prior is a calibration, so that no corner need be put.  Never raises for what the image shows or doesn't.
+        ``put_px`` (name: (2,)): the corners set by hand; ``jaw_opening_m`` None where it isn't reported; ``known``: the
+        prior is a calibration, so that no corner has to be set.  Never raises because of the image's content.
         """
         start_m = self._opening(put_px, prior) if jaw_opening_m is None else jaw_opening_m
         placed = place(self.camera, self.gripper, start_m, put_px, prior)
@@ -82,7 +82,7 @@ class Snapper:
             return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
         if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
             return self._rough(placed[0], start_m, misfit)
-        # Only the edges can show how the gripper is turned about such a line; where they don't, that is why.
+        # Only the edges can show the gripper's turn about such a line; if they don't, that is the reason.
         line = None if known or not self._on_a_line(put_px) else ON_A_LINE
         found = self._found(image, placed, start_m, jaw_opening_m is not None)
         if not known and self._mirrored_fits(image, put_px, start_m, jaw_opening_m is not None, prior, found):
@@ -100,7 +100,7 @@ class Snapper:
     def _found(
         self, image: Image, placed: Sequence[Placed], jaw_opening_m: float, reported: bool
     ) -> Measurement | None:
-        """The best of what is measured from each of the poses."""
+        """The best measurement from any of the poses."""
         best: Measurement | None = None
         for pose in placed[:2]:
             if reported and best is None:
@@ -117,7 +117,7 @@ class Snapper:
         return best
 
     def _opening(self, put_px: Mapping[str, Array], prior: Prior) -> float:
-        """The jaw opening that the corners put by hand fit best, where it differs clearly from the nominal one."""
+        """The jaw opening that fits the corners set by hand best, if it is clearly better than the nominal one."""
         gripper = self.gripper
         if not gripper.has_jaw or len(put_px) < FEWEST_PUT:
             return gripper.jaw_nominal_m
@@ -135,8 +135,8 @@ class Snapper:
         prior: Prior,
         found: Measurement | None,
     ) -> bool:
-        """Whether clearly more agrees with the corners of both fingers exchanged: four corners in a plane also have a
-        pose that sees them from behind.
+        """Whether the image fits clearly better if both fingers' corners are exchanged: four corners in a plane also
+        have a pose seen from behind.
         """
         worth = 0.0 if found is None else _worth(found)
         twins = _twins(self.gripper, opening_m)
@@ -153,7 +153,7 @@ class Snapper:
         return meter.measure(image, cam_T_grip, jaw_opening_m, USUAL_SHARE, NARROW, reported)
 
     def _misfit(self, placed: Placed, sigmas: float) -> str | None:
-        """The corner that fits the others least, in words, where it is farther from them than that."""
+        """The corner that fits the others least, as a text, if it is farther away than ``sigmas``; else None."""
         name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
         if away_px <= sigmas * rough_sigma_px(self.camera):
             return None
@@ -162,13 +162,13 @@ class Snapper:
         return f"{name} is {where}; another corner, or another jaw opening?"
 
     def _on_a_line(self, put_px: Mapping[str, Array]) -> bool:
-        """Whether the corners put by hand lie on one line of the gripper."""
+        """Whether the corners set by hand lie on one line of the gripper."""
         put = [name in put_px for name in self.gripper.corner_ids]
         return on_a_line(self.gripper.points_grip_m()[self.gripper.corner_points[put]])
 
     def _away_px(self, found: Measurement, put_px: Mapping[str, Array]) -> float:
-        """Root mean square distance between the corners put by hand and where the measured gripper has them; infinite
-        where the lens maps one of them nowhere.
+        """Root mean square distance between the corners set by hand and those of the measured gripper; infinite where
+        the lens can't map one of them.
         """
         if not put_px:
             return 0.0
@@ -231,7 +231,7 @@ class Snapper:
 
 
 def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | None:
-    """Each corner's counterpart on the other finger; None where the fingers aren't each other's mirror image."""
+    """Each corner's counterpart on the other finger; None where the fingers aren't mirror images of each other."""
     at = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     apart = np.linalg.norm(at[:, None] * [-1.0, 1.0, 1.0] - at, axis=2)
     nearest = apart.argmin(axis=1)
@@ -245,7 +245,7 @@ def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | No
 def outlines_px(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None, points: int = 17
 ) -> dict[str, Array]:
-    """Where the visible edges show: name: (points, 2), px, without those that the lens maps nowhere."""
+    """Image of the visible edges: name: (points, 2), px, without points that the lens can't map."""
     points_m = gripper.points_grip_m(jaw_opening_m)
     eye_m = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
     edges = np.flatnonzero(gripper.edge_view(points_m, eye_m).visible)
@@ -258,17 +258,17 @@ def outlines_px(
 
 
 def _worth(measurement: Measurement) -> float:
-    """What agrees, by how many edges it is spread over: one finger alone can agree anywhere along itself."""
+    """Inlier ratio, weighted by the part of the edges that show it: a single finger can fit anywhere along itself."""
     edges = measurement.prediction.layout.edges
     seen = np.count_nonzero(measurement.consensus.edge_seen[edges]) / max(len(edges), 1)
     return measurement.consensus.share * seen * (1.0 if measurement.trusted else 0.5)
 
 
 class _Meter(FingertipMeter):
-    """Tries many poses, with a coarse zoom first: its profiles reach farther."""
+    """Tries many poses, with a coarse zoom first, whose search lines reach farther."""
 
     def followed(self, image: Image, placed: Placed, jaw_opening_m: float, reported: bool) -> Expected:
-        """The most promising pose among those that the corners put by hand allow."""
+        """The most promising pose among those that the corners set by hand allow."""
         self._prior = self._prior_reported if reported else self._prior_unreported
         root = np.linalg.cholesky(placed.covariance)
         poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_SPREAD)]
@@ -282,10 +282,10 @@ class _Meter(FingertipMeter):
 
 
 def _spread(count: int) -> Array:
-    """(count, 6) standard normal offsets without gaps or clusters, the first one zero."""
+    """Standard normal offsets (count, 6) without gaps or clusters, the first one zero."""
     from scipy.stats import norm, qmc
 
-    # Fixed: the same corners give the same answer.
+    # Deterministic: the same corners give the same result.
     points = qmc.Halton(6, scramble=False).random(count + 1)[1:]
     offsets = norm.ppf(points)
     offsets[0] = 0.0

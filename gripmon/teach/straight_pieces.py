@@ -1,8 +1,8 @@
-"""Chains of edge points to straight pieces: long ones where an edge is straight, short ones where it is curved.
+"""From chains of edge points to straight pieces: long ones where an edge is straight, short ones where it is curved.
 
-Which points make a piece is decided for the whole chain at once (dynamic programming, Bellman 1961): the sum of squares
-about the pieces, in units of the points' scatter, and a price for each piece, what Schwarz's criterion asks for its
-unknowns.  Pieces then are measured again on stations of their own, less their ends, and adjacent ones meet in vertices.
+The pieces of a whole chain are chosen at once by dynamic programming (Bellman 1961).  The cost is the sum of squares
+about the pieces, in units of the points' scatter, plus a price per piece: Schwarz's criterion for its unknowns.  Each
+piece is then measured again on stations of its own, without its ends, and adjacent pieces meet in vertices.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from gripmon.teach.silhouette import Stations, from_ideal_px, in_image, measure_
 from gripmon.track.edges.prediction import STRETCH
 
 SHORTEST_PIECE_PX = 6.0
-"""What is left of 8 px less the ROWS that a search line is wide at both ends."""
+"""Shortest piece: what remains of 8 px after removing the width of a search line (ROWS) at both ends."""
 LEAST_SCATTER_PX = 0.05
-"""Of an edge point: no image gives it better, whatever the points themselves show."""
+"""Least scatter of an edge point: no image gives it better, whatever the points themselves show."""
 CORNER_SAG_PX = 0.6
-"""Two pieces that turn by more than a curve which they draw could: on a circle each would miss it by length * turn / 8,
-and pieces miss their curve by STRAIGHT_PX, or four times that where the points scatter."""
+"""Largest sag, length * turn / 8, of two pieces that approximate a curve; beyond it they form a corner.  Pieces miss
+their curve by STRAIGHT_PX, or up to four times that where the points scatter."""
 END_MARGIN_PX = 2.5
-"""At both ends of a piece: the blur of the next one reaches so far (3 sigma of 0.8 px)."""
+"""Margin at both ends of a piece: the blur of the next piece reaches this far (3 sigma of 0.8 px)."""
 STRAIGHT_PX = 0.2
-"""By which a line may miss an edge, beside its own scatter: as exactly as an outline is to be known."""
+"""Largest distance of a line from its edge, besides its own scatter: the accuracy wanted of an outline."""
 WORST_RMS_PX = 0.5
-"""Scatter about a piece beyond which it is none: twice and more what a curve leaves about its pieces."""
+"""Largest scatter about a piece: at least twice what a curve leaves about its pieces."""
 LONGEST_CUT_PX = 24.0
-"""Of a piece that may only be the smoothed contour cutting a corner off, which two edges that go on then decide."""
+"""Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
-"""Next to a corner its two edges' blur runs together."""
+"""Distance from a corner within which the blur of its two edges mixes."""
 STATION_MARGIN_PX = 6.0
-"""From the image's border: search lines reach so far, with what interpolation reads beside them."""
+"""Margin to the image's border: the reach of search lines, with the neighbours that interpolation reads."""
 _GAP_PX = 12.0
 _OUTLIER_PX = 1.0
 _MOST_POINTS = 1500
@@ -45,9 +45,10 @@ _MOST_POINTS = 1500
 
 @dataclass(frozen=True)
 class Chain:
-    """Vertices (v, 2) in the image in turn, ``closed`` or from end to end.  ``folds_px`` (f, v, 2) the same without a
-    tenth of the images each; ``corner`` (v,): two pieces meet in it; ``rms_px`` (pieces,) scatter about each piece,
-    ``sigma_px`` (v,) of a vertex across its pieces.  Walking along it the gripper lies on the left in the image.
+    """Consecutive vertices ``uv_px`` (v, 2) in the image, ``closed`` or from end to end.  ``folds_px`` (f, v, 2): the
+    same without a tenth of the images each; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px`` (pieces,)
+    scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left in the
+    image.
     """
 
     uv_px: Array
@@ -59,27 +60,27 @@ class Chain:
 
     @property
     def pieces(self) -> list[tuple[int, int]]:
-        """Ends of all pieces."""
+        """Vertex indices of the two ends of each piece."""
         n = len(self.uv_px)
         return [(k, (k + 1) % n) for k in range(n if self.closed else n - 1)]
 
     @property
     def sigma_px(self) -> Array:
-        """(v,) standard deviation of a vertex by the scatter over the images, the larger axis (delete-a-group
+        """Standard deviation (v,) of a vertex along its larger axis, from the scatter over the images (delete-a-group
         jackknife).
         """
         return jackknife_sigma(self.folds_px).max(axis=1)
 
 
 def jackknife_sigma(folds: Array) -> Array:
-    """Standard deviation over the folds (f, ...) of what was found without one f-th of the images each."""
+    """Standard deviation from results (f, ...), each computed without one f-th of the images."""
     count = len(folds)
     return np.asarray(np.sqrt((count - 1) / count * np.square(folds - folds.mean(axis=0)).sum(axis=0)))
 
 
 def runs(usable: NDArray[np.bool_], uv_px: Array) -> list[tuple[NDArray[np.intp], bool]]:
-    """Chains of a closed contour's usable points, indices in turn, split where more than 12 px are missing; whether it
-    is closed.
+    """Chains of a closed contour's usable points, as consecutive indices, split where more than 12 px are missing; and
+    whether each is closed.
     """
     at = np.flatnonzero(usable)
     if len(at) < 2 * SHORTEST_PIECE_PX:
@@ -100,14 +101,14 @@ def runs(usable: NDArray[np.bool_], uv_px: Array) -> list[tuple[NDArray[np.intp]
 
 
 def without_outliers(offset_px: Array, chain: NDArray[np.intp]) -> NDArray[np.intp]:
-    """A chain's points without those that stand off their neighbours' median."""
+    """A chain's points without those far from the median of their neighbours."""
     values = offset_px[chain]
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, 5, mode="edge"), 11)
     return chain[np.abs(values - np.median(windows, axis=1)) < _OUTLIER_PX]
 
 
 def split(points: Array) -> list[int]:
-    """Indices where the pieces of a chain (n, 2) begin and end."""
+    """Indices at which the pieces of a chain (n, 2) begin and end."""
     stride = max(1, math.ceil(len(points) / _MOST_POINTS))
     p = points[::stride]
     n = len(p)
@@ -115,7 +116,7 @@ def split(points: Array) -> list[int]:
     if n < 2 * least:
         return [0, len(points) - 1]
     scatter = max(_scatter(p), LEAST_SCATTER_PX)
-    # Neighbouring points err together: of a stretch's points about a fourth are independent.
+    # Errors of neighbouring points are correlated: about one in four of a stretch's points is independent.
     price = 3.0 * math.log(n) * STRETCH / 4.0
     sums = np.vstack([np.zeros(5), np.cumsum(_moments(p - p.mean(axis=0)), axis=0)])
     best, before = np.full(n + 1, np.inf), np.zeros(n + 1, dtype=int)
@@ -139,7 +140,7 @@ def _moments(p: Array) -> Array:
 
 
 def _misfit(sums: Array, starts: NDArray[np.intp], end: int) -> Array:
-    """Sum of squares about the best line of the points from each start to the end."""
+    """Sum of squares of the points from each start to the end about their best line."""
     count = end - starts
     x, y, xx, xy, yy = (sums[end] - sums[starts]).T
     a, b, c = xx - x * x / count, xy - x * y / count, yy - y * y / count
@@ -147,7 +148,7 @@ def _misfit(sums: Array, starts: NDArray[np.intp], end: int) -> Array:
 
 
 def _scatter(p: Array) -> float:
-    """Of points about a smooth curve: second differences across the chain."""
+    """Scatter of points about a smooth curve, from second differences across the chain."""
     second = p[:-2] - 2.0 * p[1:-1] + p[2:]
     along = p[2:] - p[:-2]
     along /= np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
@@ -157,7 +158,7 @@ def _scatter(p: Array) -> float:
 
 @dataclass(frozen=True)
 class _Line:
-    """Unit normal and distance, ideal pixels, of all images and (f,) of the folds; ``rms_px`` of its points."""
+    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points."""
 
     normal: Array
     distance: float
@@ -176,8 +177,8 @@ def fit_chain(
     closed: bool,
     blur_px: float,
 ) -> Chain | None:
-    """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normal away from the
-    gripper there.  None where nothing straight of at least 8 px is left.
+    """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
+    gripper.  None where no straight piece of at least 8 px is left.
     """
     if closed:
         points, outward = _from_a_corner(points, outward)
@@ -219,8 +220,8 @@ def _without_rounding(
     found: list[_Found],
     closed: bool,
 ) -> list[_Found]:
-    """Without short pieces that only cut a sharp corner off, as the smoothed contour did on which the points lie: the
-    two next to it go on straight until they meet.
+    """Remove short pieces that only cut a sharp corner off, as the smoothed contour below the points does: their two
+    neighbours continue straight until they meet.
     """  # fmt: skip
     out = list(found)
     k = 0 if closed else 1
@@ -245,7 +246,7 @@ def _without_rounding(
 def _goes_on(
     camera: Camera, images: NDArray[np.float32], noise: float, start: Array, meet: Array, outward: Array, blur_px: float
 ) -> bool:
-    """Whether an edge follows its line from its end on to a corner, ideal pixels."""
+    """Whether an edge follows its line from its end to a corner, ideal pixels."""
     length = float(np.linalg.norm(meet - start))
     if length < 2.0 * CORNER_BLUR_PX:
         return True
@@ -259,7 +260,7 @@ def _goes_on(
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
-    """Whether one line explains two pieces, but for twice their ends' own scatter, up to as much again."""
+    """Whether one line explains two pieces, within a tolerance plus twice their ends' scatter, at most doubled."""
     for span, line in parts:
         for k in span:
             end = _foot(line.normal[None], np.array([line.distance]), ideal[k])[0]
@@ -271,7 +272,7 @@ def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Arra
 
 
 def _from_a_corner(points: Array, outward: Array) -> tuple[Array, Array]:
-    """A closed chain begins where it turns most, so that no piece is cut in two."""
+    """Start a closed chain where it turns most, so that no piece is cut in two."""
     ahead, behind = np.roll(points, -8, axis=0) - points, points - np.roll(points, 8, axis=0)
     turn = np.abs(ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0])
     k = int(turn.argmax())
@@ -295,7 +296,7 @@ def _measured(
     outward: Array,
     blur_px: float,
 ) -> _Line | None:
-    """A piece measured on stations of its own."""
+    """Measure a piece on stations of its own."""
     for _ in range(2):
         length = float(np.linalg.norm(ends[1] - ends[0]))
         stations = _stations_on(camera, *ends, outward, min(END_MARGIN_PX, 0.2 * length), images[0].shape)
@@ -327,7 +328,7 @@ def _measured(
 def _stations_on(
     camera: Camera, start: Array, end: Array, outward: Array, margin_px: float, shape: tuple[int, ...]
 ) -> Stations | None:
-    """A station a pixel between two ends, ideal pixels, less a margin."""
+    """Stations one pixel apart between two ends, ideal pixels, without a margin."""
     length = float(np.linalg.norm(end - start))
     count = max(int(length - 2.0 * margin_px), 4)
     share = np.linspace(margin_px / length, 1.0 - margin_px / length, count)
@@ -363,7 +364,7 @@ def _robust_line(p: Array, usable: NDArray[np.bool_]) -> tuple[tuple[Array, floa
 
 
 def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[int, int]], closed: bool) -> Chain:
-    """Vertices where adjacent pieces meet, and at the ends."""
+    """The chain with vertices where adjacent pieces meet, and at the ends."""
     count = len(lines)
     normals = np.stack([np.vstack([line.normal[None], line.fold_normals]) for line in lines])  # (pieces, 1 + f, 2)
     distances = np.stack([np.append(line.distance, line.fold_distances) for line in lines])
@@ -380,7 +381,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
             vertices.append(met)
             corner.append(True)
             continue
-        # Pieces of a curve meet at their common point: where nearly parallel lines cross is not known along them.
+        # Pieces of a curve meet at their common point: the intersection of nearly parallel lines is uncertain.
         feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
         near = np.linalg.norm(met[0] - joint) < 2.0
         vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
@@ -397,7 +398,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
 
 
 def _turn(a: Array, b: Array) -> float:
-    """Angle between two lines by their normals, 0 to 90 degrees."""
+    """Angle between two lines from their normals, 0 to 90 degrees."""
     return math.asin(min(abs(float(a[0] * b[1] - a[1] * b[0])), 1.0))
 
 
@@ -407,7 +408,7 @@ def _foot(normals: Array, distances: Array, point: Array) -> Array:
 
 
 def _meet(na: Array, da: Array, nb: Array, db: Array) -> Array:
-    """Where lines (1 + f) meet; far away if they don't."""
+    """Intersections of lines (1 + f); far away if they are parallel."""
     det = na[:, 0] * nb[:, 1] - na[:, 1] * nb[:, 0]
     det = np.where(np.abs(det) < 1e-9, 1e-9, det)
     x = (da * nb[:, 1] - db * na[:, 1]) / det

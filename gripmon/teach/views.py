@@ -1,4 +1,4 @@
-"""One teaching image against the reference: whether the gripper is there, and the edge candidates beside its edges."""
+"""One teaching image against the reference: whether the gripper is there, and the edge points near its edges."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from gripmon.track.edges.profiles import (
 )
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
-_CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is searched for elsewhere
-_DENSE = 4096  # profiles: as many as there are pixels along the edges
+_CLEAR_SHARE = 0.9  # inlier ratio where the gripper was expected; below it it is searched for elsewhere
+_DENSE = 4096  # search lines: as many as there are pixels along the edges
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 
@@ -40,7 +40,7 @@ class TeachingRefused(ValueError):
 
 
 class ImageRefused(TeachingRefused):
-    """This image can't be taught from; others may."""
+    """This image can't be taught from; others may be."""
 
     def __init__(self, image: TeachingImage, why: str):
         super().__init__(f"{image.name}: {why}")
@@ -49,7 +49,7 @@ class ImageRefused(TeachingRefused):
 
 @dataclass(frozen=True, slots=True)
 class TeachingImage:
-    """An image at the reference, and the jaw opening that was reported for it (the nominal one without jaw)."""
+    """An image at the reference, and the jaw opening reported for it (the nominal one without a jaw)."""
 
     image: Image
     jaw_opening_m: float
@@ -60,10 +60,10 @@ class TeachingImage:
 class View:
     """One image, sampled along all edges in view, with their predictions at the reference.
 
-    ``prediction`` from where it was sampled, with its ``profiles`` (n, s) in grey levels and edge ``candidates``;
-    ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m`` (k,) how far each
-    candidate lies from there across the line of sight, ``expected_m`` (n,) how far the samples do, ``per_m`` (n,) how
-    many px a metre is.
+    ``prediction``: from the pose at which it was sampled, with its ``profiles`` (n, s) in grey levels and edge
+    ``candidates``; ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m``
+    (k,): offset of each candidate from there across the line of sight; ``expected_m`` (n,): that of the samples;
+    ``per_m`` (n,): px per metre.
     """
 
     image: TeachingImage
@@ -79,9 +79,9 @@ class View:
 class Viewer:
     """Measures teaching images with one camera, gripper and reference.
 
-    ``crease`` (e,) which edges lie between two visible faces at the reference, ``inside`` (e,) on which side of an edge
-    its finger lies (1: to the right of someone who walks along it, -1: to the left), ``turned`` (i, e) by what angle
-    the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold (rad).
+    ``crease`` (e,): which edges lie between two visible faces at the reference; ``inside`` (e,): the side of an edge on
+    which its finger lies (1: to the right when going along it, -1: to the left); ``turned`` (i, e): angle (rad) by
+    which the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold.
     """
 
     def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
@@ -102,18 +102,18 @@ class Viewer:
         self.turned = np.einsum("nei,ei->ne", across, depth)
 
     def arrays(self, edges: Mapping[str, TaughtEdge]) -> TaughtEdges:
-        """Edges as the measurement uses them."""
+        """Taught edges as arrays for the measurement."""
         return TaughtEdges.of(edges, self.gripper, self.ref_cam_T_grip, self.jaw_opening_m)
 
     def _inside(self, points_grip_m: Array, inside_point_m: Array) -> Array:
-        """(e,) by the visible face beside each edge; without faces by the middle of the finger's points."""
+        """Side (e,) of the visible face at each edge; without faces, of the middle of the finger's points."""
         gripper, cam_T_grip = self.gripper, self.ref_cam_T_grip
         middles = np.array(
             [points_grip_m[gripper.point_finger == f].mean(axis=0) for f in range(len(gripper.finger_ids))]
         )
         inside = np.where(np.isfinite(inside_point_m), inside_point_m, middles[gripper.edge_finger])
         ends = points_grip_m[gripper.edge_points]
-        # Right of the edge as the camera sees it: x right, y down, z forward.
+        # To the right of the edge as the camera sees it: x right, y down, z forward.
         eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
         right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
         return np.sign(np.einsum("ei,ei->e", right, inside - eye))
@@ -126,28 +126,28 @@ class Viewer:
         share: float = USUAL_SHARE,
         patience: Patience = NARROW,
     ) -> Measurement:
-        """The image measured as in use, from a pose, the reference if None."""
+        """Measure the image as in operation, starting from a pose, the reference if None."""
         rig = self.rig
         meter = FingertipMeter(rig.camera, rig.gripper, rig.settings.corners, rig.settings.jaw_sigma_m, taught)
         here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
         return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
 
     def _off_reference_px(self, found: Measurement) -> float:
-        """How far the measured gripper shows from the reference."""
+        """Distance in the image between the measured gripper and the reference."""
         return found.prediction.moved_px(perturbation_between(self.ref_cam_T_grip, found.cam_T_grip))
 
     def fitted(self, image: TeachingImage) -> Measurement | None:
-        """The sharp model fitted to the image from the reference; None where it doesn't fit, as with wide bevels."""
+        """Fit the sharp model to the image from the reference; None where it doesn't fit, as with wide bevels."""
         found = self.measured(image, None)
         return found if found.trusted and self._off_reference_px(found) <= self._reach_px else None
 
     def check_elsewhere(self, image: TeachingImage) -> None:
-        """Raise :class:`ImageRefused` if the gripper clearly stands farther from the reference than the profiles
+        """Raise :class:`ImageRefused` if the gripper is clearly farther from the reference than the search lines
         reach.
         """
         found = self.measured(image, None, None, _CLEAR_SHARE, EVERYWHERE)
         if found.trusted:
-            # Once more from there: the first search goes by predictions at the reference, and clutter may mislead it.
+            # Repeat from there: the first search uses predictions at the reference, where clutter may mislead it.
             found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, EVERYWHERE)
         away_px = self._off_reference_px(found)
         if found.trusted and away_px > self._reach_px:
@@ -161,8 +161,8 @@ class Viewer:
     def view(
         self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
     ) -> View:
-        """All edges in view, or those that were ``taught``, as densely as pixels lie: from where the sharp model was
-        found, or else from the reference at a ``zoom``.
+        """Sample all edges in view, or those ``taught``, at the density of pixels: at the pose of the fitted sharp
+        model, or else at the reference with a ``zoom``.
         """
         cam_T_grip, jaw_opening_m = self.ref_cam_T_grip, image.jaw_opening_m
         if found is not None:
@@ -171,7 +171,7 @@ class Viewer:
         margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
         sampling = msgspec.structs.replace(sampling, **margins)
         layout = lay_out(rig.camera, rig.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
-        # Both have the same samples: those that the lens maps from both poses.
+        # Both use the same samples: those that the lens maps from both poses.
         here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
         there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
         if there.layout is not here.layout:
@@ -180,7 +180,7 @@ class Viewer:
         noise = estimate_noise(profiles, quantum(grey))
         candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), rig.settings.corners.edges, zoom)
         per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
-        # Edges are straight: that a sample moves along its edge, too, doesn't matter.
+        # Edges are straight: a sample's motion along its edge doesn't matter.
         expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)
         sample = candidates.sample
         across = np.einsum("ni,ni->n", there.normal, here.normal)
@@ -194,8 +194,8 @@ class Viewer:
         return predict(self.rig.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
 
     def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
-        """How far an edge may show from the reference: a bevel's offset and a number of standard deviations of the
-        reference and the reported opening; never farther than the profiles reach.
+        """Largest allowed distance of an edge from the reference: a bevel's offset plus a number of standard deviations
+        of the reference and the reported opening; at most the reach of the search lines.
         """
         here = view.at_reference
         mine = here.layout.edge == edge
@@ -207,26 +207,26 @@ class Viewer:
 
     @property
     def prior_covariance(self) -> Array:
-        """(7, 7) of the reference and the reported opening; at least a micrometre, which stands for "exact"."""
+        """Covariance (7, 7) of the reference and the reported opening, the latter at least 1 µm, for "exact"."""
         out = np.zeros((7, 7))
         out[:6, :6] = self.reference_covariance
         out[6, 6] = max(self._jaw_sigma_m, 1e-6) ** 2
         return out
 
     def distance(self, motion: Array) -> str:
-        """A motion (6 or 7,) of the reference, in words."""
+        """A motion (6 or 7,) of the reference, as a text."""
         x, y, z = (1e3 * motion[:3]).tolist()
         return f"by ({x:.3f}, {y:.3f}, {z:.3f}) mm and {np.degrees(np.linalg.norm(motion[3:6])):.3f}°"
 
     def pose(self, motion: Array) -> str:
-        """The reference after a motion (6 or 7,), as it stands in a configuration."""
+        """The reference after a motion (6 or 7,), as written in a configuration."""
         there = to_record(perturb(self.ref_cam_T_grip, motion[:6]))
         translation_m = [round(v, 7) for v in there.translation_m]
         rotation_xyzw = [round(v, 8) for v in there.rotation_xyzw]
         return f"reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
 
     def advice(self, motion: Array) -> str:
-        """What to do about a reference that is off by a motion (6 or 7,)."""
+        """What to do about a reference with an error of a motion (6 or 7,)."""
         return (
             "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
             f"pose as {self.pose(motion)}"
@@ -234,8 +234,8 @@ class Viewer:
 
 
 class Sampled(NamedTuple):
-    """One edge in all images: candidates, the shares of the edge between which it was sampled (the middle ones of all
-    images), px a metre, the line (2,) that was expected, px, and ``rows`` (2, 7): metres at both ends by the unknowns.
+    """One edge in all images: its edge points, the fractions of the edge between which it was sampled (medians over all
+    images), px per metre, the expected line (2,), px, and ``rows`` (2, 7), derivatives at both ends by the unknowns, m.
     """
 
     points: EdgePoints

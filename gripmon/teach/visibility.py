@@ -1,10 +1,10 @@
-"""Which corners and edges of the gripper a camera sees from a pose, as the monitor will look for them, and why others
+"""Which corners and edges of the gripper a camera sees from a pose, as the monitor will search for them, and why others
 are not seen.
 
-Beyond the monitor's own rule (a face must look at the camera) fingers that stand before each other are found: the
-monitor will look for such an edge, and see the other finger.  And margins: how far visible corners are from the image's
-border, how far the camera may move until too few of them are in view, and over which part of the jaw's travel the view
-suffices.
+In addition to the monitor's own rule (a face must be turned to the camera), this finds fingers in front of each other:
+the monitor will search for a hidden edge, and see the other finger.  It also gives margins: the distance of visible
+corners from the image's border, how far the camera may move until too few of them are in view, and the part of the
+jaw's travel in which the view suffices.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import CORNER_MARGIN_PX, FEWEST_SAMPLES, EdgeLayout, lay_out
 
 FEWEST_CORNERS = 3
-"""Corners that must be seen; a configuration that shows fewer is refused."""
+"""Fewest visible corners; a configuration with fewer is refused."""
 
 TOUCHING_M = 1e-4
-"""A point that is less than this behind another finger's face lies on it."""
+"""Distance behind another finger's face below which a point lies on the face."""
 
 
 class Rig(NamedTuple):
-    """A camera, a gripper, and the monitor's settings; everything but the pose between them."""
+    """A camera, a gripper, and the monitor's settings: everything but the pose between camera and gripper."""
 
     camera: Camera
     gripper: Gripper
@@ -43,12 +43,12 @@ class Rig(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What is seen from one pose at one jaw opening: arrays (c,) over the gripper's landmarks, which are its corners if
-    it has some.
+    """The view from one pose at one jaw opening: arrays (c,) over the gripper's landmarks, which are its corners if it
+    has any.
 
-    ``uv_px`` (c, 2), NaN where the lens maps nothing.  Each corner is ``visible``, or ``outside`` of the image, or
-    ``self_hidden`` by its own finger, or ``behind`` another one, the first that holds.  ``edges``: how many can be
-    sampled.
+    ``uv_px`` (c, 2), NaN where the lens maps nothing.  Each corner is ``outside`` of the image, ``self_hidden`` by its
+    own finger, or ``behind`` another one, the first that applies, or else ``visible``.  ``edges``: the number that can
+    be sampled.
     """
 
     uv_px: Array
@@ -87,7 +87,7 @@ class Sight:
 
 
 def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
-    """What ``rig`` sees at a pose (4, 4) and an opening (nominal if None)."""
+    """The view of ``rig`` at a pose (4, 4) and an opening (nominal if None)."""
     camera, gripper = rig.camera, rig.gripper
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     eye_grip_m = invert(cam_T_grip)[:3, 3]
@@ -100,7 +100,7 @@ def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
     self_hidden = ~outside & ~gripper.points_visible(points_grip_m, eye_grip_m, gripper.landmarks)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     layout = lay_out(camera, gripper, cam_T_grip, opening_m, rig.settings.corners.sampling, rig.taught)
-    # Both in one call, which takes most of the time.
+    # Both in one call, as this takes most of the time.
     samples_m, of_samples = _samples(gripper, layout, points_grip_m)
     of_corners = gripper.point_finger[gripper.landmarks]
     targets_m, finger = np.concatenate([corners_grip_m, samples_m]), np.concatenate([of_corners, of_samples])
@@ -111,7 +111,7 @@ def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
 
 
 def samples_behind(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
-    """(n,) which samples of a layout lie behind another finger."""
+    """Mask (n,) of a layout's samples that lie behind another finger."""
     samples_m, finger = _samples(gripper, layout, points_grip_m)
     return behind_another_finger(gripper, points_grip_m, eye_grip_m, samples_m, finger)
 
@@ -132,9 +132,9 @@ _WITHOUT = ([1, 2], [0, 2], [0, 1])
 def behind_another_finger(
     gripper: Gripper, points_grip_m: Array, eye_grip_m: Array, targets_m: Array, finger: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """(n,) whether a face of another finger stands between the eye (3,) and each of the targets (n, 3), which belong to
-    the fingers ``finger`` (n,); all in the gripper frame.  Fingers are convex solids, of which the faces that look at
-    the eye hide all that the others do.  Without faces nothing is known to hide.
+    """Mask (n,): whether a face of another finger lies between the eye (3,) and each of the targets (n, 3), which
+    belong to the fingers ``finger`` (n,); all in the gripper frame.  Fingers are convex solids, so faces turned to the
+    eye hide all that the others do.  Without faces nothing counts as hidden.
     """
     hidden = np.zeros(len(targets_m), dtype=bool)
     rays = targets_m - eye_grip_m
@@ -162,7 +162,7 @@ def behind_another_finger(
 
 
 def _in_polygon(points: Array, loop: Array, drop: int) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 3) of a planar loop's plane lie in it (even-odd rule), seen along the axis ``drop``."""
+    """Mask (n,) of points (n, 3) inside of a planar loop in their plane (even-odd rule), seen along axis ``drop``."""
     x, y = points[:, _WITHOUT[drop]].T[:, :, None]
     ax, ay = loop[:, _WITHOUT[drop]].T
     bx, by = np.append(ax[1:], ax[0]), np.append(ay[1:], ay[0])
@@ -173,13 +173,13 @@ def _in_polygon(points: Array, loop: Array, drop: int) -> NDArray[np.bool_]:
 
 
 SOUGHT_M = 1.0
-"""How far a shift of the camera is followed."""
+"""Largest shift of the camera that is examined."""
 
 SOUGHT_RAD = np.pi
-"""How far a turn of the camera is followed."""
+"""Largest turn of the camera that is examined."""
 
 STEP_PX = 16.0
-"""Image motion between two views on the way: a gap in the view that is narrower than this may be passed over."""
+"""Image motion between two views that are examined; a narrower gap in the view may be missed."""
 
 _SIDES = ("left", "right", "top", "bottom")
 
@@ -187,7 +187,7 @@ _SIDES = ("left", "right", "top", "bottom")
 @dataclass(frozen=True, slots=True)
 class Border:
     """Distance of the visible corners from the image's border: the smallest on each side, px; and the smallest of all,
-    with the corner and the side.
+    with its corner and side.
     """
 
     by_side_px: dict[str, float]
@@ -198,11 +198,11 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """How far the camera may move alone along each axis before the monitor can't measure any more.
+    """How far the camera may move along each single axis before the monitor can't measure any more.
 
-    ``limits`` (6, 2): shift (m) along, then turn (rad) about the camera's own x, y, z, to the negative and to the
-    positive side, all as amounts; NaN where the view suffices as far as was sought.  ``reasons`` (6 pairs) what is
-    missing beyond.
+    ``limits`` (6, 2): shift (m) along, then turn (rad) about the camera's own x, y, z, in negative and in positive
+    direction, all as positive amounts; NaN where the view suffices over the whole range examined.  ``reasons`` (6
+    pairs): what is missing beyond.
     """
 
     limits: Array
@@ -211,7 +211,7 @@ class Freedom:
 
 def moved_camera(cam_T_grip: Array, motion: Array) -> Array:
     """``cam_T_grip`` (4, 4) after the camera has shifted by ``motion[:3]`` (m) and turned about its own centre by the
-    rotation vector ``motion[3:]`` (rad), both in the axes that it had before.
+    rotation vector ``motion[3:]`` (rad), both in its axes before the motion.
     """
     back = exp_rotation(motion[3:]).T
     return make_transform(back @ cam_T_grip[:3, :3], back @ (cam_T_grip[:3, 3] - motion[:3]))
@@ -230,15 +230,15 @@ def border(rig: Rig, sight: Sight) -> Border | None:
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
-    """How far the camera may shift and turn along each of its axes while the jaws stand at an opening."""
+    """How far the camera may shift and turn along each of its axes at a fixed jaw opening."""
     found = [_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for axis in np.eye(6) for sign in (-1.0, 1.0)]
     limits = np.reshape([amount for amount, _ in found], (6, 2))
     return Freedom(limits, tuple((found[k][1], found[k + 1][1]) for k in range(0, 12, 2)))
 
 
 def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> float:
-    """The shortest shift of the camera along its x or y, either way, after which the monitor can't measure; infinite
-    for none.  Found in steps that are coarser than those of :func:`freedom`, to a hundredth of a step.
+    """The shortest shift of the camera along its x or y, in either direction, after which the monitor can't measure;
+    infinite if there is none.  The steps are coarser than those of :func:`freedom`, the result good to 1/100 of a step.
     """
     axes = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
     limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, 4.0 * STEP_PX, halvings=7)[0] for axis in axes]
@@ -248,8 +248,8 @@ def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> floa
 def _limit(
     rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 24
 ) -> tuple[float, str | None]:
-    """The amount of a motion along ``axis`` (6,), a unit vector, after which the view doesn't suffice, and why; NaN for
-    never.
+    """The amount of a motion along the unit vector ``axis`` (6,) after which the view doesn't suffice, and why; NaN if
+    it always does.
     """
 
     def view(amount: float) -> Sight:
@@ -273,13 +273,13 @@ def _limit(
 def _step(
     rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, amount: float, sight: Sight, step_px: float
 ) -> float:
-    """How much farther moves the visible corners by ``step_px`` at most."""
+    """Next step: it moves the visible corners by ``step_px`` at most."""
     gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
     points_m = gripper.points_grip_m(jaw_opening_m)[gripper.landmarks[sight.visible]]
     pose = moved_camera(cam_T_grip, (amount + small) * axis)
     moved_px = rig.camera.project(points_m @ pose[:3, :3].T + pose[:3, 3]) - sight.uv_px[sight.visible]
     rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / small
-    # Near the lens's axis a shift along it moves nothing, yet.
+    # Close to the lens's axis a shift along it moves nothing at first.
     farthest = 0.05 if axis[3:].any() else 0.02 * (1.0 + 50.0 * amount)
     return min(step_px / max(rate, 1e-12), farthest)
 
@@ -287,8 +287,8 @@ def _step(
 def _first_failing(
     good: float, bad: float, there: Sight, view: Callable[[float], Sight], halvings: int
 ) -> tuple[float, Sight]:
-    """By bisection between a value whose view suffices and one whose view, ``there``, doesn't: the nearest such value
-    to the former that was found, and its view.
+    """Bisect between a value whose view suffices and one whose view, ``there``, doesn't: the failing value found that
+    is nearest to the former, and its view.
     """
     for _ in range(halvings):
         middle = 0.5 * (good + bad)
@@ -301,7 +301,7 @@ def _first_failing(
 
 
 class Gap(NamedTuple):
-    """Openings at which the view doesn't suffice, and why (in its middle)."""
+    """A range of openings in which the view doesn't suffice, and the reason (in its middle)."""
 
     from_m: float
     to_m: float
@@ -310,8 +310,8 @@ class Gap(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class JawTravel:
-    """``share`` of the jaw's travel in which the monitor can measure, with the ``gaps`` that are left out; ``corners``
-    and ``edges`` (n,) visible at the ``openings_m`` (n,).
+    """``share`` of the jaw's travel in which the monitor can measure, and the ``gaps`` in it; ``corners`` and ``edges``
+    (n,): their visible numbers at the ``openings_m`` (n,).
     """
 
     share: float
@@ -322,8 +322,8 @@ class JawTravel:
 
 
 def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
-    """What is visible at ``count`` openings from end to end, the ends of gaps found between them; None for a gripper
-    whose jaw doesn't move.  Where the view fails only between two openings is not noticed.
+    """What is visible at ``count`` openings over the whole travel, with the ends of gaps refined between them; None for
+    a gripper whose jaw doesn't move.  A failure only between two openings is missed.
     """
     gripper = rig.gripper
     if not gripper.jaw_max_m > gripper.jaw_min_m:
@@ -342,7 +342,7 @@ def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
 
 
 def _gaps(openings_m: list[float], sights: list[Sight], view: Callable[[float], Sight]) -> tuple[Gap, ...]:
-    """The runs without enough, their ends by bisection."""
+    """The runs of openings without a sufficient view, their ends found by bisection."""
     change = np.flatnonzero(np.diff([1, *(int(sight.enough) for sight in sights), 1]))
     gaps = []
     for first, beyond in change.reshape(-1, 2).tolist():

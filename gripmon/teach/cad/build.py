@@ -1,4 +1,4 @@
-"""From files of CAD to a gripper file."""
+"""From CAD files to a gripper file."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ SHORTEST_M = 0.005
 
 @dataclass(frozen=True)
 class Parts:
-    """What was read: ``fingers`` and what else is ``around`` them (or nothing), in the CAD frame; ``paths_m``: of each
-    finger (s, 3) where its joint shifts it to, empty without a joint.
+    """The content of the files: ``fingers`` and the other bodies ``around`` them, in the CAD frame; ``paths_m``: for
+    each finger the shifts (s, 3) by its joint, empty without a joint.
     """
 
     fingers: dict[str, Surface]
@@ -48,8 +48,8 @@ class Parts:
 
 @dataclass(frozen=True)
 class CadGripper:
-    """A gripper from CAD: its ``model`` and what is to be known of it (``notes``); ``view``: where it was looked at
-    from, None where its fingers' faces say what shows from everywhere; ``grip_T_cad`` (4, 4).
+    """A gripper from CAD: its ``model`` and the ``notes`` on it; ``grip_T_cad`` (4, 4); ``camera`` and ``cam_T_grip``:
+    the view that was given, None without one.
     """
 
     model: GripperModel
@@ -65,7 +65,7 @@ class CadGripper:
         return gripper_text(self.model, self.notes)
 
     def summary(self) -> list[str]:
-        """What a person is told: the fingers, what of them is known, how they move, and what to bear in mind."""
+        """A summary for people: each finger's corners, edges, faces and size, the jaw's range, and the notes."""
         lines = []
         for finger, shape in self.shapes.items():
             used = shape.points_m[sorted({p for edge in shape.edges for p in edge})]
@@ -102,17 +102,17 @@ def gripper_from_cad(
     provenance: Provenance | None = None,
     progress: Progress = quiet,
 ) -> CadGripper:
-    """A gripper model from CAD files: one mesh (STL, OBJ, PLY) or .cao a finger, or both in one; or a URDF.
+    """A gripper model from CAD files: one mesh (STL, OBJ, PLY) or .cao per finger, or one file with both; or a URDF.
 
-    ``unit`` of meshes: "m", "mm", "cm" or "in"; URDF and .cao are metres.  ``frame``: "tcp" puts the origin between the
-    fingertips, x across the jaws and z along ``approach`` (an axis of the CAD frame, "+z" and the like; None: "+z", of
-    a URDF where its fingers reach to), "cad" leaves the axes of the file.  ``jaw_range_m``: meshes of two fingers move
-    by half of the opening each; a URDF says it itself (``joint``: its name, if several could be meant).
-    ``jaw_opening_m`` is what a robot reports for the fingers as they are drawn; the distance of the tips if None.
-    ``length_m``: only so much of the fingers, from the tips.
+    ``unit`` of meshes: "m", "mm", "cm" or "in"; URDF and .cao are in metres.  ``frame``: "tcp" puts the origin between
+    the fingertips, x across the jaws and z along ``approach`` (an axis of the CAD frame, "+z" and the like; if None,
+    "+z", or for a URDF the axis along which its fingers reach); "cad" keeps the file's axes.  ``jaw_range_m``: meshes
+    of two fingers move by half of the opening each; a URDF has its own motion (``joint``: its name, if several are
+    possible).  ``jaw_opening_m`` is what a robot reports for the fingers as drawn; the distance of the tips if None.
+    ``length_m``: the length of the fingers to use, from the tips.
 
-    Convex fingers with flat faces hold for every view.  Others need ``camera`` and ``cam_T_grip`` (4, 4): what shows
-    from there is taken.  :class:`~gripmon.model.errors.InputError` says what can't be used, and what would.
+    Convex fingers with flat faces are valid for every view.  Others need ``camera`` and ``cam_T_grip`` (4, 4), and are
+    made for that view.  :class:`~gripmon.model.errors.InputError` says what can't be used, and what can.
     """
     _check(frame, approach, unit, length_m)
     parts = _read(files, unit, joint, progress)
@@ -144,8 +144,8 @@ def _shapes(
     mounted: bool,
     progress: Progress,
 ) -> tuple[dict[str, Shape], list[str]]:
-    """Each finger's points and edges, and those fingers in words of which the view decides; they have no shape without
-    one.
+    """Each finger's points and edges, and as texts the fingers whose shape depends on the view; these have no shape
+    without one.
     """
     shapes: dict[str, Shape] = {}
     seen: list[str] = []
@@ -180,7 +180,7 @@ def _check(frame: str, approach: str | None, unit: str | None, length_m: float |
 
 
 def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | None, progress: Progress) -> Parts:
-    """All files' bodies as fingers."""
+    """Read all files' bodies as fingers."""
     paths = [Path(file) for file in files]
     if not paths:
         raise InputError("from-cad: no file; a mesh or .cao for each finger, or a URDF")
@@ -220,7 +220,7 @@ def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | N
 
 
 def _fingers_in(body: Body) -> tuple[list[Body], list[str]]:
-    """A file's separate pieces as one finger, or two: small pieces belong to the nearer of the two largest."""
+    """A file's separate pieces as one finger or two: small pieces belong to the nearer of the two largest."""
     pieces = separate(body)
     if len(pieces) == 1:
         return pieces, []
@@ -234,7 +234,7 @@ def _fingers_in(body: Body) -> tuple[list[Body], list[str]]:
 
 
 def _of_linkage(path: Path, linkage: Linkage) -> Parts:
-    """A URDF's fingers: what moves without turning."""
+    """A URDF's fingers: the links that move without turning."""
     straight = [m for m in linkage.moving if m.turns_rad <= TURNS_RAD]
     if not straight:
         turns = np.degrees(max(m.turns_rad for m in linkage.moving))
@@ -262,7 +262,7 @@ def _names(count: int, given: list[str]) -> list[str]:
 
 
 def _left_to_right(surfaces: list[Surface]) -> list[int]:
-    """Their order along the axis of the CAD frame along which they stand apart most."""
+    """The fingers' order along the axis of the CAD frame along which they are farthest apart."""
     middles = np.array([0.5 * (s.points_m.min(axis=0) + s.points_m.max(axis=0)) for s in surfaces])
     return np.argsort(middles[:, int(np.ptp(middles, axis=0).argmax())], kind="stable").tolist()
 
@@ -305,7 +305,7 @@ def _moved(surface: Surface, grip_T_cad: Array) -> Surface:
 
 
 def _frame(parts: Parts, frame: str, approach: str | None, linked: bool) -> tuple[Array, list[str]]:
-    """``grip_T_cad`` (4, 4) and what is to be said of it."""
+    """``grip_T_cad`` (4, 4), and notes on it."""
     if frame == "cad":
         return make_transform(np.eye(3), np.zeros(3)), ["the frame is the CAD's own"]
     fingers = list(parts.fingers.values())

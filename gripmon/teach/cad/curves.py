@@ -1,4 +1,4 @@
-"""The lines that a surface shows to an eye: sharp edges, borders, and the outlines of what is round."""
+"""The lines of a surface that an eye sees: sharp edges, borders, and the outlines of round parts."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.surface import Surface, radius_m, shading_of
 
 MOST_PIECES = 200_000
-"""More sharp edges than that aren't a gripper's: chaining them would take minutes."""
+"""Most sharp edges: more aren't a gripper's, and chaining them would take minutes."""
 
 Key = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """Straight pieces of lines: ends ``points_m`` (n, 2, 3) with ``keys`` (n pairs, equal where two pieces meet),
-    ``crease`` (n,) whether the body shows on both sides.  ``centre_m`` (n, 2, 3): of the rounding at each end, NaN on
-    a sharp edge.  ``wanders`` (n,): an outline of what is round.
+    """Straight pieces of lines: ends ``points_m`` (n, 2, 3) with ``keys`` (n pairs, equal where two pieces meet);
+    ``crease`` (n,): whether the body is seen on both sides; ``centre_m`` (n, 2, 3): centre of the rounding at each end,
+    NaN on a sharp edge; ``wanders`` (n,): whether it is the outline of a round part, which moves with the view.
     """
 
     points_m: Array
@@ -34,7 +34,7 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Pieces in a row: ``points_m`` (n, 3), ``centre_m`` (n, 3); a closed one ends where it begins."""
+    """Consecutive pieces: ``points_m`` (n, 3), ``centre_m`` (n, 3); a closed curve ends where it begins."""
 
     points_m: Array
     centre_m: Array
@@ -42,7 +42,7 @@ class Curve:
 
 
 def pieces_of(surface: Surface, eye_m: Array) -> Pieces:
-    """All lines of a surface that the eye (3,) may see, also those that something hides."""
+    """All lines of a surface that the eye (3,) may see, including those that something hides."""
     facing = _Facing(surface, eye_m)
     found = [_lines(surface), *facing.rounds()]
     found.append(facing.sharp_edges())
@@ -62,8 +62,8 @@ def _lines(surface: Surface) -> Pieces:
 
 
 class _Facing:
-    """Which way a surface looks: ``towards`` (t, 3) is, at each corner of each triangle, how far the eye lies above the
-    smooth surface there, m.
+    """Which way a surface faces: ``towards`` (t, 3) is the height of the eye above the smooth surface, at each corner
+    of each triangle, m.
     """
 
     def __init__(self, surface: Surface, eye_m: Array) -> None:
@@ -76,14 +76,14 @@ class _Facing:
         self._split: dict[tuple[int, int], list[tuple[float, Key]]] = {}
 
     def rounds(self) -> list[Pieces]:
-        """Outlines of what is round: where the smooth surface turns away from the eye (Hertzmann 1999)."""
+        """Outlines of round parts: where the smooth surface turns away from the eye (Hertzmann 1999)."""
         signs = self._towards > 0.0
         mixed = np.flatnonzero(signs.any(axis=1) & ~signs.all(axis=1))
         if not len(mixed):
             return []
         places, normals, towards = self._places[mixed], self._normals[mixed], self._towards[mixed]
         own = self._surface.triangles[mixed]
-        # The corner that is by itself on one side: the outline crosses the two sides that end there.
+        # The single corner on its side of the outline, which crosses the two sides of the triangle that end there.
         positive = signs[mixed].sum(axis=1)
         alone = np.where(positive == 1, signs[mixed].argmax(axis=1), (~signs[mixed]).argmax(axis=1))
         rows = np.arange(len(mixed))
@@ -104,14 +104,14 @@ class _Facing:
         for k in (0, 1):
             across = np.cross(normal[:, k], way)
             across[~kept] = (1.0, 0.0, 0.0)
-            # An outline that is seen bulges; a surface that is turned inside out has its normals the other way.
+            # A visible outline is convex; a surface turned inside out has its normals the other way.
             radius = np.abs(radius_m(places, normals, across))
             centres[:, k] = np.where(np.isfinite(radius)[:, None], ends[:, k] - radius[:, None] * normal[:, k], np.nan)
         both = [(one, other) for one, other, keep in zip(*keys, kept.tolist(), strict=True) if keep]
         return [Pieces(ends[kept], both, np.zeros(len(both), bool), centres[kept], np.ones(len(both), bool))]
 
     def _keys(self, triangle: NDArray[np.intp], a: NDArray[np.intp], b: NDArray[np.intp], share: Array) -> list[Key]:
-        """One for each crossing of a side of a patch."""
+        """A key for each crossing of a side of a patch."""
         patch = self._surface.patch[triangle].tolist()
         out: list[Key] = []
         for one, other, s, p in zip(a.tolist(), b.tolist(), share.tolist(), patch, strict=True):
@@ -152,7 +152,7 @@ class _Facing:
         return Pieces(ends, keys, np.array(crease, dtype=bool), np.full(ends.shape, np.nan), np.zeros(len(keys), bool))
 
     def _at_ends(self, which: NDArray[np.intp], side: int) -> Array:
-        """(n, 2) how far the eye lies above one side's surface at both ends of edges."""
+        """Height (n, 2) of the eye above one side's surface at both ends of edges."""
         surface = self._surface
         triangle = surface.sides[which, side]
         out = np.full((len(which), 2), np.nan)
@@ -164,8 +164,8 @@ class _Facing:
 
 
 def _lifted(a: Array, b: Array, na: Array, nb: Array, share: Array) -> Array:
-    """Points between ``a`` and ``b`` (n, 3), lifted from the chord onto the arc that the normals at its ends tell: half
-    of what their tangent planes lie apart, which for a circle is exact to the second order.
+    """Points between ``a`` and ``b`` (n, 3), lifted from the chord onto the arc given by the normals at its ends: by
+    half of the distance to their tangent planes, which for a circle is exact to the second order.
     """
     p = a + share * (b - a)
     below_a = np.einsum("ni,ni->n", p - a, na)[:, None] * na
@@ -174,7 +174,7 @@ def _lifted(a: Array, b: Array, na: Array, nb: Array, share: Array) -> Array:
 
 
 def curves_of(pieces: Pieces) -> list[Curve]:
-    """Pieces joined into curves, which end where three meet, or two of different kinds."""
+    """Pieces joined into curves, which end where three pieces meet, or two of different kinds."""
     at: dict[Key, list[int]] = {}
     for number, (first, last) in enumerate(pieces.keys):
         at.setdefault(first, []).append(number)
@@ -188,7 +188,7 @@ def curves_of(pieces: Pieces) -> list[Curve]:
     left = set(range(len(pieces.keys)))
     ends = [n for n in range(len(pieces.keys)) if not all(map(through, pieces.keys[n]))]
     out = []
-    # From ends first; what is left then is closed.
+    # Start at ends first; what is left is closed.
     for start in itertools.chain(ends, range(len(pieces.keys))):
         if start not in left:
             continue

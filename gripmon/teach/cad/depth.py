@@ -1,4 +1,4 @@
-"""What stands in front: the depth of everything that a camera sees, on a grid finer than its pixels."""
+"""Occlusion: the depth of everything that a camera sees, on a grid finer than its pixels."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.surface import Surface
 
 CELLS = 2
-"""Cells a pixel."""
+"""Cells per pixel."""
 
 HIDDEN_M = 1e-4
-"""What lies this far behind a surface is hidden by it."""
+"""Distance behind a surface from which something is hidden by it."""
 
 _NEAREST_M = 1e-3
-_OUTSIDE = 0.25  # of the image's size, on each side: what is kept beside it
+_OUTSIDE = 0.25  # margin kept on each side, over the image's size
 
 
 class Pinhole(NamedTuple):
@@ -34,14 +34,14 @@ class Pinhole(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, cam_T_grip: Array) -> Pinhole:
-        """The window: the image and a quarter of it around."""
+        """The view; its window is the image with a margin of a quarter of its size."""
         share = np.linspace(0.0, 1.0, 17)
         across, down = np.meshgrid(share, share)
         grid = np.column_stack([across.ravel() * (camera.width_px - 1.0), down.ravel() * (camera.height_px - 1.0)])
         xy = camera.undistort(grid)
         xy = xy[np.isfinite(xy).all(axis=1)] * camera.fx_px
         low, high = xy.min(axis=0), xy.max(axis=0)
-        # A fisheye's ideal image has no end: three times the image's own width is enough for a gripper.
+        # A fisheye's ideal image is unbounded: three times the image's own width is enough for a gripper.
         most = 1.5 * np.array([camera.width_px, camera.height_px])
         low, high = np.maximum(low, -most), np.minimum(high, most)
         return cls(cam_T_grip, camera.fx_px, low - _OUTSIDE * (high - low), high + _OUTSIDE * (high - low))
@@ -51,7 +51,7 @@ class Pinhole(NamedTuple):
         return invert(self.cam_T_grip)[:3, 3]
 
     def project(self, points_grip_m: Array) -> tuple[Array, Array]:
-        """Places (n, 2), px, and depths (n,), m; NaN behind the camera."""
+        """Positions (n, 2), px, and depths (n,), m; NaN behind the camera."""
         cam = points_grip_m @ self.cam_T_grip[:3, :3].T + self.cam_T_grip[:3, 3]
         depth = np.where(cam[:, 2] > _NEAREST_M, cam[:, 2], np.nan)
         return self.focal_px * cam[:, :2] / depth[:, None], depth
@@ -63,7 +63,7 @@ class DepthMap:
     def __init__(self, view: Pinhole, surfaces: Sequence[Surface]) -> None:
         self._view = view
         columns, rows = np.ceil(CELLS * (view.high_px - view.low_px)).astype(int) + 3
-        # Inverse depth is linear in the image, and 0 where nothing stands.
+        # Inverse depth is linear in the image, and 0 where there is nothing.
         self._inverse = np.zeros((rows, columns))
         for surface in surfaces:
             px, depth = view.project(surface.points_m)
@@ -74,7 +74,7 @@ class DepthMap:
         self._farthest = np.min(shifts, axis=0)
 
     def visible(self, points_grip_m: Array) -> NDArray[np.bool_]:
-        """(n,) whether points on the surfaces are seen: nothing stands before all of the nine cells around."""
+        """Mask (n,) of visible points on the surfaces: not all of the nine cells around have something in front."""
         px, depth = self._view.project(points_grip_m)
         cells = np.rint(np.nan_to_num(self._cells(px), nan=-1e6)).astype(int)
         rows, columns = self._inverse.shape
@@ -90,7 +90,7 @@ class DepthMap:
 
 @compiled
 def draw(places: Any, triangles: Any, inverse: Any) -> None:
-    """Triangles (t, 3) over ``places`` (p, 3) (column, row, inverse depth) into a map of the largest inverse depths."""
+    """Draw triangles (t, 3) over ``places`` (p, 3) (column, row, inverse depth), keeping the largest inverse depths."""
     rows, columns = inverse.shape
     for t in range(len(triangles)):
         ax, ay, aw = places[triangles[t, 0]]

@@ -21,13 +21,13 @@ Triangles = NDArray[np.intp]
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 MESHES = (".stl", ".obj", ".ply")
 LARGEST_TRIANGLES = 5_000_000
-"""Some 2 GB of memory while neighbours are found; what no CAD export of a gripper needs."""
+"""Most triangles: finding neighbours then takes about 2 GB of memory; no CAD export of a gripper needs more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Triangles (t, 3) over points (p, 3), metres, in the frame of its file; ``lines`` (l, 2): edges that the file
-    names without a face.  A point that two triangles share is one point.
+    """Triangles (t, 3) over points (p, 3), metres, in the frame of its file; ``lines`` (l, 2): edges that the file has
+    without a face.  Triangles share their common points.
     """
 
     name: str
@@ -36,13 +36,13 @@ class Body:
     lines: NDArray[np.intp]
 
     def moved(self, to_T_body: Array) -> Body:
-        """The same in another frame (4, 4); a mirroring one turns the triangles round."""
+        """The same in another frame (4, 4); a mirroring transform reverses the triangles."""
         triangles = self.triangles if np.linalg.det(to_T_body[:3, :3]) > 0.0 else self.triangles[:, ::-1]
         return Body(self.name, self.points_m @ to_T_body[:3, :3].T + to_T_body[:3, 3], triangles, self.lines)
 
 
 def mesh_library(why: str) -> ModuleType:
-    """trimesh; :class:`InputError` where the extra isn't installed."""
+    """The module trimesh; :class:`InputError` where the extra isn't installed."""
     try:
         import trimesh
     except ImportError:
@@ -51,10 +51,10 @@ def mesh_library(why: str) -> ModuleType:
 
 
 def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
-    """A mesh in metres; ``unit`` is one of :data:`UNITS_M`.  ``size``: refuse one that can't be a gripper's.
+    """Read a mesh in metres; ``unit`` is one of :data:`UNITS_M`.  ``size``: refuse one that can't be a gripper's.
 
-    Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit no one gave:
-    none of these formats says it.
+    Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit wasn't given:
+    none of these formats contains it.
     """
     trimesh = mesh_library(str(path))
     if not path.is_file():
@@ -63,7 +63,7 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
         mesh = trimesh.load(path, force="mesh", process=False)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.intp)
-    except Exception as error:  # noqa: BLE001  # its readers raise whatever a damaged file leads to
+    except Exception as error:  # noqa: BLE001  trimesh raises anything for a damaged file
         raise InputError(
             f"{path}: can't be read as a mesh ({one_line(error):.120}); STL, OBJ or PLY with triangles"
         ) from None
@@ -81,7 +81,7 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
 
 
 def checked_size(body: Body, what: str, extent: Array, argument: str) -> Body:
-    """The body; :class:`InputError` where it is smaller than a finger's detail or larger than a robot's hand."""
+    """The body; :class:`InputError` if it is smaller than a finger's detail or larger than a robot's hand."""
     size_m = float(np.ptp(body.points_m, axis=0).max())
     if not 1e-3 <= size_m <= 1.0:
         raise InputError(f"{what} would be {1e3 * size_m:g} mm long; {_as_units(extent)}", argument)
@@ -89,14 +89,14 @@ def checked_size(body: Body, what: str, extent: Array, argument: str) -> Body:
 
 
 def _as_units(extent: Array) -> str:
-    """The extents (3,) of a file's numbers by the units that they may have."""
+    """The extents (3,) of a file's numbers in each possible unit."""
     size = " x ".join(f"{v:.3g}" for v in extent)
     sizes = (f"{unit}: {1e3 * float(extent.max()) * scale:.3g} mm long" for unit, scale in UNITS_M.items())
     return f"it spans {size}, that is in {', in '.join(sizes)}; one of {', '.join(UNITS_M)}"
 
 
 def separate(body: Body) -> list[Body]:
-    """Its connected pieces, the largest first; lines stay with the first."""
+    """The body's connected pieces, the largest first; pieces of lines alone count, too."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -117,7 +117,7 @@ def separate(body: Body) -> list[Body]:
 
 
 def joined(bodies: list[Body], name: str) -> Body:
-    """Several as one."""
+    """Several bodies as one."""
     first = np.cumsum([0] + [len(b.points_m) for b in bodies[:-1]]).tolist()
     return Body(
         name,
@@ -128,7 +128,7 @@ def joined(bodies: list[Body], name: str) -> Body:
 
 
 class _Cao:
-    """A .cao file's lines without comments, one after another."""
+    """Reads the lines of a .cao file, without comments, one after another."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -148,14 +148,14 @@ class _Cao:
         raise InputError(f"{self.path}, line {self.number}: {wrong}")
 
     def words(self) -> list[str]:
-        """Of the next line, without settings such as ``name=…``; empty at the end."""
+        """The next line's words, without settings such as ``name=…``; empty at the end."""
         self.number, words = next(self._lines, (self.number, []))
         if words and words[0].startswith("load("):
             self.refuse("loads another file; the models in one file")
         return [word for word in words if "=" not in word]
 
     def count(self, what: str) -> int:
-        """How many of something follow; none where the file ends."""
+        """The number of items that follow; 0 at the end of the file."""
         words = self.words()
         if not words:
             return 0
@@ -164,7 +164,7 @@ class _Cao:
         return int(words[0])
 
     def indices(self, count: int, below: int, what: str) -> list[int]:
-        """At least ``count`` numbers from 0 to ``below`` - 1."""
+        """The next line's indices, at least ``count`` of them, from 0 to ``below`` - 1."""
         words = self.words()
         if len(words) < count or not all(word.isdecimal() and int(word) < below for word in words):
             self.refuse(f"'{' '.join(words)}' is not {what}; at least {count} numbers from 0 to {below - 1}")
@@ -182,7 +182,7 @@ class _Cao:
 
 
 def read_cao(path: Path) -> Body:
-    """A 3D model of ViSP's (https://visp-doc.inria.fr, tutorial "Markerless generic model-based tracking"), metres:
+    """Read a 3D model of ViSP's (https://visp-doc.inria.fr, tutorial "Markerless generic model-based tracking"), metres:
     points, lines, faces of lines, faces of points, cylinders, circles.  Faces that aren't flat become triangles.
     """
     cao = _Cao(path)
@@ -211,7 +211,7 @@ def read_cao(path: Path) -> Body:
 
 
 def _loop_of_lines(cao: _Cao, sides: list[list[int]]) -> list[int]:
-    """The points of lines that follow each other."""
+    """The corners of a face given by consecutive lines."""
     loop = []
     for one, after in zip(sides, [*sides[1:], sides[0]], strict=True):
         common = set(one) & set(after)
@@ -231,7 +231,7 @@ def _triangles_of(path: Path, points_m: Array, loops: list[list[int]]) -> Triang
     return np.reshape(np.array(out, dtype=np.intp), (-1, 3))
 
 
-_ROUND = 96  # sides of what .cao has round: 0.0043 mm off a circle of 8 mm
+_ROUND = 96  # sides of a .cao file's circles: 0.0043 mm off a circle of 8 mm
 
 
 def _ring(radius_m: float, centre: Array, axis: Array) -> Array:

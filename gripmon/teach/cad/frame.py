@@ -13,11 +13,11 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.surface import Surface
 
 TIP_M = 1e-4
-"""Corners this far behind the foremost one are at the tip, too: what a gripper model takes as equally far."""
+"""Corners this far behind the foremost one are at the tip, too: the tolerance of a gripper model for equal z."""
 
 AXES = {sign + name: scale * np.eye(3)[k] for k, name in enumerate("xyz") for sign, scale in (("+", 1.0), ("-", -1.0))}
 SNAP_COSINE = 0.985
-"""Jaws that move within 10 degrees of an axis of the CAD frame move along it; fingers differ in shape."""
+"""Cosine of about 10 degrees: jaws that move this close to an axis of the CAD frame move along it; fingers differ."""
 
 
 def axes_of(fingers: Sequence[Surface], approach: str) -> Array:
@@ -41,8 +41,8 @@ def axes_of(fingers: Sequence[Surface], approach: str) -> Array:
 
 
 def approach_of(fingers: Sequence[Surface], around: Sequence[Surface]) -> str:
-    """The axis along which the fingers reach farthest from what holds them, or from the CAD frame's origin, which a
-    URDF has at the flange.
+    """The axis along which the fingers reach farthest from the body that holds them, or from the CAD frame's origin,
+    which in a URDF is at the flange.
     """
     middles = [0.5 * (f.points_m.min(axis=0) + f.points_m.max(axis=0)) for f in fingers]
     across = int(np.abs(middles[0] - middles[-1]).argmax()) if len(fingers) > 1 else -1
@@ -54,10 +54,10 @@ def approach_of(fingers: Sequence[Surface], around: Sequence[Surface]) -> str:
 
 
 def inner_tip(surface: Surface, grip_R_cad: Array, towards: float) -> tuple[Array, int]:
-    """The middle (3,) of a fingertip's two innermost corners, axes of the gripper, and of how many corners it is made;
-    ``towards`` is the sign of x on the side of the other finger, 0 for a finger by itself.
+    """The mean (3,) of a fingertip's two innermost corners, gripper axes, and the number of corners used; ``towards``
+    is the sign of x towards the other finger, 0 for a single finger.
 
-    A tip without sharp corners: the innermost x, the middle y and the foremost z of the foremost millimetre.
+    Without sharp corners: the innermost x, the mean y and the foremost z of the foremost millimetre.
     """
     sharp = np.unique(surface.edges[surface.sharp])
     places = surface.points_m @ grip_R_cad.T
@@ -76,7 +76,7 @@ def inner_tip(surface: Surface, grip_R_cad: Array, towards: float) -> tuple[Arra
 
 
 def _corners(surface: Surface, sharp: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Points in which three sharp edges meet, or two that turn."""
+    """Points in which three sharp edges meet, or two at an angle."""
     edges = surface.edges[surface.sharp]
     count = np.bincount(edges.ravel(), minlength=len(surface.points_m))
     found = [p for p in sharp.tolist() if count[p] >= 3]
@@ -96,7 +96,7 @@ def _corners(surface: Surface, sharp: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def frame_of(fingers: Sequence[Surface], grip_R_cad: Array) -> tuple[Array, list[int]]:
-    """``grip_T_cad`` (4, 4) with the TCP between the fingertips, and of how many corners each tip's place is made."""
+    """``grip_T_cad`` (4, 4) with the TCP between the fingertips, and the number of corners that gave each tip."""
     if len(fingers) == 1:
         tips = [inner_tip(fingers[0], grip_R_cad, 0.0)]
     else:

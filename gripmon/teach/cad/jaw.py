@@ -14,12 +14,12 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.surface import Surface
 
 STRAIGHT_M = 1e-6
-"""Fingers that stay this close to a line move along an axis; else they get a table."""
+"""Largest deviation from a line of a finger that moves along an axis; with a larger one it gets a table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Jaw:
-    """The gripper file's section, and each finger's ``motion``."""
+    """The gripper file's jaw section, and each finger's ``motion``."""
 
     model: JawModel
     motion: dict[str, dict[str, Any]]
@@ -31,10 +31,11 @@ def jaw_of(
     jaw_range_m: tuple[float, float] | None,
     jaw_opening_m: float | None,
 ) -> Jaw | None:
-    """From the joint's way (``paths_m``, one (s, 3) a finger), or for two meshes from a range; None: nothing moves.
+    """From the joint's motion (``paths_m``, one (s, 3) per finger), or for two meshes from a range; None if nothing
+    moves.
 
-    The opening is the distance of the fingers along x at their tips, unless ``jaw_opening_m`` says what a robot reports
-    for the fingers as they stand.
+    The opening is the distance of the fingers' tips along x, unless ``jaw_opening_m`` is what a robot reports for the
+    fingers as drawn.
     """
     if paths_m:
         return _linked(list(fingers), list(fingers.values()), paths_m, jaw_opening_m)
@@ -94,7 +95,7 @@ def _linked(names: list[str], surfaces: list[Surface], paths_m: Sequence[Array],
 
 
 def _travelled(path_m: Array) -> Array:
-    """One finger's way along its path, from where it starts."""
+    """A finger's distance travelled along its path."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path_m, axis=0), axis=1))])
 
 

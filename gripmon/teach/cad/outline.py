@@ -1,8 +1,7 @@
-"""What a finger of any shape shows in one view, as straight edges and curves: outlines and creases, cut where
-something hides them.
+"""The edges and curves of a finger of any shape in one view: outlines and creases, cut where something hides them.
 
-Such edges hold about this view.  A sharp edge stays where it is; the outline of what is round wanders over it as the
-view changes, which its points' ``round`` follows.
+Such edges are valid near this view.  A sharp edge stays in place; the outline of a round part moves over it as the view
+changes, which the ``round`` of its points describes.
 """
 
 from __future__ import annotations
@@ -25,30 +24,31 @@ from gripmon.teach.cad.solid import REAR_M, Shape
 from gripmon.teach.cad.surface import Surface
 
 STEP_PX = 0.5
-"""Distance of the points at which a curve is looked at."""
+"""Distance of the points at which a curve is sampled."""
 
 STRAIGHT_PX = 0.03
-"""What lies this close to its chord, over at least :data:`LONG_PX`, is straight, as a circle of 2400 px would be."""
+"""Largest distance from its chord of a straight part, over at least :data:`LONG_PX`: a circle of 2400 px has it."""
 
 LONG_PX = 24.0
 
 VIA_PX = 6.0
-"""Distance of the points that a curve is laid through: a cubic spline is off a circle of 16 px by 0.001 px then."""
+"""Distance of the points through which a curve is laid: a cubic spline then differs from a circle of 16 px by 0.001 px.
+"""
 
 SHADED_PX = 0.1
-"""Standard deviation of where the outline of something round is seen: its shade changes towards it.  In pictures of
-tips of 2 to 8 mm, rendered with a lamp from the side, outlines lay 0.05 to 0.17 px beside."""
+"""Standard deviation of the observed outline of a round part, since its shade changes towards it.  In pictures of tips
+of 2 to 8 mm, rendered with a lamp from the side, outlines were 0.05 to 0.17 px off."""
 
 SHORTEST_PX = 8.0
-"""The shortest edge by itself: what the monitor samples at least.  What is shorter only joins two others: a bridge."""
+"""Shortest single edge: what the monitor samples at least.  A shorter one only joins two others: a bridge."""
 
 SHORTEST_M = 1e-4  # of a gripper file's edges
 
 TURN_RAD = 0.524
-"""A curve that turns by more than this (30 degrees) within a few pixels has a corner there."""
+"""Turn (30 degrees) within a few pixels above which a curve has a corner there."""
 
 LARGEST_GAP_PX = 8.0
-"""What the monitor leaves out of two edges where they meet; a tighter curve between them isn't looked at."""
+"""The part of two edges near their corner that the monitor doesn't sample; a tighter curve between them is ignored."""
 
 MOST_VIA = 62  # of a gripper file
 _AROUND_PX = 3.0
@@ -68,9 +68,9 @@ class _Run:
 
 @dataclass(frozen=True, slots=True)
 class _Edge:
-    """A straight edge, or a curve ``via_m`` (n, 3): its ends in space and in the image (2, 3 and 2), the centres of the
-    roundings there (2, 3), and by how much what is seen lies beside it, m (standard deviation).  A ``bridge`` is too
-    short to be measured and says which edges go on in which.
+    """A straight edge, or a curve through ``via_m`` (n, 3): its ends in space and in the image (2, 3 and 2), the
+    centres of the roundings there (2, 3), and ``spread_m``, the standard deviation of the observed edge from it.  A
+    ``bridge`` is too short to be measured; it only shows which edges are connected.
     """
 
     points_m: Array
@@ -83,8 +83,8 @@ class _Edge:
 
 
 def outline_shape(surface: Surface, view: Pinhole, depth: DepthMap, lowest_m: float | None, mounted: bool) -> Shape:
-    """The edges of a finger (gripper frame) that ``view`` shows.  ``lowest_m``: nothing below this z is taken;
-    ``mounted``: nor what lies at the rear end, where the finger is held.
+    """The edges of a finger (gripper frame) that ``view`` shows.  ``lowest_m``: parts below this z are left out;
+    ``mounted``: so are those at the rear end, where the finger is held.
     """
     rear = float(surface.points_m[:, 2].min())
     edges: list[_Edge] = []
@@ -97,7 +97,7 @@ def outline_shape(surface: Surface, view: Pinhole, depth: DepthMap, lowest_m: fl
 
 
 def _visible(curve: Curve, view: Pinhole, depth: DepthMap, lowest_m: float) -> Iterator[_Run]:
-    """A curve's stretches that are seen, at least :data:`SHORTEST_PX` long."""
+    """A curve's visible stretches that are at least :data:`SHORTEST_PX` long."""
     px, _ = view.project(curve.points_m)
     if not np.isfinite(px).all():
         return
@@ -117,7 +117,7 @@ def _visible(curve: Curve, view: Pinhole, depth: DepthMap, lowest_m: float) -> I
 
 
 def _runs(seen: NDArray[np.bool_], travelled: Array) -> list[tuple[int, int]]:
-    """From and to of what is seen, over gaps of :data:`_LONGEST_GAP_PX`."""
+    """Start and stop of the visible runs, joined over gaps of up to :data:`_LONGEST_GAP_PX`."""
     change = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
     out: list[tuple[int, int]] = []
     for start, stop in change.reshape(-1, 2).tolist():
@@ -165,7 +165,7 @@ def _edges(run: _Run, view: Pinhole) -> Iterator[_Edge]:
 
 
 def _parts(px: Array) -> list[tuple[int, int, bool]]:
-    """From, to, and whether it is straight, of the parts of a smooth curve (n, 2), by Ramer, Douglas and Peucker."""
+    """Start, end, and whether it is straight, of each part of a smooth curve (n, 2), by Ramer, Douglas and Peucker."""
     kept, stack = {0, len(px) - 1}, [(0, len(px) - 1)]
     while stack:
         first, last = stack.pop()
@@ -186,7 +186,7 @@ def _parts(px: Array) -> list[tuple[int, int, bool]]:
 
 
 def _beside_px(px: Array, first: int, last: int) -> Array:
-    """Distances of a curve's points from one of its chords; where that has no length, from its end."""
+    """Distances of a curve's points from one of its chords; from its end if the chord has no length."""
     way, beside = px[last] - px[first], px[first : last + 1] - px[first]
     length = float(np.linalg.norm(way))
     if length < 1e-9:
@@ -195,7 +195,7 @@ def _beside_px(px: Array, first: int, last: int) -> Array:
 
 
 def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
-    """Edges with their ends made one where they meet."""
+    """The finger's shape, with the ends of edges merged where they meet."""
     if not edges:
         return Shape(np.zeros((0, 3)), set(), [], [])
     ends = np.concatenate([edge.points_m for edge in edges])
@@ -214,10 +214,10 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
     for k in range(count):
         own = np.flatnonzero(label == k)
         own = own[~bridging[own]] if not bridging[own].all() else own
-        # A sharp edge's end is exact, an outline's end near it isn't.
+        # The end of a sharp edge is exact, the end of an outline near it isn't.
         exact = own[sharp[own]] if sharp[own].any() else own
         points[k] = ends[exact].mean(axis=0)
-        # Where an outline meets a sharp edge it slides along it: what is round there ends in this edge.
+        # Where an outline meets a sharp edge it slides along it: the round part ends in this edge.
         wanders = own[~sharp[own]]
         if len(wanders):
             way = ends[wanders ^ 1] - ends[wanders]
@@ -241,8 +241,8 @@ def _joined(edges: list[_Edge], view: Pinhole) -> Shape:
 
 
 def _left_in_place(points: Array, label: NDArray[np.intp], ends: list[int]) -> tuple[Array, NDArray[np.intp]]:
-    """A point of their own, at the same place, for ``ends`` of curves on the body: what is round ends there in such a
-    curve, and wanders along it, but the curve stays.
+    """Give ``ends`` of curves on the body a point of their own at the same place: the outline of a round part ends
+    there on such a curve and moves along it, but the curve stays.
     """
     left = sorted({int(label[end]) for end in ends})
     label = label.copy()
@@ -252,7 +252,7 @@ def _left_in_place(points: Array, label: NDArray[np.intp], ends: list[int]) -> t
 
 
 def _bridged(kept: list[int], edges: list[_Edge], found: list[tuple[int, int]]) -> list[int]:
-    """Those of the edges ``kept`` that aren't bridges to nowhere; ``found``: the two points of each edge."""
+    """The edges ``kept`` without bridges to nowhere; ``found``: the two points of each edge."""
     while True:
         meeting = Counter(itertools.chain.from_iterable(found[n] for n in kept))
         left = [n for n in kept if not edges[n].bridge or min(meeting[p] for p in found[n]) > 1]
@@ -269,9 +269,9 @@ def _met(
     bridging: NDArray[np.bool_],
     apart_m: float,
 ) -> tuple[int, NDArray[np.intp]]:
-    """Loose ends of two straight edges with no more than a few pixels of a tight curve between them, joined where
-    their lines meet to ``apart_m``: at this distance that is a corner.  ``ends`` are moved there.  The number of
-    points, and each end's (e,).
+    """Join loose ends of two straight edges with no more than a few pixels of a tight curve between them, if their
+    lines meet to ``apart_m``: at this distance that is a corner.  Moves ``ends`` there.  Returns the number of points,
+    and the point of each end (e,).
     """
     others = np.where(bridging, -1, label)
     loose = np.flatnonzero((np.bincount(label, ~bridging)[label] == 1) & straight & ~bridging)
@@ -288,7 +288,7 @@ def _met(
         beyond_px = shares * [np.linalg.norm(way_i), np.linalg.norm(way_j)]
         if (np.abs(beyond_px) > LARGEST_GAP_PX).any():
             continue
-        # Along each edge, so that its line stays; where they pass each other in depth there is no corner.
+        # Move along each edge, so that its line stays; edges that pass each other in depth form no corner.
         met = [ends[k] + share * (ends[k] - ends[k ^ 1]) for k, share in ((i, shares[0]), (j, shares[1]))]
         if np.linalg.norm(met[1] - met[0]) > apart_m:
             continue

@@ -16,7 +16,7 @@ _WIDTH_PX = 1200
 
 
 def draw_gripper(camera: Camera, gripper: Gripper, cam_T_grip: Array, image: Image | None = None) -> Image:
-    """Outlines orange, creases green, corners by name, other points grey; over ``image`` if there is one."""
+    """Draw outlines orange, creases green, corners by name, other points grey; over ``image`` if there is one."""
     if image is None:
         image = np.full((camera.height_px, camera.width_px), _PAPER, np.uint8)
     canvas = Canvas(image, max(1, -(-_WIDTH_PX // camera.width_px)))

@@ -1,4 +1,4 @@
-"""Fingers with flat faces that are convex: their points, edges and faces, whatever the view."""
+"""Convex fingers with flat faces: their points, edges and faces, for all views."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from gripmon.teach.cad.files import Body
 from gripmon.teach.cad.surface import FLAT_M, Surface, surface_of
 
 MOST_FACES = 64
-"""More faces than that, on one finger, are a rounding that was cut coarsely."""
+"""Most faces of a finger; more are a coarsely cut rounding."""
 
 REAR_M = 5e-4
-"""Edges this close to a finger's rear end are where it is mounted: nothing is seen there of its own."""
+"""Distance from a finger's rear end within which edges are left out: it is mounted there, and they aren't seen."""
 
 
 @dataclass(slots=True)
 class Shape:
-    """One finger in the gripper frame: ``points_m`` (p, 3), which are ``corners``, ``edges`` as pairs of points with
-    ``crease`` or not, ``loops`` of faces.  ``round_m``: by point, centre and axis of the rounding that it lies on.
-    ``spread_m``: by edge, how far (standard deviation) what is seen lies beside it; empty for none.
+    """One finger in the gripper frame: ``points_m`` (p, 3), which of them are ``corners``, ``edges`` as pairs of points
+    with ``crease`` or not, ``loops`` of faces.  ``round_m``: by point, centre and axis of the rounding it lies on.
+    ``spread_m``: by edge, the standard deviation of the observed edge from it; empty for none.
     ``via_m``: by edge, the points (n, 3) that a curved one passes between its ends; empty where none is curved.
     """
 
@@ -39,7 +39,7 @@ class Shape:
 
 
 def is_solid(surface: Surface) -> bool:
-    """Whether a finger is a convex solid of flat faces, which a gripper file holds for all views."""
+    """Whether a finger is a convex solid with flat faces, which a gripper file describes for all views."""
     faces = int(surface.patch.max(initial=-1)) + 1
     if not 4 <= faces <= MOST_FACES or not surface.closed or not surface.flat() or len(surface.lines):
         return False
@@ -76,8 +76,8 @@ def _normals(points: Array, triangles: NDArray[np.intp]) -> Array:
 
 
 def solid_shape(surface: Surface, mounted: bool) -> Shape:
-    """Points where three faces meet, edges where two do, and the faces.  ``mounted``: z points to the tip, and at its
-    other end the finger is held; then corners are those of the front half.
+    """Points where three faces meet, edges where two do, and the faces.  ``mounted``: z points to the tip, and the
+    finger is held at its other end; then only points of the front half are corners.
     """
     patches_at: dict[int, set[int]] = {}
     for triangle, patch in zip(surface.triangles.tolist(), surface.patch.tolist(), strict=True):

@@ -1,6 +1,4 @@
-"""A body's surface: which triangles are neighbours, what turns sharply between them, what is flat, and where it is
-round by how much.
-"""
+"""A body's surface: neighbouring triangles, sharp edges between them, flat patches, and the radius of round parts."""
 
 from __future__ import annotations
 
@@ -16,22 +14,22 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.files import Body
 
 SHARP_RAD = 0.524
-"""Two triangles that turn by more than this (30 degrees) meet in an edge.  Exports cut roundings finer: Open CASCADE's
-mesher, which FreeCAD and others use, by 0.5 rad unless it is told otherwise."""
+"""Angle between two triangles (30 degrees) above which they meet in a sharp edge.  Exports cut roundings finer: Open
+CASCADE's mesher, which FreeCAD and others use, by 0.5 rad by default."""
 
 FLAT_M = 5e-6
-"""A patch whose points lie this close to a plane is a face: float32 coordinates of a metre are off by 0.03 of it."""
+"""Largest distance of a face's points from its plane: float32 coordinates of a metre are off by 0.03 of it."""
 
 WELD_M = 2e-6
-"""Points on borders that are this near are one: exports write single precision, or six digits of millimetres."""
+"""Distance within which points on borders are merged: exports have single precision, or six digits of millimetres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
     """``points_m`` (p, 3), ``triangles`` (t, 3) with unit ``normals`` (t, 3).  ``edges`` (e, 2) points, ``sides``
     (e, 2) their triangles, -1 where there is none; ``sharp`` (e,): an edge of the body, or its border.  ``patch`` (t,):
-    what is connected without crossing a sharp edge.  ``alike`` (e,): its two triangles are turned alike.  ``lines``
-    (l, 2) edges without triangles.
+    number of the part that is connected without crossing a sharp edge.  ``alike`` (e,): whether its two triangles have
+    the same orientation.  ``lines`` (l, 2) edges without triangles.
     """
 
     points_m: Array
@@ -46,19 +44,19 @@ class Surface:
 
     @property
     def border(self) -> NDArray[np.bool_]:
-        """(e,) edges with a triangle on one side only."""
+        """Mask (e,) of edges with a triangle on one side only."""
         return np.asarray(self.sides[:, 1] < 0)
 
     @property
     def closed(self) -> bool:
-        """Whether it bounds a solid, its triangles turned outwards."""
+        """Whether it bounds a solid, its triangles oriented outwards."""
         if not len(self.triangles) or self.border.any() or not self.alike.all():
             return False
         a, b, c = np.moveaxis(self.points_m[self.triangles], 1, 0)
         return bool(np.einsum("ti,ti->", a, np.cross(b, c)) > 0.0)
 
     def shifted(self, offset_m: Array) -> Surface:
-        """Moved by ``offset_m`` (3,)."""
+        """The surface shifted by ``offset_m`` (3,)."""
         return replace(self, points_m=self.points_m + offset_m)
 
     def flat(self) -> bool:
@@ -66,7 +64,7 @@ class Surface:
         return all(self.off_plane_m(k) <= FLAT_M for k in range(int(self.patch.max(initial=-1)) + 1))
 
     def off_plane_m(self, patch: int) -> float:
-        """How far a patch's points lie off its mean plane, at most."""
+        """Largest distance of a patch's points from its mean plane."""
         own = self.patch == patch
         corners = self.points_m[self.triangles[own]]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
@@ -75,9 +73,7 @@ class Surface:
 
 
 def surface_of(body: Body) -> Surface:
-    """A body's surface: its points welded, triangles without area left out; a solid that is turned inside out is turned
-    back.
-    """
+    """A body's surface: its points merged, triangles without area left out; a solid turned inside out is corrected."""
     body = _welded(body)
     a, b, c = np.moveaxis(body.points_m[body.triangles] - body.points_m.mean(axis=0), 1, 0)
     if np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0:
@@ -86,7 +82,7 @@ def surface_of(body: Body) -> Surface:
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(area, axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    # Flat to the rounding of single precision: such a sliver has no normal.
+    # Flat to the rounding of single precision: such a sliver has no reliable normal.
     kept = size > 2e-7 * longest * np.maximum(longest, 1e-3)
     triangles, normals = body.triangles[kept], area[kept] / size[kept, None]
     edges, sides, alike = _neighbours(triangles)
@@ -99,8 +95,8 @@ def surface_of(body: Body) -> Surface:
 
 
 def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Edges (e, 2), the two triangles of each (e, 2), and whether these run through it in opposite ways, as the sides
-    of one surface do.  An edge with more than two triangles counts as one for each pair.
+    """Edges (e, 2), the two triangles of each (e, 2), and whether these traverse it in opposite directions, as on a
+    consistently oriented surface.  An edge with more than two triangles counts once for each pair.
     """
     if not len(triangles):
         return np.zeros((0, 2), np.intp), np.zeros((0, 2), np.intp), np.zeros(0, bool)
@@ -110,7 +106,7 @@ def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[
     order = np.lexsort((owner, high, low))
     low, high, owner, forward = low[order], high[order], owner[order], (ends[:, 0] < ends[:, 1])[order]
     same = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
-    # The first of a run pairs with the second, a third one with a fourth.
+    # Of the triangles at an edge the first pairs with the second, a third one with a fourth.
     starts = np.flatnonzero(np.concatenate([[True], ~same]))
     rank = np.arange(len(low)) - np.repeat(starts, np.diff(np.append(starts, len(low))))
     first = np.flatnonzero(rank % 2 == 0)
@@ -122,7 +118,7 @@ def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[
 
 
 def _welded(body: Body) -> Body:
-    """Points on borders joined where they coincide."""
+    """The body with coinciding points on borders merged."""
     edges, sides, _ = _neighbours(body.triangles)
     border = np.unique(edges[sides[:, 1] < 0])
     if len(border) < 2:
@@ -141,7 +137,7 @@ def _welded(body: Body) -> Body:
 
 @dataclass(frozen=True, slots=True)
 class Shading:
-    """A surface's smooth normals: ``corner`` (t, 3) indices into ``normals`` (n, 3), one a point and patch."""
+    """A surface's smooth normals: ``corner`` (t, 3) indices into ``normals`` (n, 3), one per point and patch."""
 
     corner: NDArray[np.intp]
     normals: Array
@@ -166,7 +162,7 @@ def shading_of(surface: Surface) -> Shading:
 
 
 def radius_m(places: Array, normals: Array, direction: Array) -> Array:
-    """How a surface is rounded along ``direction`` (n, 3): radii (n,), infinite where flat, negative where hollow.
+    """Radii (n,) of curvature along ``direction`` (n, 3); infinite where flat, negative where concave.
 
     ``places``, ``normals`` (n, 3, 3): the corners of triangles on it.  The derivative of the normal along the surface
     is linear in the direction (the shape operator); it follows from the three sides of a triangle (Rusinkiewicz 2004).
@@ -178,7 +174,7 @@ def radius_m(places: Array, normals: Array, direction: Array) -> Array:
     v = np.cross(mean / np.linalg.norm(mean, axis=1)[:, None], u)
     along, across = np.einsum("nki,ni->nk", sides, u), np.einsum("nki,ni->nk", sides, v)
     turned = np.einsum("nki,ni->nk", change, u)
-    # Least squares of turned = a * along + b * across over the three sides: a is the curvature that is sought.
+    # Least squares of turned = a * along + b * across over the three sides: a is the curvature wanted.
     aa, bb, ab = (along**2).sum(axis=1), (across**2).sum(axis=1), (along * across).sum(axis=1)
     at, bt = (along * turned).sum(axis=1), (across * turned).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

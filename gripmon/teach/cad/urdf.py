@@ -1,4 +1,4 @@
-"""Reads a gripper's URDF: which links its joint moves, and where to at every opening.
+"""Reads a gripper's URDF: which links its joint moves, and their positions at every opening.
 
 https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.
 """
@@ -18,10 +18,10 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.files import MESHES, Body, joined, mesh_library, read_mesh
 
 STEPS = 41
-"""Places of the joint at which the fingers are put: an arc of 57 mm over 0.8 rad is 2.8 um off a table of 41 rows."""
+"""Number of joint positions that are evaluated: an arc of 57 mm over 0.8 rad is 2.8 um off a table of 41 rows."""
 
 TURNS_RAD = 1e-3
-"""A link that turns by no more than this between the ends of the joint's way doesn't turn: 0.02 mm at 20 mm."""
+"""Largest turn, over the joint's range, of a link that counts as not turning: 0.02 mm at 20 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,8 @@ class _Joint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """A group of links that one joint moves alike: ``body`` in the base's frame at the middle of the joint's way, and
-    ``path_m`` (s, 3) where it is shifted to from there; ``turns_rad``: by how much it turns on the way.
+    """A group of links that move together: ``body`` in the base's frame at the middle of the joint's range, ``path_m``
+    (s, 3) its shifts from there, and ``turns_rad``, its largest turn over the range.
     """
 
     body: Body
@@ -60,7 +60,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Linkage:
-    """A URDF gripper: what the joint moves, and what stands (``base``); ``joint`` the one that drives it."""
+    """A URDF gripper: the bodies that the joint moves, the fixed one (``base``), and the driving ``joint``."""
 
     moving: list[Moving]
     base: Body | None
@@ -153,7 +153,7 @@ class _Reader:
         return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
 
     def _find(self, name: str) -> Path | None:
-        """``package://NAME/…`` is sought from the URDF's folder upwards."""
+        """Find a mesh file; ``package://NAME/…`` is searched for from the URDF's folder upwards."""
         plain = name.removeprefix("file://").removeprefix("package://")
         parts = Path(plain).parts
         tries = [Path(plain)] if plain.startswith("/") else []
@@ -177,9 +177,9 @@ class _Reader:
 
 
 def read_urdf(path: Path, joint: str | None) -> Linkage:
-    """A URDF's gripper, moved by ``joint`` (None: the only one that moves something and follows no other).
+    """Read a URDF's gripper, moved by ``joint`` (None: the only one that moves something and follows no other).
 
-    Raises :class:`InputError` for a file that isn't a URDF, or whose joints leave open which one opens the jaws.
+    Raises :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which one opens the jaws.
     """
     reader = _Reader(path)
     joints, bodies = reader.joints(), reader.bodies()
@@ -195,7 +195,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
     for name in bodies:
         way = np.array([pose.get(name, np.eye(4)) for pose in poses])
         middle = np.linalg.inv(way[STEPS // 2])
-        # Links whose motion is the same are one body.
+        # Links with the same motion are one body.
         groups.setdefault(np.round(way @ middle, 9).tobytes(), []).append(name)
     moving, base = [], None
     for names in groups.values():
@@ -213,7 +213,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
 
 
 def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_Joint, dict[str, float]]:
-    """The joint of the jaws, and by how much of its value each driving joint goes: two equal ones go together."""
+    """The jaws' joint, and each driving joint's value over its value: two equal ones move together."""
     free = [j for j in joints if j.kind != "fixed" and j.mimic is None]
     if name is not None:
         chosen = [j for j in free if j.name == name]
@@ -233,7 +233,7 @@ def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_
 
 
 def _placed(joints: list[_Joint], values: dict[str, float]) -> dict[str, Array]:
-    """``base_T_link`` of every link that a joint holds, with the base where no joint holds it."""
+    """``base_T_link`` of every link held by a joint; a link without one is at the base."""
     children = {j.child: j for j in joints}
     out: dict[str, Array] = {}
 

@@ -1,4 +1,4 @@
-"""Fingers' shapes as a gripper model, and that as a file with comments."""
+"""Fingers' shapes as a gripper model, and the model as a file with comments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIGITS = 7  # of a metre: a tenth of a micrometre
 
 
 def model_of(name: str, shapes: Mapping[str, Shape], jaw: Jaw | None, provenance: Provenance | None) -> GripperModel:
-    """The gripper file.  Points are called FINGER_p1 and so on, from the tip backwards, edges FINGER_e1."""
+    """The gripper file's model.  Points are named FINGER_p1 and so on, from the tip backwards, edges FINGER_e1."""
     points: dict[str, PointModel] = {}
     edges: dict[str, EdgeModel] = {}
     faces = []
@@ -34,7 +34,7 @@ def model_of(name: str, shapes: Mapping[str, Shape], jaw: Jaw | None, provenance
             )
         for k, ((a, b), crease) in enumerate(zip(shape.edges, shape.crease, strict=True), start=1):
             kind: Literal["contour", "crease"] = "crease" if crease else "contour"
-            # The model takes a bevel's edge to lie anywhere in its width: 1/sqrt(12) of that is its deviation.
+            # The model has a bevel's edge anywhere in its width: 1/sqrt(12) of that is its standard deviation.
             bevel_m = round(math.sqrt(12.0) * shape.spread_m[k - 1], 6) if shape.spread_m else 0.0
             via = tuple(map(_rounded, shape.via_m[k - 1])) if shape.via_m else ()
             edges[f"{finger}_e{k}"] = EdgeModel(start=names[a], end=names[b], kind=kind, bevel_m=bevel_m, via=via)
@@ -65,7 +65,7 @@ def _round(shape: Shape, point: int) -> RoundModel | msgspec.UnsetType:
 
 
 def gripper_text(model: GripperModel, notes: Sequence[str]) -> str:
-    """The file, commented as those in ``configs/grippers``; what is at its default is left out."""
+    """The file, commented as those in ``configs/grippers``; values at their default are left out."""
     return "\n".join(_lines(model, notes)) + "\n"
 
 
@@ -109,6 +109,6 @@ def _without_defaults(part: PointModel | EdgeModel) -> dict[str, Any]:
 
 
 def _flow(value: Any) -> str:
-    """A value on one line of YAML."""
+    """A value as one line of YAML."""
     text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**9, allow_unicode=True)
     return re.sub(r"\n\.\.\.$", "", text.strip())
