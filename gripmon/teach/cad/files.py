@@ -182,8 +182,9 @@ class _Cao:
 
 
 def read_cao(path: Path) -> Body:
-    """Read a 3D model of ViSP's (https://visp-doc.inria.fr, tutorial "Markerless generic model-based tracking"), metres:
-    points, lines, faces of lines, faces of points, cylinders, circles.  Faces that aren't flat become triangles.
+    """Read a 3D model of ViSP's (https://visp-doc.inria.fr, tutorial "Markerless generic model-based tracking"),
+    metres: points, lines, faces of lines, faces of points, cylinders, circles.  Faces that aren't flat become
+    triangles.
     """
     cao = _Cao(path)
     points = [cao.numbers(3, "a point") for _ in range(cao.count("points"))]
