@@ -32,7 +32,7 @@ pixels fewer than nine in ten repeat, down to a noise of 0.1 grey levels.
 """
 
 FEWEST_INNER = 200
-"""Fewest pixels, of about 1,700, that are neither black nor white; an image with fewer proves nothing."""
+"""Fewest pixels, of about 1,700, strictly between the image's darkest and brightest; with fewer it proves nothing."""
 
 SURE_FRAMES = 3
 """Frames that confirm a finding: images with large identical parts; repeated stamps, which mean a clock that stands
