@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import load_gripper
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import FingerLook, JawScript, Light, LightStep, Shadow, Tilt
-from gripmon.track.look import LookAlignment, LookFusion, LookMotion, kernel
+from gripmon.track.look import LookAlignment, LookFusion, LookMotion, alignment, kernel
 from gripmon.track.look.alignment import FEWEST_VIEWS, LINEAR_PX
 from gripmon.track.look.fusion import MEMORY, PER_OPENING
 
@@ -78,6 +79,21 @@ def test_the_compiled_fit_is_that_of_numpy(seed: int):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("by", [kernel, by_numpy])
+def test_from_where_the_fit_ended_it_goes_no_farther(by: ModuleType):
+    """What is known of the opening counts once, however often the image is read."""
+    rng = np.random.default_rng(12)
+    mean, weight = rng.uniform(40.0, 200.0, (12, 36)), np.ones((12, 36))
+    jacobian, motion = rng.normal(0.0, 30.0, (12, 7, 36)), rng.normal(0.0, 0.02, 7)
+    jacobian -= jacobian.mean(axis=2, keepdims=True)
+    prior, known = np.array([0.0] * 6 + [3e5]), np.zeros(7)
+    step, information, *_ = by.align(mean + motion @ jacobian, mean, weight, jacobian, prior, known)
+    assert 0.2 < prior[6] / information[6, 6] < 0.8  # both say something of it
+    rest = mean + (motion - step) @ jacobian
+    again, *_ = by.align(rest, mean, weight, jacobian, prior, known - step)
+    assert abs(again[6]) < 0.05 * abs(step[6])
+
+
 @pytest.mark.parametrize("shape", [(40, 50, 1), (40, 50, 3)])
 def test_the_compiled_reading_is_that_of_numpy(shape: tuple[int, ...]):
     rng = np.random.default_rng(5)
@@ -132,6 +148,22 @@ def test_light_and_jaws_change_little(settings: dict[str, object], most_um: tupl
     simulation = filmed(**settings)
     errors, _ = errors_um(simulation, learnt(simulation), range(24, 38))
     assert (np.abs(errors.mean(axis=0)) < most_um).all()
+
+
+def test_reading_again_does_not_take_the_opening_farther_from_what_is_known(monkeypatch: pytest.MonkeyPatch):
+    """A report 0.1 mm off: three times or twelve, the pixels and the report together say the same."""
+    (simulation, learnt_before), off_m = standing(), []
+    truth = simulation.truth(30)
+    assert truth.jaw_opening_m is not None
+    monkeypatch.setattr(alignment, "CLOSE_PX", 0.0)
+    for readings in (3, 12):
+        monkeypatch.setattr(alignment, "READINGS", readings)
+        args = simulation.render(30), truth.cam_T_grip, truth.jaw_opening_m + 1e-4, 5e-6
+        found = learnt_before.measure(*args)
+        assert found is not None and found.jaw_opening_m is not None
+        off_m.append(found.jaw_opening_m - truth.jaw_opening_m)
+    assert 3e-5 < off_m[0] < 9e-5  # both say something of it
+    assert off_m[1] == pytest.approx(off_m[0], abs=2e-6)
 
 
 def test_what_hides_half_of_a_finger_is_left_out():
@@ -216,6 +248,29 @@ def test_the_fused_pose_scatters_less_than_either_and_about_the_edges_mean():
     edges_um = 1e6 * np.sqrt(EDGES.diagonal()[:3])
     assert (1e6 * fused.std(axis=0) < 0.45 * edges_um).all()
     assert (1e6 * np.abs(fused.mean(axis=0)) < 4.0 * edges_um / np.sqrt(MEMORY)).all()
+
+
+def test_no_direction_is_worse_than_the_edges_from_the_first_frame_that_is_measured():
+    """Edges that err much alike from one background to the next; the look is learnt where they have the gripper."""
+    rng, alike = np.random.default_rng(11), 0.8
+    edges, fused = [], []
+    for _ in range(400):
+        fusion, errors = LookFusion(0.03), [rng.multivariate_normal(np.zeros(6), EDGES)]
+        while len(errors) < FEWEST_VIEWS + 8:
+            fresh = rng.multivariate_normal(np.zeros(6), (1.0 - alike**2) * EDGES)
+            errors.append(alike * errors[-1] + fresh)
+        for error in errors[:FEWEST_VIEWS]:
+            fusion.place(perturb(np.eye(4), error), EDGES, None)
+        bias = np.mean(errors[:FEWEST_VIEWS], axis=0)
+        for error in errors[FEWEST_VIEWS:]:
+            look_T = perturb(np.eye(4), bias + rng.multivariate_normal(np.zeros(6), LOOK))
+            both = fusion.fuse(perturb(np.eye(4), error), EDGES, LookMotion(look_T, LOOK, None))
+            fusion.learn()
+            assert both is not None
+            edges.append(error)
+            fused.append(perturbation_between(np.eye(4), both.cam_T_grip))
+    one, other = (np.sqrt(np.mean(np.square(errors), axis=0)) for errors in (fused, edges))
+    assert (one < 0.85 * other).all()
 
 
 def test_the_fused_pose_changes_by_as_much_as_is_claimed_while_nothing_moves():

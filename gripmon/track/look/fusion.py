@@ -1,9 +1,9 @@
 """Edges and look in one estimate: the edges know where the gripper is, the look by how much it has moved.
 
 What the look has too much, its bias, is where the edges had the gripper on average while it was learnt, and what its
-model of the fingers has wrong.  Against the edges it so begins at zero, as uncertain as that average.  The edges show it
-a little in every frame, and their own errors are others before every background.  A motion is seen by both, so that it
-never becomes bias, however slow it is.
+model of the fingers has wrong.  Against the edges it so begins at zero, as uncertain as that average.  The edges show
+it a little in every frame, and their own errors are others before every background.  A motion is seen by both, so that
+it never becomes bias, however slow it is.
 """
 
 from __future__ import annotations
