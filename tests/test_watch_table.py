@@ -223,7 +223,9 @@ def test_an_alert_with_the_clock_of_recorded_images_says_so(capsys: pytest.Captu
     log.show()
     now, recorded = capsys.readouterr().out.splitlines()
     assert "(" not in now.partition("arm/wrist")[0]
-    assert recorded.startswith("2023-11-1") and "(the clock of recorded images, or an alert from before)  arm" in recorded
+    assert (
+        recorded.startswith("2023-11-1") and "(the clock of recorded images, or an alert from before)  arm" in recorded
+    )
 
 
 @pytest.mark.parametrize("number", [-1, 2**63, -(10**30), 10**400])

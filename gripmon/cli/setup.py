@@ -38,7 +38,7 @@ def setup(arguments: Arguments) -> None:
     from gripmon.teach.page_server import serve
 
     folder, source = make_directory(arguments.dir, "DIR"), arguments.source
-    if source is not None and not source.isdecimal() and not os.path.isabs(source) and os.path.exists(source):
+    if source is not None and not source.isdecimal() and not Path(source).is_absolute() and Path(source).exists():
         source = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))  # named from here, kept from there
     with contextlib.chdir(folder):
         project = Project(Path())

@@ -93,7 +93,9 @@ def read_document(path: Path, kind: type[_T]) -> _T:
         raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
     if schema != tag:
         words = [_SCHEMAS.get(str(name).partition("/")[0]) for name in (schema, tag)]
-        wrong, right = (f"{name}, {what}" if what else name for name, what in zip((repr(schema), tag), words, strict=True))
+        wrong, right = (
+            f"{name}, {what}" if what else name for name, what in zip((repr(schema), tag), words, strict=True)
+        )
         raise ConfigError(path, "schema", f"is {wrong}", right)
     return read_settings(path, kind, values)
 

@@ -133,7 +133,9 @@ class Project:
         if step.kind in ("page", "run"):
             state = self._state(step)
             command = f"cd {shlex.quote(str(self.folder))} && {state.command}"
-            raise InputError(state.note if state.progress == "waits" else f"{name}: has a command of its own; {command}")
+            raise InputError(
+                state.note if state.progress == "waits" else f"{name}: has a command of its own; {command}"
+            )
         if step.kind == "form":
             return self.do(name)
         capture = self.capture(name)

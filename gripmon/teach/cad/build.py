@@ -279,7 +279,7 @@ def _checked(surface: Surface, name: str) -> Surface:
 
 
 def _odd(surface: Surface, name: str) -> list[str]:
-    """What is said of a surface as small as none by its unit, and of one that isn't closed: its borders show as edges."""
+    """Notes on a surface too small for its unit, and on one that isn't closed: its borders show as edges."""
     out = []
     longest_m = float(np.ptp(surface.points_m, axis=0).max())
     if longest_m < SHORTEST_M:
