@@ -1,1 +1,1 @@
-"""What comes in and goes out: images, Zenoh, ROS 2, metrics."""
+"""Input and output: image sources, Zenoh, ROS 2 and metrics."""

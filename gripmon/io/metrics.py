@@ -1,7 +1,7 @@
-"""Metrics for Prometheus: what the state message says, counts of alerts and verdicts, and the latency's distribution.
+"""Prometheus metrics: the content of the state message, counts of alerts and verdicts, and a latency histogram.
 
-The loop's thread only adds to a few counters (:class:`Tally`); a thread of the HTTP server makes metrics of them when
-someone asks.  The text format comes from ``prometheus-client``, an optional dependency (``gripmon[metrics]``) that is
+The monitor's loop only updates a few counters (:class:`Tally`); a thread of the HTTP server turns them into metrics on
+each scrape.  The text format comes from ``prometheus-client``, an optional dependency (``gripmon[metrics]``) that is
 imported when the server starts.
 """
 
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_POLL_S = 0.1  # how long a stop waits for the server at most
+_POLL_S = 0.1  # longest time that stopping waits for the server
 
 
 LATENCY_BOUNDS_S = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1, 0.25, 1.0)
-"""Upper bounds of the latency's buckets; one more is open."""
+"""Upper bounds of the latency histogram's buckets, s; one more bucket is unbounded."""
 
 _BOUNDS_NS = tuple(round(1e9 * bound) for bound in LATENCY_BOUNDS_S)
-_COUNTED = (AlertEvent.RAISED, AlertEvent.NOTED)  # an update or the end is no further alert
+_COUNTED = (AlertEvent.RAISED, AlertEvent.NOTED)  # updates and ends are not counted as alerts
 
 
 class Tally(Publisher):
@@ -85,7 +85,7 @@ class MetricsError(InputError):
 
 
 def package_fault(settings: MetricsSettings) -> tuple[str, str, str] | None:
-    """Key, what is wrong and what would be right, where the package is missing that the settings ask for."""
+    """Return key, what is wrong and what would be right if the package that the settings need is missing; else None."""
     if not settings.enabled or importlib.util.find_spec("prometheus_client") is not None:
         return None
     right = "pip install -e '.[metrics]' in gripmon's checkout, or enabled: false"
@@ -93,10 +93,10 @@ def package_fault(settings: MetricsSettings) -> tuple[str, str, str] | None:
 
 
 class MetricsServer(Tally):
-    """Counts what it is given as a publisher, and tells whoever asks at ``/metrics``."""
+    """A publisher that counts its records and serves the counts at ``/metrics``."""
 
     def __init__(self, settings: MetricsSettings, robot: str, camera: str) -> None:
-        """Listens at once, in a thread of its own.  Raises :class:`MetricsError`."""
+        """Start listening immediately, in a separate thread.  Raises :class:`MetricsError`."""
         super().__init__()
         if (fault := package_fault(settings)) is not None:
             raise MetricsError("{}: {}; {}".format(*fault))
@@ -107,7 +107,7 @@ class MetricsServer(Tally):
         ProcessCollector(registry=registry)
         try:
             self._server = _listen(settings.address, settings.port)
-        except (OSError, UnicodeError) as error:  # UnicodeError: a host name that can't be one
+        except (OSError, UnicodeError) as error:  # UnicodeError: not a possible host name
             where = f"{settings.address}:{settings.port}"
             key, right = _remedy(error)
             reason = getattr(error, "strerror", None) or error
@@ -126,26 +126,26 @@ class MetricsServer(Tally):
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """A thread for each question: who asks and doesn't listen holds up no one else."""
+    """One thread per request, so that a client that doesn't read its answer delays no one else."""
 
     daemon_threads = True
 
     def handle_error(self, request: object, client_address: object) -> None:
-        _log.debug("metrics for %s", client_address, exc_info=True)  # they hung up; a traceback on stderr otherwise
+        _log.debug("metrics for %s", client_address, exc_info=True)  # client hung up; not a traceback on stderr
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = 10.0  # s, for someone who connects and asks nothing
+    timeout = 10.0  # s, for a client that connects and sends no request
 
     def log_message(self, format: str, *values: object) -> None:
-        """Not a line for each question."""
+        """Suppress the log line per request."""
 
     def address_string(self) -> str:
         return str(self.client_address[0])
 
 
 def _listen(address: str, port: int) -> _Server:
-    """OSError, or UnicodeError for what can't be a name, where that isn't possible."""
+    """Open the server.  OSError if it can't listen there, UnicodeError for an impossible host name."""
     family, *_, where = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     bound = type("_Bound", (_Server,), {"address_family": family})
     return cast(_Server, bound(where[:2], _Handler))
@@ -173,7 +173,7 @@ class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class _Family(NamedTuple):
-    """A metric: its name, help text, and its samples by the values of its ``labels`` beside robot and camera."""
+    """A metric: name, help text, and samples by the values of its ``labels`` (robot and camera are added to these)."""
 
     kind: Literal["counter", "gauge"]
     name: str
@@ -183,8 +183,8 @@ class _Family(NamedTuple):
 
 
 class Families:
-    """A collector of ``prometheus_client``'s, asked in the HTTP server's thread: the counts and the newest state, named
-    and in units as Prometheus has them.  What isn't known has no sample: a zero would look like health.
+    """A ``prometheus_client`` collector, called in the HTTP server's thread: the counts and the newest state, with
+    names and units by Prometheus's conventions.  An unknown value has no sample, because a zero would look healthy.
     """
 
     def __init__(self, tally: Tally, robot: str, camera: str) -> None:
@@ -192,7 +192,7 @@ class Families:
         self._who = (robot, camera)
 
     def collect(self) -> Iterator[Metric]:
-        """All families, of the newest state and the frames so far."""
+        """Yield all metric families, from the newest state and the frames so far."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         kinds = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
@@ -238,7 +238,7 @@ def _of_state(state: StateRecord) -> Iterator[_Family]:
     yield _Family("gauge", "gripmon_tcp_shift_meters", text, shift, ("axis",))
     text, version = "Always 1: the version and the reference", {(state.version, state.reference_id): 1.0}
     yield _Family("gauge", "gripmon_info", text, version, ("version", "reference"))
-    # A sample for each name, 1 for the one that holds: also for one that this version has no name for.
+    # One sample per state, 1 for the current one, even if this version doesn't know that state's name.
     states = {(each.value,): 0.0 for each in State} | {(str(state.state),): 1.0}
     yield _Family("gauge", "gripmon_state", "1 for what the monitor is doing", states, ("state",))
     verdicts = {(each.value,): 0.0 for each in Verdict} | {(str(state.verdict),): 1.0}
@@ -255,12 +255,12 @@ def _of_frames(tally: Tally) -> Iterator[_Family]:
     known = record is not None and record.verdict is not Verdict.UNKNOWN and record.drift is not None
     turn = {(): record.drift.rotation_rad} if known and record and record.drift else {}
     yield _Family("gauge", "gripmon_rotation_radians", "Turn of the camera against the reference", turn)
-    # A copy: the loop may add one meanwhile.
+    # Copied, because the loop may add an entry meanwhile.
     alerts = {tuple(n.value for n in names): float(count) for names, count in dict(tally.alerts).items()}
     yield _Family("counter", "gripmon_alerts", "Alerts raised or noted", alerts, ("kind", "cause", "severity"))
 
 
 def _cumulative(counts: list[int]) -> list[tuple[str, float]]:
-    """Buckets as the text format has them: each counts all below its bound."""
+    """Cumulative buckets, as in the text format: each counts all values below its bound."""
     totals = itertools.accumulate(counts)
     return [(bound, float(total)) for bound, total in zip((*map(str, LATENCY_BOUNDS_S), "+Inf"), totals, strict=True)]

@@ -1,4 +1,4 @@
-"""What the monitor says on the network, and the jaw opening that it hears there.
+"""What the monitor publishes on the network, and the robot's messages that it subscribes to there.
 
 Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.model.records`):
 

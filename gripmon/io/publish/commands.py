@@ -1,4 +1,4 @@
-"""Commands from the network: Zenoh's thread takes them in, the monitor's loop carries them out between two frames."""
+"""Commands from the network: Zenoh's thread receives them, the monitor's loop executes them between two frames."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from gripmon.model.records import (
 _log = logging.getLogger(__name__)
 
 TIMEOUT_S = 2.0
-"""Time that the loop has for a command; then the asker learns that it has not answered."""
+"""Time that the loop has for a command, s; after it the sender gets an error reply."""
 
 _WAITING_MOST = 16
 _REMEMBERED_MOST = 256
 _QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
-"""They change nothing, and their answers are large: asked again they are answered afresh, not from memory."""
+"""Commands that change nothing and have large answers: repeated requests are executed again, not cached."""
 
 _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
 
 
 class PendingCommand:
-    """A command, and all who wait for its answer: whoever sent it, perhaps several times under the same id.
+    """A command and all queries that wait for its answer; a sender may repeat a command under the same id.
 
-    It is carried out once at most.  Each asker gets one reply: the answer, or that the time is over.
+    It is executed at most once.  Each query gets one reply: the answer, or an error at the timeout.
     """
 
     def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
-        """``monitor_id`` is that of the monitor which answers."""
+        """``monitor_id``: the id of the monitor that answers."""
         self.command, self._monitor_id = command, monitor_id
         self._answers = answers
         self._timeout_s = timeout_s
@@ -57,11 +57,11 @@ class PendingCommand:
 
     @property
     def askers(self) -> int:
-        """How many wait for the answer."""
+        """Number of queries that wait for the answer."""
         return len(self._askers)
 
     def join(self, query: zenoh.Query, key: str) -> bool:
-        """Add someone who waits, or tell the answer that is there; False if it was given up and never carried out."""
+        """Add a waiting query, or reply if the answer is known; False if the command was given up without execution."""
         with self._lock:
             if self._dropped:
                 return False
@@ -75,14 +75,14 @@ class PendingCommand:
         return True
 
     def take(self) -> bool:
-        """The loop is about to carry it out; False if all its askers were told that it won't be."""
+        """Claim the command for execution by the loop; False if all its queries already got a timeout."""
         with self._lock:
             self._taken = bool(self._askers)
             self._dropped = not self._taken
             return self._taken
 
     def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
-        """Tell those who still wait, and whoever asks again; at once, but with an attachment it may take seconds."""
+        """Reply to the waiting queries and to later repeats; immediate, but with an attachment it may take seconds."""
         with self._lock:
             self._answer = answer
             askers, self._askers = self._askers, []
@@ -101,11 +101,11 @@ class PendingCommand:
 
 
 class ZenohCommands:
-    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`CommandRequest` or none.
+    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``; its payload is a :class:`CommandRequest` or empty.
 
-    It replies a :class:`~gripmon.model.records.CommandReply` as JSON, or as an error a
-    :class:`~gripmon.model.records.CommandError`.
-    What was carried out under an id is not carried out again: the last 256 answers are remembered.
+    It replies with a :class:`~gripmon.model.records.CommandReply` as JSON, or with a
+    :class:`~gripmon.model.records.CommandError` as an error.
+    A command is executed only once per id: the last 256 answers are kept.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ZenohCommands:
         self._malformed = Malformed("command", keys["cmd"])
         self._timeout_s = timeout_s
         self._waiting: deque[PendingCommand] = deque()
-        self._lock = threading.Lock()  # guards what is known by its id
+        self._lock = threading.Lock()  # guards the commands by id
         self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
@@ -125,11 +125,11 @@ class ZenohCommands:
 
     @property
     def malformed(self) -> int:
-        """Requests so far whose payload was none."""
+        """Number of requests so far with a malformed payload."""
         return self._malformed.count
 
     def poll(self) -> PendingCommand | None:
-        """The next command to carry out and answer, at once; None if there is none."""
+        """Return the next command to execute and answer, without waiting; None if there is none."""
         while self._waiting:
             pending = self._waiting.popleft()
             if pending.take():
@@ -137,8 +137,8 @@ class ZenohCommands:
         return None
 
     def close(self) -> None:
-        """Tell those who still wait that the monitor stops."""
-        with self._lock:  # what is being taken in just now is answered below, too
+        """Tell the waiting queries that the monitor is stopping."""
+        with self._lock:  # a command being received right now is answered below, too
             self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(_STOPPING)
@@ -149,7 +149,7 @@ class ZenohCommands:
         self._queryable = session.declare_queryable(self._keys["cmd/*"], answer, complete=True)
 
     def _receive(self, query: zenoh.Query) -> None:
-        # Zenoh swallows an exception here and the asker would see an empty result: always answer in words.
+        # Zenoh swallows an exception here and the client would get an empty result: always send an error reply.
         key = str(query.key_expr)
         try:
             error = self._queue(query, key)
@@ -160,7 +160,7 @@ class ZenohCommands:
             self._answers.send(query, _reply(key, error, self._monitor_id))
 
     def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
-        """Let the loop answer; an error if it won't."""
+        """Queue the command for the loop; returns an error if it can't be queued."""
         name = _name(self._keys, key)
         if isinstance(name, CommandError):
             return name
@@ -178,7 +178,7 @@ class ZenohCommands:
             if known is not None and known.command != command:
                 text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
                 return CommandError(CommandFault.ID_REUSED, text)
-            if known is not None and known.askers >= _WAITING_MOST:  # each costs a thread until its time is over
+            if known is not None and known.askers >= _WAITING_MOST:  # each occupies a thread until its timeout
                 return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} wait for this answer already; try again later")
             if known is not None and known.join(query, key):
                 return None
@@ -195,7 +195,7 @@ class ZenohCommands:
         return "" if self._presence is None else self._presence.monitor_id
 
     def _meant_for_another(self, request: CommandRequest) -> CommandError | None:
-        """Of several monitors of one name each command is carried out by the one that it names, or by none."""
+        """An error unless the command names our id, or names none and no other monitor has our name."""
         if request.monitor_id and request.monitor_id != self._monitor_id:
             text = f"this is the monitor {self._monitor_id or 'without id'}, and {request.monitor_id} is meant"
             return CommandError(CommandFault.ANOTHER, text)
@@ -214,7 +214,7 @@ class ZenohCommands:
 
 
 class _Asker:
-    """One query that waits for its answer."""
+    """One query waiting for its answer."""
 
     def __init__(self, query: zenoh.Query, key: str, answers: Answers, monitor_id: str) -> None:
         self._query, self._key, self._answers, self._monitor_id = query, key, answers, monitor_id
@@ -231,15 +231,15 @@ class _Asker:
         reply = _reply(self._key, answer, self._monitor_id, attachment)
         if attachment is None:
             self._answers.send(self._query, reply)
-        else:  # large: whoever made it has a thread for that, and makes no more of them meanwhile
+        else:  # large: its producer has a thread for sending, and makes no other answer meanwhile
             send_now(self._query, reply)
 
 
 def _name(keys: Keys, key: str) -> CommandName | CommandError:
-    """Which command is asked for on a key, or what is wrong with it."""
+    """The command that a key names, or what is wrong with the key."""
     name = key.rpartition("/")[2]
     if "*" in key or key != keys[f"cmd/{name}"]:
-        # What changes a calibration must name it: a pattern may reach more monitors than was thought of.
+        # A command that changes a calibration must name its monitor: a pattern may match more monitors than intended.
         text = f"{key} is a pattern; name the monitor: {keys['cmd/<name>']}"
         return CommandError(CommandFault.SEVERAL, text)
     try:
@@ -250,11 +250,11 @@ def _name(keys: Keys, key: str) -> CommandName | CommandError:
 
 
 def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
-    """What a payload says, or what is wrong with it."""
+    """The decoded payload, or what is wrong with it."""
     try:
         if payload is None or not len(payload):
             return CommandRequest()
-        if len(payload) > (most := largest_bytes(CommandRequest)):  # before a copy of it is made
+        if len(payload) > (most := largest_bytes(CommandRequest)):  # checked before copying it
             raise MessageRefused(f"{len(payload)} bytes; at most {most}")
         return from_json(payload.to_bytes(), CommandRequest)
     except MessageRefused as error:
@@ -265,7 +265,7 @@ def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
 def _reply(
     key: str, answer: CommandReply | CommandError, monitor_id: str, attachment: bytes | None = None
 ) -> Callable[[zenoh.Query], None]:
-    """What sends an answer to a query, with the id of the monitor that gives it."""
+    """A function that sends an answer to a query, with the id of the answering monitor."""
 
     def send(query: zenoh.Query) -> None:
         payload = to_json(msgspec.structs.replace(answer, monitor_id=monitor_id))

@@ -1,4 +1,4 @@
-"""Images on the network, as a camera's driver puts them there: one by one, or a source in real time."""
+"""Publish images on the network as a camera driver does: one by one, or a source in real time."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _LAST_WORD_S = 0.2
 
 
 class Feeder:
-    """Sends frames when they are due; ``sent`` of them so far, ``unsent`` not, ``reason`` why the last one wasn't."""
+    """Sends frames when they are due; counts ``sent`` and ``unsent`` ones; ``reason``: why the last one wasn't sent."""
 
     def __init__(
         self, link: Link, key: str, frame_format: FrameFormat = "raw", *, jpeg_quality: int = 90, recorded_stamps: bool
     ) -> None:
-        """``recorded_stamps``: send the frames' own time stamps instead of the time of sending."""
+        """``recorded_stamps``: send the frames' own time stamps instead of the sending time."""
         self.sent = self.unsent = 0
         self.reason = ""
         self._link, self._recorded_stamps = link, recorded_stamps
@@ -35,17 +35,17 @@ class Feeder:
         link.attach(declare)
 
     def run(self, begin: Callable[[], Source], *, fps: float | None = None, loop: bool = False) -> None:
-        """Send a source's frames at the times of their stamps, or ``fps`` a second, those of a camera at once; with
-        ``loop`` from the beginning again, for ever.  ``begin`` opens it, each time; it is closed here.
+        """Send a source's frames at the pace of their stamps or at ``fps``; a live camera's frames immediately.  With
+        ``loop`` it repeats forever.  ``begin`` opens the source for each pass; it is closed here.
 
-        It waits until there is a monitor or a router: nothing is lost while that starts.
+        Waits first for a monitor or a router, so that no frame is lost while that starts.
         """
         while self._link.fault():
             time.sleep(_LOOK_AGAIN_S)
         for frame, due_s in _paced(begin, fps, loop):
             time.sleep(max(due_s - time.monotonic(), 0.0))
             self._send(frame)
-        time.sleep(_LAST_WORD_S)  # what was put last is still on its way
+        time.sleep(_LAST_WORD_S)  # the last message is still being sent
 
     def _send(self, frame: Frame) -> None:
         assert self._publisher is not None
@@ -61,7 +61,7 @@ class Feeder:
 
 
 def _paced(begin: Callable[[], Source], fps: float | None, loop: bool) -> Iterator[tuple[Frame, float]]:
-    """Frames, and when each is due (monotonic s)."""
+    """Yield frames and their due times (monotonic, s)."""
     start_s, passed_s = time.monotonic(), 0.0
     while True:
         source, first_ns, count, since_s = begin(), None, 0, 0.0
@@ -77,7 +77,7 @@ def _paced(begin: Callable[[], Source], fps: float | None, loop: bool) -> Iterat
             source.close()
         if not loop or source.live or count == 0:
             return
-        # The last frame lasts as long as the others do.
+        # The last frame lasts as long as the others on average.
         passed_s += since_s * count / max(count - 1, 1) if count > 1 else 1.0 / (fps or USUAL_FPS)
 
 
@@ -95,20 +95,20 @@ _RAW = {
 class FramePublisher:
     """Publishes one camera's frames on a key.
 
-    Ordinary priority, below the monitor's transforms, and dropped rather than waited for when a link is congested.
+    Normal priority, below the monitor's transforms; on a congested link frames are dropped instead of blocking.
     """
 
     def __init__(
         self, session: zenoh.Session, key: str, frame_format: FrameFormat = "raw", *, jpeg_quality: int = 90
     ) -> None:
-        """``jpeg_quality``: 1 to 100 %."""
+        """``jpeg_quality``: 1 to 100 (%)."""
         self._publisher = session.declare_publisher(key)
         self._format, self._jpeg_quality = frame_format, jpeg_quality
 
     def put(self, image: Image, *, stamp_ns: int | None = None, jaw_opening_m: float | None = None) -> None:
-        """Publish an image, H x W or H x W x 3 (BGR); ``stamp_ns``: Unix time of its capture.
+        """Publish an image, (H, W) or (H, W, 3) BGR; ``stamp_ns``: capture time, Unix ns.
 
-        Raises ValueError for an array that is no image of the format.
+        Raises ValueError for an array that isn't an image of the publisher's format.
         """
         if self._format == "raw":
             height, width = image.shape[:2]
@@ -132,7 +132,7 @@ class FramePublisher:
 
 
 def raw_encoding(image: Image) -> str:
-    """The name of an array's pixel format; ValueError for one that has none."""
+    """The name of an array's pixel format; ValueError for an array that has none."""
     encoding = _RAW.get((image.ndim, image.dtype.name))
     if encoding is None or (image.ndim == 3 and image.shape[2] != 3):
         raise ValueError(f"no image: shape {image.shape}, {image.dtype}; H x W or H x W x 3, uint8 or uint16")

@@ -1,4 +1,4 @@
-"""What the robot reports on the network: its jaw opening, and the pulses of a laser."""
+"""The robot's reports on the network: its jaw opening, and laser pulses."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_j
 _log = logging.getLogger(__name__)
 
 LARGEST_OPENING_M = 0.5
-"""No gripper file allows more."""
+"""Largest opening that a gripper file allows, m."""
 
 BEYOND_TRAVEL_M = 1e-3
-"""So far beyond its travel a gripper may report to be; the monitor refuses frames with more."""
+"""How far a reported opening may lie beyond the gripper's travel, m; the monitor rejects frames with more."""
 
 MOST_REPORTS = 2048
-"""Reports kept for images that are older than the newest one: two seconds at 1 kHz."""
+"""Number of reports kept, for images older than the newest report: two seconds at 1 kHz."""
 
 
 class Reported(NamedTuple):
-    """An opening, and when the robot measured it (Unix ns); 0 if that isn't known."""
+    """An opening, and when the robot measured it (Unix ns; 0 if unknown)."""
 
     stamp_ns: int
     opening_m: float
 
 
 DecodeOpening = Callable[[bytes], Reported | None]
-"""An opening from a payload; None if the message is about something else.  Raises :class:`JawError`."""
+"""Decodes an opening from a payload; None if the message is about something else.  Raises :class:`JawError`."""
 
 
 class JawError(ValueError):
-    """A payload that tells no jaw opening; the text says why, in one line."""
+    """A payload that contains no jaw opening; the text says why, in one line."""
 
 
 class StampedOpenings:
-    """Reports with stamps, by their stamps: what the opening was at a time between them."""
+    """Reports in order of their stamps, for interpolating the opening at a given time."""
 
     def __init__(self) -> None:
         self._reports: list[tuple[Reported, float]] = []
@@ -57,8 +57,8 @@ class StampedOpenings:
         return len(self._reports)
 
     def add(self, report: Reported, arrival_s: float, max_age_s: float) -> None:
-        """Keep a report; forget those that arrived too long before it (monotonic, s), and all from before the robot's
-        clock was set back.
+        """Keep a report; drop those that arrived more than ``max_age_s`` before it (``arrival_s``: monotonic), and all
+        reports if the robot's clock was set back by more than that.
         """
         reports = self._reports
         if reports and 1e-9 * (reports[-1][0].stamp_ns - report.stamp_ns) > max_age_s:
@@ -71,12 +71,12 @@ class StampedOpenings:
         self._reports.clear()
 
     def apart_s(self, stamp_ns: int) -> float:
-        """How much later the newest report's stamp is, s."""
+        """Stamp of the newest report minus ``stamp_ns``, s."""
         return 1e-9 * (self._reports[-1][0].stamp_ns - stamp_ns)
 
     def at(self, stamp_ns: int) -> float:
-        """Linear between the reports before and after (m); beyond the first and the last one nothing is made up: as
-        they say.
+        """The opening (m), interpolated linearly between the reports before and after; outside all reports, the opening
+        of the nearest one (no extrapolation).
         """
         after = bisect.bisect_left(self._reports, stamp_ns, key=lambda kept: kept[0].stamp_ns)
         if after in (0, len(self._reports)):
@@ -86,7 +86,7 @@ class StampedOpenings:
 
 
 class _Input:
-    """Messages on a key: Zenoh's thread stores what arrives; any thread may ask.  What is malformed is counted."""
+    """Messages on a key: Zenoh's thread stores them, any thread may read.  Malformed messages are counted."""
 
     def __init__(self, link: Link, key: str, what: str) -> None:
         self._malformed = Malformed(what, key)
@@ -96,7 +96,7 @@ class _Input:
 
     @property
     def malformed(self) -> int:
-        """Messages so far that were none."""
+        """Number of malformed messages so far."""
         return self._malformed.count
 
     def _attach(self, session: zenoh.Session) -> None:
@@ -115,17 +115,17 @@ class _Input:
             _log.debug("message on %s", self._key, exc_info=error)
 
     def _take(self, payload: zenoh.ZBytes) -> bool:
-        """Store a message, False if it is about something else.  ValueError for one that is malformed."""
+        """Store a message; False if it is about something else.  ValueError if it is malformed."""
         raise NotImplementedError
 
 
 class ZenohJaw(_Input):
-    """The jaw opening that the robot sent: at an image's stamp where the reports have stamps of the same clock, else
-    the newest.
+    """The jaw opening that the robot sends: interpolated at an image's stamp if the reports have stamps of the same
+    clock, else the newest.
 
     Age counts from arrival, so that the robot's clock need not agree with ours.  Zenoh's thread stores what arrives;
-    any thread may ask.  What is malformed, or no opening that this gripper can have, is counted and said; the one
-    before it stays in force until it is too old.
+    any thread may read.  A malformed message, or an opening that this gripper can't have, is counted and reported; the
+    previous opening stays in use until it is too old.
     """
 
     def __init__(
@@ -136,24 +136,24 @@ class ZenohJaw(_Input):
         *,
         travel_m: tuple[float, float] = (0.0, LARGEST_OPENING_M),
     ) -> None:
-        """Reads ``key``, by default :func:`opening_of_json`; ``travel_m``: smallest and largest opening of the gripper.
+        """``decode`` reads payloads, by default :func:`opening_of_json`; ``travel_m``: smallest and largest opening.
 
         A reading older than the link's ``jaw_max_age_s`` is not used.
         """
         self._decode = decode or opening_of_json
         self._travel_m = travel_m
         self._max_age_s = link.settings.jaw_max_age_s
-        self._lock = threading.Lock()  # guards what follows against Zenoh's thread
+        self._lock = threading.Lock()  # guards the attributes below against Zenoh's thread
         self._newest_m: float | None = None
         self._arrival_s = 0.0
         self._stamped = StampedOpenings()
-        self._apart_s: float | None = None  # reports' stamps from the images', where they are of different clocks
+        self._apart_s: float | None = None  # reports' stamps minus the images', if their clocks differ
         super().__init__(link, key, "jaw message")
 
     def opening_m(self, stamp_ns: int | None = None) -> float | None:
-        """The opening at an image's stamp, or the newest (m); None if none came, or none for ``jaw_max_age_s``.
+        """The opening at an image's stamp, or the newest (m); None if none arrived within ``jaw_max_age_s``.
 
-        Stamps farther apart than that are of different clocks: then it is the newest, and :meth:`fault` says so.
+        Stamps farther apart than that come from different clocks: it then returns the newest; :meth:`fault` says so.
         """
         with self._lock:
             if self._newest_m is None or self._is_old():
@@ -196,18 +196,18 @@ class ZenohJaw(_Input):
             if reported.stamp_ns > 0:
                 self._stamped.add(reported, arrival_s, self._max_age_s)
             else:
-                self._stamped.clear()  # of one robot all reports have stamps, or none
+                self._stamped.clear()  # a robot stamps either all its reports or none
         return True
 
     def _check(self, opening_m: float) -> None:
         low_m, high_m = self._travel_m
-        # Written so that NaN fails, too.
+        # Written so that NaN fails as well.
         if not low_m - BEYOND_TRAVEL_M <= opening_m <= high_m + BEYOND_TRAVEL_M:
             raise JawError(f"opening {opening_m:g} m; {low_m:g} to {high_m:g} m as the gripper file says")
 
 
 LARGEST_BYTES = 1 << 18
-"""A JointState of some thousand joints."""
+"""Largest payload accepted: a JointState of some thousand joints."""
 
 
 def _bounded(payload: zenoh.ZBytes) -> bytes:
@@ -217,7 +217,7 @@ def _bounded(payload: zenoh.ZBytes) -> bytes:
 
 
 def opening_of_json(payload: bytes) -> Reported:
-    """A report from ``{"stamp_ns": …, "opening_m": …}``, or from a number alone (m).  Raises :class:`JawError`."""
+    """Decode ``{"stamp_ns": …, "opening_m": …}``, or a bare number (m).  Raises :class:`JawError`."""
     try:
         if payload[:64].lstrip()[:1] == b"{":
             reading = from_json(payload, JawReading)
@@ -232,7 +232,7 @@ def opening_of_json(payload: bytes) -> Reported:
 
 
 def opening_of_joints(joints: JointOpening) -> DecodeOpening:
-    """A decoder of ``sensor_msgs/JointState`` (CDR); messages about other joints only are passed over."""
+    """Return a decoder of ``sensor_msgs/JointState`` (CDR); it ignores messages that are only about other joints."""
 
     def decode(payload: bytes) -> Reported | None:
         try:
@@ -252,10 +252,10 @@ _WAITING_MOST = 64
 
 
 class ZenohPulses(_Input):
-    """Pulses in the order in which they came.
+    """Laser pulses in order of arrival.
 
-    Zenoh's thread stores what arrives; any thread may ask.  What is malformed, or no pulse that can be, is counted and
-    said.  Pulses that are not asked for, more than 64 of them, give way to newer ones.
+    Zenoh's thread stores what arrives; any thread may read.  A malformed or impossible pulse is counted and reported.
+    If more than 64 pulses wait to be read, the oldest are dropped.
     """
 
     def __init__(self, link: Link, key: str) -> None:
@@ -263,11 +263,11 @@ class ZenohPulses(_Input):
         super().__init__(link, key, "pulse message")
 
     def poll(self) -> ReportedPulse | None:
-        """The next pulse, at once; None if there is none."""
+        """Return the next pulse without waiting; None if there is none."""
         return self._waiting.popleft() if self._waiting else None
 
     def fault(self) -> str:
-        """What is wrong with what came, in a few words for a person; empty if nothing is."""
+        """What is wrong with the pulses received, in a few words for a person; empty if nothing is."""
         return self._malformed.fault()
 
     def _take(self, payload: zenoh.ZBytes) -> bool:

@@ -1,4 +1,4 @@
-"""Which start of a monitor this is, who else speaks under its name, and the threads that answer queries."""
+"""The id of this monitor process, detection of others with the same name, and the threads that answer queries."""
 
 from __future__ import annotations
 
@@ -19,47 +19,48 @@ from gripmon.io.wire import Keys, Link, in_zenohs_thread
 _log = logging.getLogger(__name__)
 
 VANISHES_WITHIN_S = 20.0
-"""A monitor that hangs, or lost its power or its line, stays visible for Zenoh's lease, 10 s by default, and until that
-is looked at: 14.5 s after a SIGSTOP were measured.
+"""Longest time for which a monitor that hangs, or lost power or network, stays visible, s: Zenoh's lease, 10 s by
+default, plus the time until Zenoh checks it; 14.5 s were measured after a SIGSTOP.
 """
 
-_CONNECTED_WITHIN_S = 2.0  # a router that isn't there yet is no reason to wait longer
+_CONNECTED_WITHIN_S = 2.0  # don't wait longer for a router that isn't there yet
 _LOOK_EVERY_S = 0.5
-_LOOKS_FOR_AN_ID = 4  # on a busy machine one isn't enough
+_LOOKS_FOR_AN_ID = 4  # on a busy machine one query isn't enough
 _NOT_IN_A_KEY = re.compile(r"[^A-Za-z0-9.]+")
 _LONGEST_HOST = 32
 
 
 def new_monitor_id() -> str:
-    """The id of a start: the machine and the process for a person who looks for it, and what makes it unique."""
+    """Return a new process id for the network: host and pid, for a person who looks for it, and a random suffix."""
     host = _NOT_IN_A_KEY.sub("_", socket.gethostname())[:_LONGEST_HOST] or "host"
     return f"{host}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 class Presence:
-    """One start of a monitor on a link: its id, and the ids of others of the same robot and camera.
+    """One monitor process on a link: its id, and the ids of other monitors of the same robot and camera.
 
-    Each shows a liveliness token ``…/alive/<id>``, which its publisher declares.
+    Each monitor has a liveliness token ``…/alive/<id>``, which its publisher declares.
     """
 
     def __init__(self, link: Link, keys: Keys) -> None:
         self.monitor_id = new_monitor_id()
         self._link, self._keys = link, keys
         self._others: frozenset[str] = frozenset()
-        self._lock = threading.Lock()  # guards it against Zenoh's other threads
+        self._lock = threading.Lock()  # guards the set against Zenoh's other threads
         self._session: zenoh.Session | None = None
-        self._declared: object = None  # Zenoh undeclares what has no reference left
+        self._declared: object = None  # kept, because Zenoh undeclares an object that is no longer referenced
         link.attach(self._attach, self._leave)
 
     def others(self) -> tuple[str, ...]:
-        """The ids of other monitors of this name that are there now, in order; asked once a frame."""
+        """The sorted ids of other monitors of this name that are present now; called once per frame."""
         return tuple(sorted(self._others)) if self._others else ()
 
     def wait_alone(self, timeout_s: float = VANISHES_WITHIN_S) -> tuple[str, ...]:
-        """Before the own token is shown: who has the name and keeps it for ``timeout_s``; mostly no one, at once.
+        """Before declaring our own token, wait until no other monitor has this name; return the ids that are still
+        there after ``timeout_s``.  Usually there are none, and it returns immediately.
 
-        A predecessor that was killed vanishes meanwhile.  An empty id is that of a version of gripmon without ids.
-        Without a connection no one is found: :meth:`others` shows them later.
+        A killed predecessor vanishes within that time.  An empty id stands for a gripmon version without ids.
+        Without a connection it returns no ids; :meth:`others` reports them later.
         """
         if not self._connected():
             return ()
@@ -74,7 +75,7 @@ class Presence:
         return ()
 
     def _connected(self) -> bool:
-        """Is there a session that is connected as it should be, or soon?"""
+        """Wait up to ``_CONNECTED_WITHIN_S`` for the configured connections; False only if there is no session then."""
         end_s = time.monotonic() + _CONNECTED_WITHIN_S
         while self._session is None or self._link.unconnected():
             if time.monotonic() >= end_s:
@@ -83,7 +84,7 @@ class Presence:
         return True
 
     def _look(self) -> tuple[str, ...]:
-        """Who is there by their tokens, asked for just now."""
+        """The ids of the monitors present, from a new query for their tokens."""
         session = self._session
         if session is None:
             return ()
@@ -91,10 +92,10 @@ class Presence:
         for _ in range(_LOOKS_FOR_AN_ID):
             if found != {""}:
                 break
-            # Zenoh answers at first without the tokens that our subscriber of ids waits for
+            # Zenoh's first answer lacks the tokens that our subscriber of ids is still waiting for
             time.sleep(_LOOK_EVERY_S)
             found = self._ids(session)
-        # a monitor with an id shows the token without one, too: "" counts only alone
+        # a monitor with an id also has the token without one, so "" counts only if it is the only one
         return tuple(sorted(found - {""} or found))
 
     def _ids(self, session: zenoh.Session) -> set[str]:
@@ -119,33 +120,33 @@ class Presence:
 
 
 def in_words(others: tuple[str, ...]) -> str:
-    """That they are there, for a person."""
+    """A message for a person that these monitors are present."""
     names = ", ".join(other or "one of an earlier version of gripmon" for other in others)
     return f"another monitor of this robot and camera is on the network: {names}"
 
 
 def _id_in(key: object) -> str:
-    """The id in a token's key; empty for the token without one."""
+    """The id in a token's key; empty for a token without id."""
     return str(key).partition("/alive")[2].lstrip("/")
 
 
 _AT_ONCE = 2
 _WAITING_MOST = 64
 _REFUSED_MOST = 4096
-"""Queries beyond the waiting ones that get the answer that too many wait: seconds of a flood, at some bytes each."""
+"""Queries beyond the waiting ones that still get a "too many" reply: seconds of a flood, at some bytes each."""
 CLOSE_WITHIN_S = 1.0
 
 
 class Answers:
     """A few threads that send replies.
 
-    How long a reply waits for a congested link is the asker's choice in Zenoh.  By default it waits until the link is
-    given up: an asker that was stopped costs 5 to 10 s, which neither the loop nor Zenoh's own threads have.
+    In Zenoh the client chooses how long a reply waits on a congested link.  By default it waits until the link is
+    given up: a client that was suspended costs 5 to 10 s, too long for the loop and for Zenoh's own threads.
     """
 
     def __init__(self, name: str, busy: Callable[[zenoh.Query], None] | None = None) -> None:
-        """``busy`` tells an asker that too many wait; without it such a query ends unanswered."""
-        # Its threads end with the process, also if it is never closed, but none in the middle of a call into Zenoh.
+        """``busy`` replies that too many queries wait; without it an excess query ends unanswered."""
+        # The threads end with the process even without close(), but never in the middle of a call into Zenoh.
         self._pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix=f"gripmon-{name}")
         self._busy = busy
         self._refusals = ThreadPoolExecutor(1, thread_name_prefix=f"gripmon-{name}-busy")
@@ -155,7 +156,7 @@ class Answers:
         self._closed = False
 
     def send(self, query: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
-        """Let ``reply`` answer the query, soon; where too many wait, it answers that instead.  Once closed: at once."""
+        """Schedule ``reply`` for the query; if too many wait, ``busy`` replies instead.  Once closed, run it here."""
         future: Future[None] | None = None
         with self._lock:
             closed = self._closed
@@ -173,7 +174,7 @@ class Answers:
             query.drop()
 
     def close(self) -> None:
-        """Give what is under way a second."""
+        """Wait up to a second for replies being sent."""
         with self._lock:
             self._closed, under_way = True, set(self._under_way)
         wait(under_way, CLOSE_WITHIN_S)
@@ -187,7 +188,7 @@ class Answers:
 
 
 def send_now(query: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
-    """Let ``reply`` answer the query in this thread, however long it takes."""
+    """Run ``reply`` for the query in this thread, however long it takes."""
     try:
         reply(query)
     except Exception as error:  # noqa: BLE001  mostly the asker, or the session, is gone
