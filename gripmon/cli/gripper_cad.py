@@ -27,6 +27,8 @@ FILE...                 .stl, .obj, .ply, .cao: one a finger, or both in one; or
 --jaw-range MIN:MAX     of meshes: the jaws move in this range (m)
 --jaw-opening M         what the robot reports for the fingers as they are drawn (default: the tips' distance, m)
 --joint NAME            of a URDF: the joint that opens the jaws, where several could
+--bevel M               width of the bevels on real edges that are sharp in the CAD (default: 0.0002 m); 0: the edges
+                        are known to be sharp to 0.02 mm
 --camera FILE.yaml      the view's camera: a file of gripmon calibrate intrinsics, or a configuration
 --reference FILE.yaml   where the gripper stands before it: a file of gripmon calibrate plane, or a configuration
 | --view D:TILT         the same roughly: the TCP at distance D (m) in the image's middle, the camera at -y and tilted
@@ -55,9 +57,17 @@ def _view(text: str) -> tuple[float, float]:
     return values
 
 
+def _bevel(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' isn't the width of a bevel; metres, e.g. 0.0002") from None
+
+
 @Command(
     "from-cad", "from STL, OBJ, PLY, URDF or .cao", _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
     jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view, frame={"default": "tcp"},
+    bevel=_bevel,
 )  # fmt: skip
 def from_cad(arguments: Arguments) -> None:
     """A gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one that holds
@@ -69,11 +79,16 @@ def from_cad(arguments: Arguments) -> None:
     How the jaws move comes from the URDF's joint; of meshes, both fingers move by half of an opening in
     --jaw-range.
 
+    Real edges are broken, by 0.1 to 0.3 mm where a drawing says no more (ISO 13715); CAD draws them sharp.
+    --bevel says by how much.  It makes the bounds of a gripper that isn't taught so wide that hardly any
+    transform is valid at an alert limit of 1 mm: gripmon teach measures the edges as they are.
+
     Convex fingers with flat faces hold for every view.  Of round, hollow or open ones the edges and
     outlines are those that one view shows: --camera with --reference, or with a rough --view.  Make such a
     file again when the camera moves by more than some degrees.
     """
     from gripmon.daemon.teaching.views import read_view
+    from gripmon.model.gripper import UNTOLD_BEVEL_M
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.cad import gripper_from_cad
 
@@ -89,6 +104,7 @@ def from_cad(arguments: Arguments) -> None:
         arguments.file, unit=arguments.unit, name=name, camera=camera, cam_T_grip=cam_T_grip,
         jaw_range_m=arguments.jaw_range, jaw_opening_m=arguments.jaw_opening, joint=arguments.joint,
         frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
+        bevel_m=UNTOLD_BEVEL_M if arguments.bevel is None else arguments.bevel,
         provenance=provenance_of(arguments.command_line(), arguments.file), progress=progress_bar,
     )  # fmt: skip
     arguments.save("out", made.text().encode())

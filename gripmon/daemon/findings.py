@@ -31,8 +31,8 @@ from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Joining, Keys
 from gripmon.laser.report import expectation
+from gripmon.model.gripper import UNTOLD_BEVEL_M
 from gripmon.model.units import in_degrees, in_mm
-from gripmon.teach.accuracy import UNTOLD_BEVEL_M
 
 Level = Literal["OK", "WARN", "FAIL"]
 

@@ -36,12 +36,12 @@ from gripmon.daemon.forecast_values import (
 from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
+from gripmon.model.gripper import UNTOLD_BEVEL_M
 from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.records import Protection
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import (
     EDGE_POINT_SIGMA_PX,
-    UNTOLD_BEVEL_M,
     AccuracyForecast,
     Promise,
     UnknownOpening,

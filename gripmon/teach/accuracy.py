@@ -39,10 +39,6 @@ the usual frame in front of clutter; one frame in twenty has up to four times as
 """
 
 
-UNTOLD_BEVEL_M = 2e-4
-"""Width of a bevel on machined edges where the drawing only asks for broken edges."""
-
-
 @dataclass(frozen=True, slots=True)
 class UnknownOpening:
     """The effect of an unknown jaw opening, the seventh unknown of the fit.

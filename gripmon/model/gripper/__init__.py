@@ -11,6 +11,8 @@ from gripmon.model.gripper.core import LARGEST_EXTENT_M, EdgeView, Gripper, on_a
 from gripmon.model.gripper.faces import FaceLoop
 from gripmon.model.gripper.file import gripper_from_dict, load_gripper
 from gripmon.model.gripper.model import (
+    UNTOLD_BEVEL_M,
+    WIDEST_BEVEL_M,
     AxisMotion,
     EdgeModel,
     FaceModel,
@@ -26,6 +28,8 @@ from gripmon.model.gripper.model import (
 
 __all__ = [
     "LARGEST_EXTENT_M",
+    "UNTOLD_BEVEL_M",
+    "WIDEST_BEVEL_M",
     "AxisMotion",
     "EdgeModel",
     "EdgeView",

@@ -59,6 +59,14 @@ class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     round: RoundModel | msgspec.UnsetType = msgspec.UNSET  # not None: keeps the digests of files without it
 
 
+UNTOLD_BEVEL_M = 2e-4
+"""Width of a bevel that no one has stated: where a drawing leaves the shape of its edges open (ISO 13715) or asks for
+them broken by 0.1 to 0.3 mm, as is usual for machined parts.
+"""
+
+WIDEST_BEVEL_M = 0.02
+
+
 class EdgeModel(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}
 ):
@@ -66,7 +74,7 @@ class EdgeModel(
     end: str
     kind: Literal["contour", "crease"] = "contour"
     brighter: Literal["left", "right", "any"] = "any"
-    bevel_m: Annotated[float, Meta(ge=0.0, le=0.02, description="width of a bevel or rounding (m)")] = 0.0
+    bevel_m: Annotated[float, Meta(ge=0.0, le=WIDEST_BEVEL_M, description="width of a bevel or rounding (m)")] = 0.0
     via: Annotated[
         tuple[Vector, ...], Meta(max_length=62, description="a curved edge: points on it in turn, without its ends (m)")
     ] = ()

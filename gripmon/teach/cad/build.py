@@ -12,7 +12,7 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import make_transform
-from gripmon.model.gripper import Gripper, GripperError, GripperModel
+from gripmon.model.gripper import UNTOLD_BEVEL_M, WIDEST_BEVEL_M, Gripper, GripperError, GripperModel
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
@@ -99,6 +99,7 @@ def gripper_from_cad(
     frame: str = "tcp",
     approach: str | None = None,
     length_m: float | None = None,
+    bevel_m: float = UNTOLD_BEVEL_M,
     provenance: Provenance | None = None,
     progress: Progress = quiet,
 ) -> CadGripper:
@@ -109,12 +110,13 @@ def gripper_from_cad(
     "+z", or for a URDF the axis along which its fingers reach); "cad" keeps the file's axes.  ``jaw_range_m``: meshes
     of two fingers move by half of the opening each; a URDF has its own motion (``joint``: its name, if several are
     possible).  ``jaw_opening_m`` is what a robot reports for the fingers as drawn; the distance of the tips if None.
-    ``length_m``: the length of the fingers to use, from the tips.
+    ``length_m``: the length of the fingers to use, from the tips.  ``bevel_m``: width of the bevels on real edges that
+    are sharp in the CAD; 0 only for edges sharper than 0.02 mm, since what isn't stated is in no bound.
 
     Convex fingers with flat faces are valid for every view.  Others need ``camera`` and ``cam_T_grip`` (4, 4), and are
     made for that view.  :class:`~gripmon.model.errors.InputError` says what can't be used, and what can.
     """
-    _check(frame, approach, unit, length_m)
+    _check(frame, approach, unit, length_m, bevel_m)
     parts = _read(files, unit, joint, progress)
     grip_T_cad, notes = _frame(parts, frame, approach, joint is not None or bool(parts.paths_m))
     fingers = {name: _moved(surface, grip_T_cad) for name, surface in parts.fingers.items()}
@@ -128,12 +130,14 @@ def gripper_from_cad(
         raise InputError(why, "camera" if camera is None else "reference")
     notes += [f"{each}: its edges are those of this view; make it again for another" for each in seen]
     jaw = jaw_of(fingers, paths, jaw_range_m, jaw_opening_m)
-    model = model_of(name or Path(files[0]).stem, shapes, jaw, provenance)
+    model = model_of(name or Path(files[0]).stem, shapes, bevel_m, jaw, provenance)
     try:
         gripper = Gripper(model)
     except GripperError as error:
         raise InputError(f"{files[0]}: {_what_shows(shapes)} ({error}); another view, or --length") from None
-    return CadGripper(model, gripper, shapes, grip_T_cad, camera, cam_T_grip, (*notes, *gripper.notes))
+    return CadGripper(
+        model, gripper, shapes, grip_T_cad, camera, cam_T_grip, (*notes, _on_bevels(bevel_m), *gripper.notes)
+    )
 
 
 def _shapes(
@@ -166,7 +170,7 @@ def _shapes(
     return shapes, seen
 
 
-def _check(frame: str, approach: str | None, unit: str | None, length_m: float | None) -> None:
+def _check(frame: str, approach: str | None, unit: str | None, length_m: float | None, bevel_m: float) -> None:
     if frame not in ("tcp", "cad"):
         raise InputError(f"'{frame}' is not a frame; tcp or cad", "frame")
     if approach is not None and approach not in AXES:
@@ -177,6 +181,8 @@ def _check(frame: str, approach: str | None, unit: str | None, length_m: float |
         )
     if unit is not None and unit not in UNITS_M:
         raise InputError(f"'{unit}' is not an unit; one of {', '.join(UNITS_M)}", "unit")
+    if not 0.0 <= bevel_m <= WIDEST_BEVEL_M:
+        raise InputError(f"{bevel_m:g} m: is no width of a bevel; 0 to {WIDEST_BEVEL_M:g} m", "bevel")
 
 
 def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | None, progress: Progress) -> Parts:
@@ -322,6 +328,15 @@ def _axis(direction: Array) -> str:
         if np.allclose(direction, axis, atol=1e-9):
             return name
     return "(" + ", ".join(f"{v:.4f}" for v in direction) + ")"
+
+
+def _on_bevels(bevel_m: float) -> str:
+    if not bevel_m:
+        return "sharp edges are taken as exact: were they broken by 0.1 mm, a valid transform could be beyond its bound"
+    return (
+        f"sharp edges may be broken by {1e3 * bevel_m:g} mm (bevel_m), which makes bounds wide, mostly too wide for a "
+        "valid transform, until gripmon teach has measured how the edges really show"
+    )
 
 
 def _what_shows(shapes: dict[str, Shape]) -> str:

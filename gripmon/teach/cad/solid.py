@@ -24,7 +24,8 @@ REAR_M = 5e-4
 class Shape:
     """One finger in the gripper frame: ``points_m`` (p, 3), which of them are ``corners``, ``edges`` as pairs of points
     with ``crease`` or not, ``loops`` of faces.  ``round_m``: by point, centre and axis of the rounding it lies on.
-    ``spread_m``: by edge, the standard deviation of the observed edge from it; empty for none.
+    ``spread_m``: by edge, the standard deviation of a round part's observed outline from it, 0 for a sharp edge; empty
+    where all are sharp.
     ``via_m``: by edge, the points (n, 3) that a curved one passes between its ends; empty where none is curved.
     """
 

@@ -19,8 +19,12 @@ from gripmon.teach.cad.solid import Shape
 _DIGITS = 7  # of a metre: a tenth of a micrometre
 
 
-def model_of(name: str, shapes: Mapping[str, Shape], jaw: Jaw | None, provenance: Provenance | None) -> GripperModel:
-    """The gripper file's model.  Points are named FINGER_p1 and so on, from the tip backwards, edges FINGER_e1."""
+def model_of(
+    name: str, shapes: Mapping[str, Shape], bevel_m: float, jaw: Jaw | None, provenance: Provenance | None
+) -> GripperModel:
+    """The gripper file's model.  Points are named FINGER_p1 and so on, from the tip backwards, edges FINGER_e1.
+    ``bevel_m``: width of the bevels on edges that are sharp in the CAD.
+    """
     points: dict[str, PointModel] = {}
     edges: dict[str, EdgeModel] = {}
     faces = []
@@ -35,9 +39,10 @@ def model_of(name: str, shapes: Mapping[str, Shape], jaw: Jaw | None, provenance
         for k, ((a, b), crease) in enumerate(zip(shape.edges, shape.crease, strict=True), start=1):
             kind: Literal["contour", "crease"] = "crease" if crease else "contour"
             # The model has a bevel's edge anywhere in its width: 1/sqrt(12) of that is its standard deviation.
-            bevel_m = round(math.sqrt(12.0) * shape.spread_m[k - 1], 6) if shape.spread_m else 0.0
+            spread_m = shape.spread_m[k - 1] if shape.spread_m else 0.0
+            width_m = round(math.sqrt(12.0) * spread_m, 6) if spread_m else bevel_m
             via = tuple(map(_rounded, shape.via_m[k - 1])) if shape.via_m else ()
-            edges[f"{finger}_e{k}"] = EdgeModel(start=names[a], end=names[b], kind=kind, bevel_m=bevel_m, via=via)
+            edges[f"{finger}_e{k}"] = EdgeModel(start=names[a], end=names[b], kind=kind, bevel_m=width_m, via=via)
         faces += [FaceModel(finger=finger, points=tuple(names[p] for p in loop)) for loop in shape.loops]
     fingers = {finger: FingerModel(motion=None if jaw is None else jaw.motion[finger]) for finger in shapes}
     return GripperModel(
@@ -89,7 +94,7 @@ def _lines(model: GripperModel, notes: Sequence[str]) -> Iterator[str]:
     for name, point in model.points.items():
         yield f"  {_flow(name)}: {_flow(_without_defaults(point))}"
     yield "edges:  # between two points, straight, or curved through the points `via`; `kind`: where faces don't say,"
-    yield "  # `bevel_m`: the edge is seen anywhere in this width (m, default 0)"
+    yield "  # `bevel_m`: width of a bevel or rounding, in which an untaught edge shows anywhere (m, default 0)"
     for name, edge in model.edges.items():
         yield f"  {_flow(name)}: {_flow(_without_defaults(edge))}"
     if model.faces:
