@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from support.meters import difference, measure, meter
@@ -12,12 +14,24 @@ from support.watched import pose_of, reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, Verdict
+from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.teach.cad import gripper_from_cad
-from tools.benchmarks.meshes import MeshCamera, box_fingers, curved_fingers, rounded_fingers, wandering, write_meshes
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtEdges
+from tools.benchmarks.meshes import (
+    MeshCamera,
+    bevelled_fingers,
+    box_fingers,
+    curved_fingers,
+    rounded_fingers,
+    wandering,
+    write_meshes,
+)
 
-FRAMES = 45
+FRAMES, FEW = 45, 24
 ROUNDED_M = (0.002, 0.004, 0.008)
 
 SHAPES = {
@@ -30,12 +44,15 @@ SHAPES = {
 """Meshes by name, and what 95 % of the frames' errors keep across and along the optical axis, m."""
 
 
-def tracked(meshes: list, folder: Path) -> tuple[Gripper, MeshCamera]:
-    """The gripper made from meshes, and a camera that takes pictures of them."""
-    camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip()
-    view = {"camera": camera, "cam_T_grip": pose, "length_m": 0.035}
+def from_meshes(meshes: list, folder: Path, **settings: float) -> Gripper:
+    view = {"camera": make_camera(PAPER_LENS), "cam_T_grip": nominal_cam_T_grip(), "length_m": 0.035}
     paths = write_meshes(meshes, folder)
-    return gripper_from_cad(paths, unit="mm", jaw_range_m=(0.0, 0.06), **view).gripper, MeshCamera(camera, meshes)
+    return gripper_from_cad(paths, unit="mm", jaw_range_m=(0.0, 0.06), **view, **settings).gripper
+
+
+def tracked(meshes: list, folder: Path) -> tuple[Gripper, MeshCamera]:
+    """The gripper made from meshes, and a camera that takes pictures of them: its edges are as sharp as drawn."""
+    return from_meshes(meshes, folder, bevel_m=0.0), MeshCamera(make_camera(PAPER_LENS), meshes)
 
 
 def watch_of(gripper: Gripper) -> Monitor:
@@ -152,3 +169,74 @@ def test_a_knock_of_curved_fingers_is_reported(tmp_path: Path):
         alerts += [alert.kind for alert in record.alerts]
         assert k < 35 or record.verdict is Verdict.VALID
     assert alerts and alerts[0] in (AlertKind.STEP, AlertKind.DRIFT)
+
+
+# --- what the CAD doesn't draw ---
+
+
+@dataclass(frozen=True)
+class Promised:
+    """A sequence's frames with a transform: which are valid, how far off (m), and the bound of each (m)."""
+
+    valid: np.ndarray
+    error_m: np.ndarray
+    bound_m: np.ndarray
+
+
+def good_to(sigma_m: float) -> ReferenceRecord:
+    covariance = np.diag(np.square([sigma_m] * 3 + [10.0 * sigma_m] * 3))
+    return msgspec.structs.replace(reference_of(nominal_cam_T_grip()), covariance=tuple(covariance.ravel().tolist()))
+
+
+def promised(
+    gripper: Gripper, pictures: MeshCamera, reference: ReferenceRecord, taught: TaughtEdges | None
+) -> Promised:
+    """The camera wanders by 0.2 mm and 1 mrad, each frame before another background."""
+    monitor, rows = Monitor(make_camera(PAPER_LENS), gripper, MonitorSettings(), reference, taught), []
+    for k in range(FEW):
+        truth = wandering(nominal_cam_T_grip(), k / FEW, 2e-4, 1e-3)
+        stamp_ns, opening_m = int(k / 30 * 1e9), gripper.jaw_nominal_m
+        record = monitor.process(
+            Frame(seq=k, stamp_ns=stamp_ns, image=pictures.picture(truth), jaw_opening_m=opening_m)
+        )
+        if record.cam_T_grip is not None and record.protection is not None:
+            off_m = np.linalg.norm(difference(pose_of(record.cam_T_grip), truth)[:3])
+            rows.append((record.verdict is Verdict.VALID, off_m, record.protection.position_m))
+    assert len(rows) >= FEW - 1
+    valid, error_m, bound_m = np.array(rows).T
+    return Promised(valid > 0.0, error_m, bound_m)
+
+
+@pytest.mark.parametrize("real_m", [1e-4, 2e-4, 3e-4])
+def test_an_untaught_gripper_from_cad_allows_for_real_bevels(real_m: float, tmp_path: Path):
+    """They look like half a millimetre of distance and more.  No frame is valid by it, valid or not none is beyond."""
+    gripper = from_meshes(box_fingers(), tmp_path)
+    seen = promised(gripper, MeshCamera(make_camera(PAPER_LENS), bevelled_fingers(real_m)), good_to(1e-3), None)
+    assert (seen.error_m < seen.bound_m).all() and seen.error_m.max() > 2.5 * real_m
+    assert not seen.valid.any(), "or its price is lower than the command and the documentation say"
+
+
+def test_taken_as_exact_its_valid_frames_are_beyond_their_bound(tmp_path: Path):
+    """What --bevel 0 is not for."""
+    gripper = from_meshes(box_fingers(), tmp_path, bevel_m=0.0)
+    seen = promised(gripper, MeshCamera(make_camera(PAPER_LENS), bevelled_fingers(2e-4)), good_to(1e-3), None)
+    assert np.count_nonzero(seen.valid & (seen.error_m > seen.bound_m)) > 0.5 * FEW
+
+
+def test_edges_as_sharp_as_the_option_says_are_within_the_bound_without_teaching(tmp_path: Path):
+    gripper = from_meshes(box_fingers(), tmp_path, bevel_m=0.0)
+    seen = promised(gripper, MeshCamera(make_camera(PAPER_LENS), bevelled_fingers(2e-5)), good_to(1e-3), None)
+    assert (seen.error_m < seen.bound_m).all() and np.mean(seen.valid[1:]) > 0.9
+
+
+def test_teaching_takes_the_price_of_bevels_off(tmp_path: Path):
+    """Four images at the reference, each before another background and at another opening."""
+    gripper, camera, pose = from_meshes(box_fingers(), tmp_path), make_camera(PAPER_LENS), nominal_cam_T_grip()
+    pictures, reference, images = MeshCamera(camera, bevelled_fingers(2e-4)), good_to(2e-4), []
+    for opened_m in (-4e-3, -1e-3, 1e-3, 4e-3):
+        image = pictures.picture(pose, [np.array([side * opened_m / 2.0, 0.0, 0.0]) for side in (-1.0, 1.0)])
+        images.append(TeachingImage(image, gripper.jaw_nominal_m + opened_m, f"{opened_m}"))
+    found = teach(Rig(camera, gripper, MonitorSettings()), reference, images)
+    taught = TaughtEdges.of(found.edges, gripper, pose, gripper.jaw_nominal_m)
+    seen = promised(gripper, pictures, reference, taught)
+    assert (seen.error_m < seen.bound_m).all() and np.mean(seen.valid[1:]) > 0.9 and seen.error_m.max() < 1.5e-4

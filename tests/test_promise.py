@@ -10,9 +10,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.model.records import Protection
@@ -132,6 +134,25 @@ def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():
     assumed = usual._replace(gripper=with_bevels(usual.gripper, 2e-4))
     bounds = [forecast_frame(each, cam_T_grip, None).protection for each in (stated, assumed, usual)]
     assert bounds[0] == bounds[1] and bounds[1].position_m > 2.0 * bounds[2].position_m
+
+
+def test_bevels_that_are_stated_but_not_taught_ask_for_teaching_and_not_for_another_mount(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """As gripmon gripper from-cad states them."""
+    model = yaml.safe_load((DEMO.parent / "grippers" / "two_box_fingers.yaml").read_text())
+    for edge in model["edges"].values():
+        edge["bevel_m"] = 2e-4
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(model))
+    path = tmp_path / "config.yaml"
+    path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
+    needed = r"valid needs its bevels taught \(gripmon teach\), or alert_limit_m of at least 0\.00"
+    assert main(["check", str(path)]) == 0
+    assert re.search(f"WARN  promise .*no transform can be valid: .*{needed}", capsys.readouterr().out)
+    assert re.search(needed, limits_warning(load_config(path)) or "")
+    assert main(["check", str(path), "--sweep", "--distance", "0.1188", "--tilt", "31", "--jaw", "0.03:0.06"]) == 0
+    text = capsys.readouterr().out
+    assert "1 mounts tried, 1 would work" in text and "taught     not yet: the gripper file's bevels count" in text
 
 
 def test_a_limit_that_can_not_be_kept_is_said_by_check_and_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -56,7 +56,8 @@ def test_the_present_mount_is_that_of_the_configuration(capsys: pytest.CaptureFi
     assert values["mounts"][0]["worst_sigma_m"] == pytest.approx(values["present"]["worst_sigma_m"], rel=0.01)
     over_jaw = checked["in_view"]["jaw_travel"]["certainty"]
     there = dict(zip(over_jaw["opening_m"], over_jaw["worst_sigma_m"], strict=True))
-    assert there[values["present"]["worst_at_m"]] == pytest.approx(values["present"]["worst_sigma_m"], rel=1e-9)
+    # Two edges have a bevel, which counts as taught.
+    assert there[values["present"]["worst_at_m"]] == pytest.approx(values["present"]["worst_sigma_m"], rel=1e-3)
     # Without the part of the jaw's travel that is worst it isn't as bad.
     open_ones = swept(capsys, "--distance", "0.1188", "--tilt", "31", "--jaw", "0.03:0.06")["present"]
     assert open_ones["jaw"]["opening_m"][0] == 0.03 and open_ones["jaw"]["opening_m"][-1] == 0.06

@@ -152,6 +152,8 @@ def _looked_at(config: Config, present: Trial) -> list[str]:
         lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
     if config.taught is not None:
         lines.append("taught     as seen from the present mount; taught again at another one it gets more exact there")
+    elif config.gripper.edge_bevel_m[~config.gripper.edge_curved].any():
+        lines.append("taught     not yet: the gripper file's bevels count as taught, without which bounds are wider")
     return lines
 
 

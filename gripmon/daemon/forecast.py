@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ from gripmon.teach.accuracy import (
     Promise,
     UnknownOpening,
     accuracy_over_jaw,
+    as_if_taught,
     forecast_accuracy,
     forecast_frame,
     with_bevels,
@@ -115,12 +117,23 @@ def rig_of(config: Config) -> Rig:
     return Rig(config.camera, config.gripper, config.settings.monitor, config.taught_edges)
 
 
+def rig_once_taught(config: Config) -> Rig:
+    """The same, where nobody has taught the edges yet as if someone had."""
+    rig = rig_of(config)
+    return rig._replace(gripper=as_if_taught(rig.gripper)) if rig.taught is None else rig
+
+
 def promise_of(config: Config) -> Promise | None:
     """What a frame at the configured pose and opening may promise; None where too little is in view to measure it."""
     rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
     if not see(rig, cam_T_grip, opening_m).enough:
         return None
-    return Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, config.settings.monitor.policy)
+    policy = config.settings.monitor.policy
+    found = Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, policy)
+    if found.reachable:
+        return found
+    once_taught = Promise.of(forecast_frame(rig_once_taught(config), cam_T_grip, opening_m).protection, policy)
+    return replace(found, teaching_helps=once_taught.reachable)
 
 
 def limits_warning(config: Config) -> str | None:

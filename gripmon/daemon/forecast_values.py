@@ -246,8 +246,8 @@ class Forecast(msgspec.Struct, frozen=True):
     """What the calibration expects to see: metres, radians, px; positions in the camera frame.
 
     ``protection``: what one frame may promise; ``protection_if_bevelled``: the same if the gripper has bevels that no
-    one has said or taught, null where it can't; ``needed``: the alert limits that this view could keep, where no
-    transform of it can be valid.
+    one has said or taught, null where it can't; ``needed``: the alert limits that this view could keep, or teaching,
+    where no transform of it can be valid.
     """
 
     config: str

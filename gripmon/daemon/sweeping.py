@@ -10,7 +10,7 @@ from typing import Any
 
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.calibrated import read_camera
-from gripmon.daemon.forecast import rig_of
+from gripmon.daemon.forecast import rig_once_taught
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import to_record
@@ -60,7 +60,7 @@ def make_grid(
 
     Raises :class:`InputError` for lenses that can't be, a place outside of the image, and too many mounts.
     """
-    present, rig = Mount.of(config.cam_T_grip), rig_of(config)
+    present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
     distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
     turns = {"tilt": ranges.get("tilt") or _spaced(*_TILTS_DEG)}
     turns |= {name: ranges[name] for name in ("side", "roll") if name in ranges}
@@ -142,7 +142,7 @@ def sweep(
             raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g}: is not in the jaw's travel; {right}", "jaw")
     opening_m, trials = config.jaw_opening_m, []
     mount, cam_T_grip = Mount.of(config.cam_T_grip), config.cam_T_grip
-    present = try_mount(rig_of(config), mount, -1, cam_T_grip, opening_m, travel_m)
+    present = try_mount(rig_once_taught(config), mount, -1, cam_T_grip, opening_m, travel_m)
     for trial in tried(grid, opening_m, travel_m):
         trials.append(trial)
         step()

@@ -146,6 +146,13 @@ def with_bevels(gripper: Gripper, least_m: float) -> Gripper:
     return Gripper(structs.replace(gripper.model, edges=edges))
 
 
+def as_if_taught(gripper: Gripper) -> Gripper:
+    """The same gripper with the bevels of its straight edges known, as teaching leaves it; curved ones stay."""
+    model = gripper.model
+    edges = {n: edge if edge.via else structs.replace(edge, bevel_m=0.0) for n, edge in model.edges.items()}
+    return Gripper(structs.replace(model, edges=edges))
+
+
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
     """One standard deviation (6,) along the least certain direction of a covariance (6, 6), a radian counting as
     ``lever_m``.
@@ -198,12 +205,14 @@ class ForecastMeter(FingertipMeter):
 @dataclass(frozen=True, slots=True)
 class Promise:
     """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
-    whether transforms of a view can be valid, before there is any image.
+    whether transforms of a view can be valid, before there is any image.  ``teaching_helps``: they can't, but could
+    once the bevels that the gripper file states were taught.
     """
 
     protection: Protection
     alert_limit_m: float
     alert_limit_rad: float
+    teaching_helps: bool = False
 
     @classmethod
     def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
@@ -222,7 +231,7 @@ class Promise:
 
     @property
     def needed(self) -> str:
-        """The alert limits that this view can keep, where the present ones are too tight; else empty."""
+        """The alert limits that this view can keep, or teaching, where the present ones are too tight; else empty."""
         bound, parts = self.protection, []
         if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
             return "more of the fingers in view: no limit would do"
@@ -232,7 +241,7 @@ class Promise:
         if bound.rotation_rad > self.alert_limit_rad:
             needed_rad = _rounded_up(bound.rotation_rad)
             parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
-        return " and ".join(parts)
+        return "its bevels taught (gripmon teach), or " * self.teaching_helps + " and ".join(parts)
 
     def text(self) -> str:
         """One line for a person."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -42,6 +43,19 @@ def box_fingers() -> list[trimesh.Trimesh]:
     """Two sharp fingers of the size and at the places of the rounded ones."""
     profile = np.array([[0.008, -0.04], [0.008, 0.0], [-0.008, 0.0], [-0.008, -0.04]])
     return [finger_mesh(profile, x) for x in ((-0.027, -0.017), (0.017, 0.027))]
+
+
+def bevelled_fingers(bevel_m: float) -> list[trimesh.Trimesh]:
+    """The sharp fingers with a bevel of that width on all edges, at 45 degrees."""
+    out = []
+    for mesh in box_fingers():
+        middle, half = mesh.bounds.mean(axis=0), 0.5 * np.ptp(mesh.bounds, axis=0)
+        # Of each corner three are left, one on each of its faces, both of whose edges are broken.
+        broken = half - bevel_m / np.sqrt(2.0) * (1.0 - np.eye(3))
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        points = middle + (signs[:, None] * broken).reshape(-1, 3)
+        out.append(trimesh.convex.convex_hull(points))
+    return out
 
 
 def rounded_profile(radius_m: float, width_m: float = 0.016, length_m: float = 0.04, parts: int = 48) -> np.ndarray:
