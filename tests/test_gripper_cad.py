@@ -160,6 +160,18 @@ def test_the_rim_of_a_rounded_tip_stays_where_the_outline_wanders(tmp_path: Path
         np.testing.assert_allclose(np.hypot(beside, above), radius_m, atol=10 * MICROMETRE)
 
 
+@pytest.mark.parametrize("bevel_m", [2e-4, 0.0])
+def test_what_the_cad_draws_sharp_has_a_bevel_and_what_it_draws_round_its_shade(tmp_path: Path, bevel_m: float):
+    """Only the line across a rounded tip is an outline of something round: 0.1 px of 8 to a millimetre."""
+    settings = seen() if bevel_m else seen(bevel_m=0.0)
+    gripper = gripper_from_cad(write_meshes(rounded_fingers(0.004), tmp_path), unit="mm", **settings).gripper
+    ends = gripper.points_grip_m()[gripper.edge_points]
+    round_ = (np.abs(ends[:, 1, 0] - ends[:, 0, 0]) > 0.009) & (ends[:, :, 2].max(axis=1) < 1e-3) & ~gripper.edge_crease
+    assert np.count_nonzero(round_) == 2, "one a finger"
+    np.testing.assert_allclose(gripper.edge_bevel_m[round_] / np.sqrt(12.0), 0.1 * 0.115 / 962.0, rtol=0.1)
+    assert (gripper.edge_bevel_m[~round_] == bevel_m).all()
+
+
 def test_what_is_too_short_to_be_measured_joins_the_edges_beside_it(tmp_path: Path):
     """Round a finger's outline each edge goes on in the next one, from side to side."""
     for radius_m in (0.002, 0.004, 0.008):
@@ -274,6 +286,26 @@ def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, caps
     assert picture.stat().st_size > 10_000
     assert from_cad(*paths, *words, "--out", out) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+def test_the_command_says_what_the_bevels_of_sharp_edges_cost_and_who_takes_it_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    paths, out = write_meshes(box_meshes(sharp_gripper()), tmp_path), tmp_path / "g.yaml"
+    for words, width_m, said in (
+        ((), 2e-4, "note: sharp edges may be broken by 0.2 mm (bevel_m), which makes bounds wide, mostly too wide"),
+        (("--bevel", "5e-5"), 5e-5, "until gripmon teach has measured how the edges really show"),
+        (("--bevel", "0"), 0.0, "note: sharp edges are taken as exact: were they broken by 0.1 mm"),
+    ):
+        assert from_cad(*paths, "--unit", "mm", *words, "--out", out, "--force") == 0
+        assert said in capsys.readouterr().out and said.removeprefix("note: ") in out.read_text()
+        assert (load_gripper(out).edge_bevel_m == width_m).all()
+    for wrong in ("0.2", "-0.0001", "nan"):
+        assert from_cad(*paths, "--unit", "mm", f"--bevel={wrong}", "--out", out, "--force") == 2
+        assert capsys.readouterr().err.endswith(" m: is no width of a bevel; 0 to 0.02 m\n")
+    with pytest.raises(SystemExit, match="2"):
+        from_cad(*paths, "--unit", "mm", "--bevel", "wide", "--out", out, "--force")
+    assert "'wide' isn't the width of a bevel; metres, e.g. 0.0002" in capsys.readouterr().err
 
 
 def test_a_mesh_named_twice_and_one_as_small_as_none_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

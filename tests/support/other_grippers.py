@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,13 +55,27 @@ def rounded_tips(folder: Path) -> Array:
 
 
 def curved_meshes(folder: Path) -> Array:
+    """Fingers that curve, as sharp as their CAD: :func:`_at_work`."""
+    from benchmarks.meshes import curved_fingers
+
+    return _at_work(folder, curved_fingers(), curved_fingers())
+
+
+def bevelled_boxes(folder: Path) -> Array:
+    """Boxes with bevels of 0.2 mm, which their CAD doesn't draw: :func:`_at_work`."""
+    from benchmarks.meshes import bevelled_fingers, box_fingers
+
+    return _at_work(folder, box_fingers(), bevelled_fingers(2e-4))
+
+
+def _at_work(folder: Path, drawn: Sequence[Any], real: Sequence[Any]) -> Array:
     """``finger0.stl`` and ``finger1.stl``, mm; ``robot.yaml``, the robot's hand/eye calibration; ``work``, in which the
     camera trembles by 0.05 mm.  True ``cam_T_grip`` (frames, 4, 4) at work.
     """
-    from benchmarks.meshes import MeshCamera, curved_fingers, wandering, write_meshes
+    from benchmarks.meshes import MeshCamera, wandering, write_meshes
 
-    meshes, nominal = curved_fingers(), nominal_cam_T_grip()
-    write_meshes(meshes, folder)
+    nominal = nominal_cam_T_grip()
+    write_meshes(drawn, folder)
     flange_T_cam = np.eye(4)
     flange_T_cam[:3, :3] = Rotation.from_euler("xz", [-32.0, 4.0], degrees=True).as_matrix()
     flange_T_cam[:3, 3] = [0.01, 0.08, 0.02]
@@ -76,6 +91,6 @@ def curved_meshes(folder: Path) -> Array:
         pose = wandering(nominal, k / FRAMES, 5e-5, 2e-4)
         pose[:3, 3] += KNOCK_M * (k >= STEP)
         truth.append(pose)
-    camera = MeshCamera(CAMERA, meshes)
+    camera = MeshCamera(CAMERA, real)
     write_images(folder / "work", [camera.picture(pose) for pose in truth])
     return np.array(truth)

@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks import options
 
 _DESCRIPTION = """\
-Makes gripper files from meshes, as `gripmon gripper from-cad` does, and tracks pictures of the same meshes: another
+Makes gripper files from meshes, as `gripmon gripper from-cad --bevel 0` does, and tracks pictures of them: another
 piece of background behind the fingers in each frame, the camera wandering on a smooth way by as much as the row says
 along and about each axis, the jaws by 1 mm.  Valid: share of the frames from the second on (the first has none before
 it that confirms it).  Misleading: valid and off by more than the alert limit; beyond: valid and off by more than its
@@ -101,7 +101,7 @@ def track(shape: Shape, most_m: float, most_rad: float, frames: int, seed: int, 
     paths = write_meshes(meshes, folder)
     # The TCP stays that of both fingers, so that poses and errors are alike.
     made = gripper_from_cad(
-        paths, unit="mm", jaw_range_m=jaw_range_m, camera=camera, cam_T_grip=pose,
+        paths, unit="mm", jaw_range_m=jaw_range_m, camera=camera, cam_T_grip=pose, bevel_m=0.0,
         **({"length_m": LENGTH_M} if shape.fingers > 1 else {"frame": "cad"}),
     )  # fmt: skip
     gripper, settings = made.gripper, MonitorSettings()

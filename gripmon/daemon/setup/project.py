@@ -275,8 +275,9 @@ class Project:
             return lines
         if self.values["gripper"] == steps.FROM_IMAGES:
             return self._gripper_from_images(words)
-        if words[0] != "cp":
-            return None
+        if self.values["gripper"] == steps.FROM_CAD:
+            # What it notes is for a person to look at: edges that aren't taught, a small finger, an open surface.
+            return [Line(e.text, "WARN") if e.text.startswith("note: ") else e for e in self._command(words)]
         path = Path(words[1])
         if not words[1] or not path.is_file():
             raise InputError(f"{words[1] or 'the file'}: there is no such file; a gripper file such as the library's")

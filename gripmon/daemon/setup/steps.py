@@ -240,8 +240,9 @@ STEPS = (
         (
             Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_IMAGES, FROM_CAD, FROM_FILE)),
             Field("gripper_file", "file", "", "a gripper file", (), ("gripper", (FROM_FILE,))),
-            Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one a finger or one for both; or a URDF", (),
-                  ("gripper", (FROM_CAD,))),
+            Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one a finger or one for both; or a URDF.  "
+                  "Edges drawn sharp count as broken by 0.2 mm, with bounds too wide for valid, until the step Teach",
+                  (), ("gripper", (FROM_CAD,))),
             Field("cad_unit", "unit of the meshes", "", "of URDF and .cao it is known", ("", "mm", "m", "cm", "in"),
                   ("gripper", (FROM_CAD,))),
             Field("cad_view", "view (m:°)", "", "of fingers that are round, hollow or open: how far the fingertips are "
@@ -287,8 +288,9 @@ STEPS = (
         _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
     ),
     Step(
-        "teach", "Teach", "Drag the corners, see the edges snap and what accuracy to expect.  Save, then Done.", "page",
-        "Teach", ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
+        "teach", "Teach", "Drag the corners, see the edges snap and what accuracy to expect.  Save, then Done.  A "
+        "gripper from CAD is hardly ever valid without: its real edges aren't known.", "page", "Teach",
+        ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
     ),
     Step(
         "check", "Forecast", "What the monitor will be able to do with this view.", "form", "Check", ("config.yaml",),
