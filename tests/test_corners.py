@@ -28,8 +28,7 @@ from gripmon.model.records import CornerFault
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import BentFinger, JawScript
 from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
-from gripmon.track.edges.lines import CornerSettings
-from gripmon.track.edges.robust_fit import RobustFitSettings
+from gripmon.track.edges.settings import CornerSettings, RobustFitSettings
 
 PLAIN = plain_scenario()
 IDS = box_gripper().corner_ids

@@ -28,8 +28,9 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Bump, ObjectLook, Prop
 from gripmon.track.edges import FingerEnds
-from gripmon.track.edges.prediction import SamplingSettings, lay_out, predict
-from gripmon.track.edges.profiles import EdgeSettings, profile_offsets_px
+from gripmon.track.edges.prediction import lay_out, predict
+from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 

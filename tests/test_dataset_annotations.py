@@ -46,7 +46,7 @@ def annotated(dataset: Path, out: Path, to: Path, answers: list[dict]) -> list[P
         for episode, answer in zip(episodes, answers, strict=True):
             camera = episode.source.camera or "/wrist/image"
             journal.add(Measured(episode.name, camera, episode.key, episode.version, **answer))
-        written = write_dataset(journal, [episode.key for episode in episodes], out, "d", 0.01, 0.0, 0.0)
+        written = write_dataset(journal, [episode.key for episode in episodes], out, 0.01, 0.0, 0.0)
         annotations.write(Rows(journal, written))
     return sorted(path for path in to.rglob("*") if path not in before and not path.is_dir())
 

@@ -18,9 +18,10 @@ from test_robust_fit import (
 )
 
 from gripmon.model.records import CornerFault
-from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
+from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import RobustFit, fit_irls
+from gripmon.track.edges.settings import CornerSettings
 
 GEOMETRY = CornerGeometry.of(GRIPPER, PREDICTION, CornerSettings())
 

@@ -9,7 +9,6 @@ from scipy.special import erf
 
 from gripmon.track.edges.profiles import (
     Candidates,
-    EdgeSettings,
     estimate_noise,
     find_candidates,
     full_scale,
@@ -17,6 +16,7 @@ from gripmon.track.edges.profiles import (
     quantum,
     read_profiles,
 )
+from gripmon.track.edges.settings import EdgeSettings
 
 SIZE = 160
 CENTRE = np.array([79.3, 80.6])

@@ -55,7 +55,7 @@ HEAVY = (
 
 
 def room_of(path: Path) -> str:
-    """``gripmon/track/edges/fit.py`` -> ``corners``; the package's own ``__init__`` -> ``gripmon``."""
+    """``gripmon/track/edges/robust_fit.py`` -> ``track``; the package's own ``__init__`` -> ``gripmon``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return "gripmon" if parts == ("__init__",) else parts[0]
 
@@ -107,6 +107,56 @@ def test_every_import_points_downward():
             for fault in faults_of(room, imported_modules(path.read_text(), package))
         ]
     assert not faults, "\n".join(faults)
+
+
+def circles_of(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Modules that reach each other by their imports, in groups."""
+
+    def reached(start: str) -> set[str]:
+        found, todo = set(), [start]
+        while todo:
+            new = imports.get(todo.pop(), set()) - found
+            found |= new
+            todo += new
+        return found
+
+    reach = {module: reached(module) for module in imports}
+    groups = {frozenset(other for other in reach[module] if module in reach.get(other, ())) for module in imports}
+    return sorted(sorted(group) for group in groups if group)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Deferred imports and those for type checkers count: a circle of them can't be read from either end, either.
+
+    Left out is ``gripmon`` itself, which names what it offers (test_the_package_itself_imports_no_room) and is imported
+    for its ``__version__``; and that whatever imports a package's module runs the package's ``__init__`` first.
+    """
+    paths = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
+    paths = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+    del paths["gripmon"]
+    imports = {
+        name: {
+            module if module in paths else module.rpartition(".")[0]
+            for module in imported_modules(path.read_text(), ".".join(path.relative_to(ROOT).parent.parts))
+        }
+        & set(paths)
+        for name, path in paths.items()
+    }
+    assert sum(map(len, imports.values())) > len(imports), "imports were found"
+    assert circles_of(imports) == []
+
+
+@pytest.mark.parametrize(
+    ("imports", "expected"),
+    [
+        ({"a": {"b"}, "b": {"c"}, "c": set()}, []),
+        ({"a": {"b"}, "b": {"a"}, "c": {"a"}}, [["a", "b"]]),
+        ({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"e"}, "e": {"d"}}, [["a", "b", "c"], ["d", "e"]]),
+        ({"a": {"a"}}, [["a"]]),
+    ],
+)
+def test_circles_are_found(imports: dict[str, set[str]], expected: list[list[str]]):
+    assert circles_of(imports) == expected
 
 
 def test_the_package_itself_imports_no_room():

@@ -11,9 +11,10 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
-from gripmon.track.edges.lines import CornerGeometry, CornerSettings
-from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.lines import CornerGeometry
+from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.settings import CornerSettings, SamplingSettings
 
 LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
 LENS_NAMES = ["paper", "brown_conrady", "fisheye"]

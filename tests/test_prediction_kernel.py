@@ -11,8 +11,9 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import load_gripper
 from gripmon.track.edges import prediction, prediction_kernel
-from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.settings import SamplingSettings
 
 CLOSE = 1e-9
 GRIPPERS = {"box": box_gripper(), "arc": load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")}

@@ -12,15 +12,8 @@ from support.by_numpy import profiles as by_numpy
 from test_robust_fit import EDGES, PREDICTION, SETTINGS
 
 from gripmon.track.edges import profile_kernel
-from gripmon.track.edges.profiles import (
-    EdgeSettings,
-    estimate_noise,
-    find_candidates,
-    full_scale,
-    quantum,
-    read_profiles,
-    weigh,
-)
+from gripmon.track.edges.profiles import estimate_noise, find_candidates, full_scale, quantum, read_profiles, weigh
+from gripmon.track.edges.settings import EdgeSettings
 
 CLOSE = 1e-9
 HEIGHT, WIDTH = 576, 768

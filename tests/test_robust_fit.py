@@ -8,17 +8,17 @@ from support.meters import JAW_SIGMA_M, box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
-from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import Candidates, Edgels, profile_offsets_px, weigh
 from gripmon.track.edges.robust_fit import (
     Prior,
     RobustFit,
-    RobustFitSettings,
     fit_irls,
     fit_irls_from_grid,
     grid_of_starts,
     prior_information,
 )
+from gripmon.track.edges.settings import RobustFitSettings, SamplingSettings
 from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, assess, without_one_edge
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()

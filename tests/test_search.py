@@ -22,7 +22,8 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 from gripmon.model.camera import make_camera
 from gripmon.simulate import make_scenario
 from gripmon.track.edges import Effort, Measurement
-from gripmon.track.edges.search import SearchSettings, search_poses
+from gripmon.track.edges.search import search_poses
+from gripmon.track.edges.settings import SearchSettings
 
 SETTINGS = SearchSettings()
 

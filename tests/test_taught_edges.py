@@ -11,8 +11,9 @@ from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of,
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
 from gripmon.teach.lines import EdgePoints, find_line, pool, settle_line, slopes
-from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.settings import SamplingSettings
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
 POSE = nominal_cam_T_grip()

@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
 from gripmon.analyse.stretches import Stretch, mountings_of
-from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Verdict
@@ -156,12 +155,13 @@ def write_dataset(
     journal: Journal,
     keys: Sequence[str],
     out: Path,
-    name: str,
     level: float,
     tolerance_m: float,
     tolerance_rad: float,
 ) -> Written:
-    """The table and the report of the episodes ``keys``, in that order; the files before are replaced."""
+    """The table of the episodes ``keys``, in that order; one from before is replaced.  The report on it is written by
+    :func:`gripmon.analyse.dataset_page.write_page`.
+    """
     covariances: list[NDArray[np.float64]] = []
     lines = tuple(line for key in keys for line in _lines(journal.read(key), covariances))
     mountings = _mountings(lines, covariances, level, tolerance_m, tolerance_rad)
@@ -171,9 +171,6 @@ def write_dataset(
     _write_table(Rows(journal, written), keys, fresh)
     shutil.rmtree(out / TABLE, ignore_errors=True)
     fresh.rename(out / TABLE)
-    from gripmon.analyse.dataset_page import page
-
-    write_atomically(out / REPORT, page(written, journal, name))
     return written
 
 

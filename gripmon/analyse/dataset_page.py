@@ -12,13 +12,19 @@ import numpy as np
 from gripmon.analyse.content import count
 from gripmon.analyse.dataset import Journal, Line, Written, matrices, moved
 from gripmon.analyse.page import rendered
+from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
 
 _MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
 """Episodes with pictures, rows of a table, points of a plot: the table has all of them."""
 
 
-def page(written: Written, journal: Journal, name: str) -> bytes:
+def write_page(written: Written, journal: Journal, name: str) -> None:
+    """Write the report on the dataset ``name`` where ``written`` says; one from before is replaced."""
+    write_atomically(written.report, _page(written, journal, name))
+
+
+def _page(written: Written, journal: Journal, name: str) -> bytes:
     """The whole page, UTF-8, without need of a network."""
     from plotly.offline import get_plotlyjs
 

@@ -23,7 +23,6 @@ from gripmon.teach.plate_print import PlatePrint, look_at, moves, rough_line, sh
 from gripmon.track.edges.kernel import FEWEST_FREE
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
-    EdgeSettings,
     estimate_noise,
     find_candidates,
     full_scale,
@@ -31,7 +30,7 @@ from gripmon.track.edges.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.track.edges.robust_fit import RobustFitSettings
+from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 REACH_PX = 10.0
 """Search distance from the rough ends of an edge."""

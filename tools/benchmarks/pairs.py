@@ -21,7 +21,7 @@ from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import Background
 from gripmon.track.differential import DegenerateGeometry, differential_update
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.track.edges.prediction import SamplingSettings
+from gripmon.track.edges.settings import SamplingSettings
 
 _RENDERED = "rendered series2, true jaw"
 _ITERATIONS = 5

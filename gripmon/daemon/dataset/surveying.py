@@ -12,6 +12,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.analyse.dataset import Journal, Rows, Written, write_dataset
 from gripmon.analyse.dataset_annotations import Annotations
+from gripmon.analyse.dataset_page import write_page
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.dataset.engines import local, ray_cluster
 from gripmon.daemon.dataset.measuring import Configs
@@ -97,7 +98,8 @@ def measure_dataset(
             journal.add(measured)
             step(len(episodes))
         order = [episode.key for episode in episodes]
-        written = write_dataset(journal, order, folder, str(dataset), level, tolerance_m, tolerance_rad)
+        written = write_dataset(journal, order, folder, level, tolerance_m, tolerance_rad)
+        write_page(written, journal, str(dataset))
         if annotations is not None:
             annotations.write(Rows(journal, written))
     return Survey(written, len(episodes), len(left))

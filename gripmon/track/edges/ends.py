@@ -18,8 +18,9 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
+from gripmon.track.edges.profiles import find_candidates, read_profiles
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
+from gripmon.track.edges.settings import EdgeSettings
 from gripmon.track.edges.settling import Measurement
 
 END_CORNERS = 2

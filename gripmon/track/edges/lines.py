@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.compiled import compiled
@@ -22,26 +20,7 @@ from gripmon.model.records import Array, CornerFault
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import RobustFit
-
-
-class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When an intersection counts as a corner."""
-
-    smallest_angle_rad: Annotated[
-        float, Meta(ge=0.02, le=1.5, description="smallest angle between two edges that make a corner (rad)")
-    ] = 0.2
-    largest_sigma_px: Annotated[
-        float, Meta(ge=0.01, le=10.0, description="largest standard deviation of a corner that may be used (px)")
-    ] = 1.0
-    neighbourhood_px: Annotated[
-        float,
-        Meta(
-            ge=2.0,
-            le=100.0,
-            description="stretch of each edge next to the corner that must show half as well as its rest (px)",
-        ),
-    ] = 16.0
-
+from gripmon.track.edges.settings import CornerSettings
 
 SHOWN_BESIDE = 0.5
 """Share of agreeing profiles next to a corner, over that on the rest of the edge, from which the corner is seen; on

@@ -9,11 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
@@ -22,32 +19,8 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.kernel import FEWEST_AGREEING
-
-if TYPE_CHECKING:
-    from gripmon.track.edges.taught import TaughtEdges
-
-
-class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where the image is sampled around the predicted edges."""
-
-    samples: Annotated[int, Meta(ge=24, le=4096, description="profiles over all edges together")] = 320
-    reach_px: Annotated[float, Meta(ge=2.0, le=40.0, description="how far each profile reaches to both sides (px)")] = (
-        7.0
-    )
-    end_margin_px: Annotated[
-        float,
-        Meta(
-            ge=0.0,
-            le=40.0,
-            description="part of an edge at each end that is left out: the neighbour edge shows there; down to half of "
-            "it where the edge is short (px)",
-        ),
-    ] = 4.0
-    creases: Annotated[
-        bool,
-        Meta(description="use edges between two visible faces too; bevels shift them (taught ones are used anyway)"),
-    ] = False
-
+from gripmon.track.edges.settings import SamplingSettings
+from gripmon.track.edges.taught import TaughtEdges
 
 STRETCH = 16
 """Neighbouring profiles of an edge whose errors are taken together."""

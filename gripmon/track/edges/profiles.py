@@ -9,32 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array, Image
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-
-if TYPE_CHECKING:
-    from gripmon.track.edges.robust_fit import RobustFitSettings
-
-
-class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What counts as an edge candidate."""
-
-    blur_px: Annotated[float, Meta(ge=0.4, le=5.0, description="sigma of the derivative of Gaussian (px)")] = 0.65
-    noise_factor: Annotated[
-        float, Meta(ge=2.0, le=50.0, description="smallest edge response in standard deviations of its noise")
-    ] = 3.0
-    contrast_fraction: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="smallest step in grey levels as a fraction of the image's full scale")
-    ] = 0.008
-
+from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 _CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
 

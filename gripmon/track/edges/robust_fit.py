@@ -9,11 +9,8 @@ px.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
@@ -21,49 +18,7 @@ from gripmon.track.edges import kernel
 from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import Edgels
-
-
-class RobustFitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How edge candidates agree on one motion."""
-
-    start_width_px: Annotated[
-        float, Meta(ge=0.5, le=10.0, description="width of the robust weight at the prediction (px)")
-    ] = 2.5
-    point_floor_px: Annotated[
-        float,
-        Meta(
-            ge=0.005, le=1.0, description="standard deviation of an edge point that image noise does not explain (px)"
-        ),
-    ] = 0.05
-    edge_floor_px: Annotated[
-        float,
-        Meta(
-            ge=0.0,
-            le=1.0,
-            description="standard deviation of a whole sharp edge's position that averaging along it does not remove; "
-            "grows with the edges' width (px)",
-        ),
-    ] = 0.02
-    support_sigmas: Annotated[
-        float,
-        Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen"),
-    ] = 4.0
-    support_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
-    ] = 0.3
-    trusted_share: Annotated[
-        float,
-        Meta(
-            ge=0.05,
-            le=0.95,
-            description="share of neighbouring profiles that must agree where the gripper was expected",
-        ),
-    ] = 0.3
-    found_share: Annotated[
-        float,
-        Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where it was looked for"),
-    ] = 0.42
-
+from gripmon.track.edges.settings import RobustFitSettings
 
 GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it (px of the zoomed image)."""

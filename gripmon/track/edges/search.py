@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
@@ -31,6 +28,7 @@ from gripmon.track.edges.hypotheses import (
     rotations,
 )
 from gripmon.track.edges.reduced import BESIDE_CELLS, ORIENTATIONS, Floats, Window, evidence_maps, rectify, window_about
+from gripmon.track.edges.settings import SearchSettings
 
 POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""
@@ -55,42 +53,6 @@ POLISH_REACH, POLISH_ROUNDS = 4, 4
 
 DISTINCT_CELLS = 2.0
 """Poses whose outlines differ by less than so many (finer) cells are one."""
-
-
-class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far around the prediction a lost gripper is looked for."""
-
-    reach_m: Annotated[
-        float,
-        Meta(
-            ge=0.0, le=0.1, description="shift of the TCP across the optical axis, and along it, that is searched (m)"
-        ),
-    ] = 0.012
-    turn_rad: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")
-    ] = 0.08
-    tilt_rad: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="turn about the axes across the optical axis that is searched (rad)")
-    ] = 0.08
-    coarse_columns: Annotated[
-        int,
-        Meta(ge=64, le=1024, description="width of the reduced image, as far as the gripper can be in it (columns)"),
-    ] = 160
-    starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
-    eager_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="so many doubtful frames may look further one after the other")
-    ] = 4
-    refill_frames: Annotated[
-        int, Meta(ge=1, le=100000, description="good frames after which one more frame may look further")
-    ] = 60
-    patient_every: Annotated[
-        int,
-        Meta(
-            ge=1,
-            le=1000,
-            description="a gripper lost for longer than its transform is held is searched for in one of so many frames",
-        ),
-    ] = 15
 
 
 def search_poses(

@@ -5,23 +5,21 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from gripmon.model.camera import Camera
 from gripmon.model.compiled import compiled
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Image
-from gripmon.track.edges.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
-from gripmon.track.edges.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.lines import CornerGeometry, Corners, intersect_edges
+from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import (
     Candidates,
     Edgels,
-    EdgeSettings,
     estimate_noise,
     find_candidates,
     full_scale,
@@ -35,12 +33,11 @@ from gripmon.track.edges.robust_fit import (
     RESTART_WIDTH_PX,
     Prior,
     RobustFit,
-    RobustFitSettings,
     fit_irls,
     prior_information,
     refit_visible,
 )
-from gripmon.track.edges.search import SearchSettings
+from gripmon.track.edges.settings import MeasurementSettings
 from gripmon.track.edges.taught import TaughtEdges
 from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, NormalEquations, Uncertainty, assess, without_one_edge
 
@@ -58,19 +55,6 @@ BLUR_AT_ZOOM = (0.7, 1.7)
 
 FEWEST_WIDTHS = 20
 """Edge points from which the blur is told."""
-
-
-class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """From the image to edge points and corners."""
-
-    sampling: SamplingSettings = SamplingSettings()
-    edges: EdgeSettings = EdgeSettings()
-    consensus: RobustFitSettings = RobustFitSettings()
-    corners: CornerSettings = CornerSettings()
-    search: SearchSettings = SearchSettings()
-    relinearise_px: Annotated[
-        float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed again (px)")
-    ] = 1.0
 
 
 class Effort(enum.IntEnum):

@@ -30,7 +30,7 @@ from gripmon.model.geometry import from_record, invert, rotation_angle, to_recor
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.gripper.core import POLARITY
 from gripmon.model.records import Array, Transform
-from gripmon.track.edges.profiles import EdgeSettings
+from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
 SAME_POSE = 1e-6

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from gripmon.model.records import Array
 from gripmon.track.edges import kernel
 from gripmon.track.edges.profiles import Edgels
-from gripmon.track.edges.robust_fit import NOT_SOLVED, ROUNDS, Prior, RobustFit, RobustFitSettings, fit_irls
+from gripmon.track.edges.robust_fit import NOT_SOLVED, ROUNDS, Prior, RobustFit, fit_irls
+from gripmon.track.edges.settings import RobustFitSettings
 
 CONTRADICTION_RATIO = 3.0
 """Stretches that contradict each other more than this call for an edge that is none, without which they do so by no

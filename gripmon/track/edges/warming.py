@@ -8,10 +8,9 @@ import numpy as np
 
 from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.evidence import agreeing_shares, edge_means
-from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
-from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction, SamplingSettings
+from gripmon.track.edges.lines import CornerGeometry, intersect_edges
+from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction
 from gripmon.track.edges.profiles import (
-    EdgeSettings,
     estimate_noise,
     find_candidates,
     profile_offsets_px,
@@ -19,7 +18,8 @@ from gripmon.track.edges.profiles import (
     usual_width_px,
     weigh,
 )
-from gripmon.track.edges.robust_fit import Prior, RobustFitSettings, fit_irls
+from gripmon.track.edges.robust_fit import Prior, fit_irls
+from gripmon.track.edges.settings import CornerSettings, EdgeSettings, RobustFitSettings, SamplingSettings
 from gripmon.track.edges.settling import corner_rms
 from gripmon.track.edges.uncertainty import assess, contradictions_without
 

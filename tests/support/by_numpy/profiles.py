@@ -17,8 +17,8 @@ from gripmon.track.edges.profile_kernel import (
     SHARPNESS,
     SURELY,
 )
-from gripmon.track.edges.profiles import _FAR, _NEAR, Candidates, Edgels, EdgeSettings, _kernel, _pixels, _threshold
-from gripmon.track.edges.robust_fit import RobustFitSettings
+from gripmon.track.edges.profiles import _FAR, _NEAR, Candidates, Edgels, _kernel, _pixels, _threshold
+from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 
 def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> Array:
