@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting
+from gripmon.monitor.refits import CONFIRMING_FRAMES, Anchor, Lasting
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")

@@ -50,8 +50,7 @@ from gripmon.track.edges import (
     warm_up,
 )
 from gripmon.track.edges.profiles import Edgels
-from gripmon.track.edges.robust_fit import RESTART_WIDTH_PX, Prior, fit_irls
-from gripmon.track.edges.uncertainty import assess, contradictions_without
+from gripmon.track.edges.robust_fit import RESTART_WIDTH_PX, Prior, assess, contradictions_without, fit_irls
 
 CLOSE = 1e-9
 

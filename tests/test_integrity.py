@@ -9,8 +9,7 @@ from support.by_numpy.integrity import beyond
 
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
-from gripmon.track.integrity.quantiles import Tails
-from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO
+from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails
 
 # --- quantiles ---
 

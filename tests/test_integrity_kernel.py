@@ -13,7 +13,7 @@ from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump
 from gripmon.track.integrity import Doubts, Separation, kernel, separation
-from gripmon.track.integrity.quantiles import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
+from gripmon.track.integrity.separation import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
 HYPOTHESES, EDGES, FINGERS = 14, 8, 2

@@ -63,7 +63,7 @@ class Cell:
         return _told(alerts)
 
     def say(self, name: CommandName) -> list[tuple[AlertKind, AlertEvent]]:
-        return _told(self.renewal.obey(Command(name), self.cam_T_grip, self.now_s, 7)[1])
+        return _told(self.renewal.obey(Command(name), self.cam_T_grip, True, self.now_s, 7)[1])
 
     @property
     def revision(self) -> int:
@@ -113,7 +113,7 @@ def test_what_was_rejected_is_not_proposed_again_where_the_camera_stays():
     cell.at_mm += 1.0
     assert cell.still() == [(K.PROPOSED, RAISED)]
     cell.say(CommandName.REJECT)
-    cell.renewal.want()
+    cell.say(CommandName.RECALIBRATE)
     assert cell.still() == [(K.PROPOSED, RAISED)], "unless someone wants it"
 
 
@@ -123,7 +123,7 @@ def test_what_was_wanted_before_does_not_overrule_the_newest_word(name: CommandN
     assert cell.still() == [(K.RECALIBRATED, NOTED)]
     cell.at_mm, cell.asks = 6.0, "a step of 30 mm"
     cell.still()
-    cell.renewal.want()
+    cell.say(CommandName.RECALIBRATE)
     cell.say(name)
     assert cell.revision == 3 and not cell.renewal.wanted
 
@@ -131,6 +131,6 @@ def test_what_was_wanted_before_does_not_overrule_the_newest_word(name: CommandN
 @pytest.mark.parametrize("cause", [Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS, Cause.CAMERA_REPLACED])
 def test_a_wish_does_not_make_a_reference_of_what_is_not_the_camera(cause: Cause):
     cell = Cell()
-    cell.renewal.want()
+    cell.say(CommandName.RECALIBRATE)
     assert cell.still(explained(cause)) == [(K.REFUSED, RAISED)]
     assert cell.revision == 1 and not cell.renewal.wanted

@@ -11,15 +11,17 @@ from gripmon.model.camera import make_camera
 from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import Candidates, Edgels, profile_offsets_px, weigh
 from gripmon.track.edges.robust_fit import (
+    CONTRADICTION_RATIO,
     Prior,
     RobustFit,
+    assess,
     fit_irls,
     fit_irls_from_grid,
     grid_of_starts,
     prior_information,
+    without_one_edge,
 )
 from gripmon.track.edges.settings import RobustFitSettings, SamplingSettings
-from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, assess, without_one_edge
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()
 SETTINGS = RobustFitSettings()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from test_robust_fit import EDGES, NO_FLOORS, PREDICTION, PRIOR, REPORTED, SAMPLES, XI, candidates, votes_for
 
-from gripmon.track.edges.robust_fit import fit_irls
-from gripmon.track.edges.uncertainty import assess
+from gripmon.track.edges.robust_fit import assess, fit_irls
 
 EDGE, STRETCH = PREDICTION.layout.edge, PREDICTION.layout.stretch
 NO_JAW = XI * [1, 1, 1, 1, 1, 1, 0]

@@ -49,6 +49,7 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.analysis import CauseAnalysis
 from gripmon.monitor.answers import (
+    NoteTaker,
     after_restart,
     drift_between,
     flat,
@@ -59,8 +60,6 @@ from gripmon.monitor.answers import (
     smoothed_record,
     unmeasured_corners,
 )
-from gripmon.monitor.notes import NoteTaker
-from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
@@ -376,8 +375,7 @@ class Monitor:
         before, done = self.reference, True
         try:
             measurable = self._newest is not None and self._newest.trusted
-            moment = Moment(self._cam_T_grip, measurable, self._now_s, stamp_ns)
-            text, alerts = obey(command, self._policy, self._renewal, moment)
+            text, alerts = self._renewal.obey(command, self._cam_T_grip, measurable, self._now_s, stamp_ns)
             self._due += alerts
         except CommandRefused as refusal:
             done, text = False, str(refusal)

@@ -1,4 +1,11 @@
-"""The fit of one frame made once more under each hypothesis, and what that bounds."""
+"""The fit of one frame made once more under each hypothesis, and the anchor: the average of those that proved where the
+gripper is.
+
+An edge that has belonged to something else since the first frame bends the average, too, so that the average is kept
+without it as well: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
+time).  Frames err together before a background that stands still: what their scatter doesn't show stays in the
+average's covariance, as in :mod:`gripmon.judge.smoothing`.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +15,32 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.smoothing import MOST_SCATTER, SMALLEST_VARIANCE_RATIO
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, with_and_without
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, follow, telling, with_and_without
 
 SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
 
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
 """Stands for no bound at all."""
+
+PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
+"""So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
+
+YOUNG_VARIANCE_RATIO = 0.2
+"""Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
+little more off than is believed of any average.
+"""
+
+CONFIRMING_FRAMES = 5
+"""Further frames that have to prove a place after a knock in full."""
+
+NOTHING, UNKNOWN = -1, 1e12
+"""Stands for no fit, and the factor on another one's covariance that makes it tell nothing."""
 
 
 @cache
@@ -144,3 +167,108 @@ def larger(one: Protection, other: Protection) -> Protection:
     """The larger one of two bounds, for position and for rotation."""
     first, second = (one, other) if one.position_m >= other.position_m else (other, one)
     return Protection(first.position_m, max(first.rotation_rad, second.rotation_rad), first.risk, first.hypothesis)
+
+
+class Lasting(NamedTuple):
+    """What may have been wrong all along: g hypotheses about all of a gripper's edges with their ``name`` and ``prior``
+    (g,), and ``doubted``, the edges that each doubts; an opening that is doubted counts as one more edge.
+    """
+
+    name: tuple[str, ...]
+    prior: Array
+    doubted: tuple[frozenset[int], ...]
+
+    @classmethod
+    def of(cls, every: Hypotheses) -> Lasting:
+        """Those of hypotheses about all edges that don't begin at some moment."""
+        rows = np.flatnonzero(~every.sudden)
+        doubted = _doubted(every, np.arange(every.keep.shape[1]))
+        return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
+
+    def rows(self, hypotheses: Hypotheses, edges: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(g,) which of some hypotheses about the seen ``edges`` (v,) each of these is; -1 where nothing of what is
+        seen is beyond its doubt.
+        """
+        number = {doubted: k for k, doubted in reversed([*enumerate(_doubted(hypotheses, edges))])}
+        known = frozenset[int]().union(*number)
+        return np.array([number.get(doubted & known, NOTHING) for doubted in self.doubted], dtype=np.intp)
+
+
+def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[int]]:
+    own = [frozenset(edges[keep == 0.0].tolist()) for keep in hypotheses.keep]
+    for number in np.flatnonzero(hypotheses.opening).tolist():
+        own[number] = frozenset([-1])
+    return own
+
+
+class Anchor:
+    """The average of poses that proved themselves, from the first one on."""
+
+    def __init__(
+        self, lasting: Lasting, base_T: Array, fits: Refits, rows: NDArray[np.intp], now_s: float, knocked: bool = False
+    ):
+        """``knocked``: the first pose stands elsewhere than before."""
+        self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
+        self._to_confirm = CONFIRMING_FRAMES if knocked else 0
+        self._filters = _chosen(fits, rows, base_T)
+        self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
+        self._scatter = np.zeros((len(rows), 6))
+        self._weight = PRIOR_FRAMES
+        self._conclude()
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether so many frames have proved the place that a further one needs to prove less."""
+        return self._to_confirm <= 0
+
+    def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float) -> None:
+        """One more proven pose, by its frame's fits; ``rows`` (g,) of those; ``creep`` (6,) variances of the way since
+        the last.
+        """
+        self.now_s = now_s
+        self._to_confirm -= 1
+        frame = _chosen(fits, rows, self._base_T)
+        innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
+        self._filters, gains = follow(self._filters, frame, creep)
+        share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
+        self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
+        self._scatter += (share - self._scatter) / self._weight
+        # A frame that leaves a direction open says little of what frames usually tell.
+        worth = np.minimum((self._frames_variance / variance).min(axis=1), 1.0)
+        usual = worth**2 * gains / 6.0
+        self._frames_variance += usual[:, None] * (variance - self._frames_variance)
+        self._conclude()
+
+    def _conclude(self) -> None:
+        young = np.einsum("hii->hi", self._filters.covariance) / self._frames_variance
+        # The filters' own covariances, which this changes.
+        scale = np.sqrt(np.maximum(YOUNG_VARIANCE_RATIO / young, 1.0))
+        self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
+        young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
+        # Of errors that last, averaging takes away less than of independent ones.
+        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, SMALLEST_VARIANCE_RATIO * self._scatter)
+        scale = np.sqrt(kept / young)
+        self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
+        self.cam_T_grip = perturb(self._base_T, self._filters.shift[0])
+        self.covariance: Array = self._claimed[0]
+        self.of_model: Array = self._filters.of_model[0]
+
+    def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
+        """What may have been wrong all along with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,) of those,
+        ``wander`` (6,) being the variance of the way that the gripper may have gone since.
+
+        Under each hypothesis either the average or the frame tells: which knows more, but the frame where they differ.
+        """
+        at = perturbation_between(self._base_T, cam_T_grip)
+        frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
+        average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
+        told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
+        return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
+
+
+def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:
+    """The fits ``rows`` (g,), as shifts from a pose (4, 4)."""
+    covariance, unknown = fits.covariance[rows], rows == NOTHING
+    if unknown.any():
+        covariance[unknown] *= UNKNOWN
+    return Separation(fits.shifts(base_T)[rows], covariance, fits.of_model[rows])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import assert_never
 
 import numpy as np
 
@@ -110,11 +111,8 @@ class Renewal:
             )
         )
 
-    def want(self) -> str:
-        """An operator wants a new reference: it is measured as soon as the camera stands still for long enough.
-
-        Raises :class:`CommandRefused` where recalibration is switched off.
-        """
+    def _want(self) -> str:
+        """An operator wants a new reference: it is measured as soon as the camera stands still for long enough."""
         if self._settings.mode == "off":
             raise CommandRefused("recalibration is switched off (monitor.recalibration.mode)")
         self.wanted = True
@@ -191,12 +189,28 @@ class Renewal:
         sigma = np.sqrt(np.reshape(proposal.covariance, (6, 6)).diagonal())
         return bool((np.abs(away) <= np.maximum(6.0 * sigma, self._policy.worth_a_warning)).all())
 
-    def obey(self, command: Command, cam_T_grip: Array, now_s: float, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
-        """Accept, reject, undo or reset: what was done, in words, and what there is to tell.
+    def obey(
+        self, command: Command, cam_T_grip: Array, measurable: bool, now_s: float, stamp_ns: int
+    ) -> tuple[str, tuple[Alert, ...]]:
+        """Carry out what an operator asks, between two frames: what was done, in words, and the alerts of it.
 
-        Raises :class:`CommandRefused`; then nothing has changed.
+        ``cam_T_grip`` (4, 4) is where the gripper is; ``measurable``: the newest frame shows it.  ``now_s`` is the
+        frames' time, ``stamp_ns`` the wall clock's.  Raises :class:`CommandRefused`; then nothing has changed.
         """
         name, argument = command.name, command.argument
+        if name in (CommandName.STATE, CommandName.SNAPSHOT):
+            reference = self.book.current
+            return f"{self._policy.state}, {reference.reference_id} in force, revision {reference.revision}", ()
+        if name is CommandName.ACKNOWLEDGE:
+            seen = self._policy.alerts.acknowledge(argument)
+            if not seen:
+                which = f"no open alert {argument}" if argument else "no open alert"
+                raise CommandRefused(f"{which} that isn't acknowledged")
+            return "acknowledged: " + ", ".join(alert.alert_id for alert in seen), seen
+        if name is CommandName.RECALIBRATE:
+            if not measurable:
+                raise CommandRefused("nothing was measured in the newest frame")
+            return self._want(), ()
         if name is CommandName.REJECT:
             rejected = self._rejected = self.book.reject(argument)
             self.wanted = False
@@ -213,7 +227,7 @@ class Renewal:
         elif name is CommandName.RESET:
             self.book.reset(stamp_ns)
         else:
-            raise CommandRefused(f"{name} doesn't concern the reference")
+            assert_never(name)
         # What was wanted before is overtaken: it must not undo what was just asked for.
         self.wanted, self._rejected = False, None
         current = self.book.current

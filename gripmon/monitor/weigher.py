@@ -17,12 +17,13 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import Anchor, Lasting
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
+    Anchor,
     Anchored,
     Known,
+    Lasting,
     ModelError,
     Refits,
     larger,

@@ -25,8 +25,7 @@ from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdg
 from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 from gripmon.track.edges.profiles import Candidates, Edgels
-from gripmon.track.edges.robust_fit import RobustFit
-from gripmon.track.edges.uncertainty import Uncertainty, assess
+from gripmon.track.edges.robust_fit import RobustFit, Uncertainty, assess
 
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed error of an edge point, besides the floors in the settings: that of a step of 40 grey levels in noise of 1.5.

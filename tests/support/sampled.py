@@ -13,9 +13,8 @@ from gripmon.teach.accuracy import EDGE_POINT_SIGMA_PX, ForecastMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import Edgels
-from gripmon.track.edges.robust_fit import RobustFit
+from gripmon.track.edges.robust_fit import RobustFit, Uncertainty
 from gripmon.track.edges.settings import RobustFitSettings
-from gripmon.track.edges.uncertainty import Uncertainty
 from support.meters import box_gripper, difference
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 

@@ -9,13 +9,11 @@ from gripmon.track.edges.ends import (
 )
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
-from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, prior_information
+from gripmon.track.edges.readout import edge_sums, trace_of
+from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, NormalEquations, prior_information
 from gripmon.track.edges.settings import MeasurementSettings, SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement
-from gripmon.track.edges.sums import edge_sums
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
-from gripmon.track.edges.uncertainty import NormalEquations
-from gripmon.track.edges.views import trace_of
 from gripmon.track.edges.warming import warm_up
 
 __all__ = [

@@ -19,8 +19,8 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
 from gripmon.track.edges.evidence import FingerMeter
-from gripmon.track.edges.look import unevenness
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
+from gripmon.track.edges.profiles import unevenness
 from gripmon.track.edges.robust_fit import (
     RobustFit,
     fit_irls,

@@ -30,16 +30,20 @@ from gripmon.track.edges.profiles import (
     weigh,
 )
 from gripmon.track.edges.robust_fit import (
+    CONTRADICTION_RATIO,
     RESTART_WIDTH_PX,
+    NormalEquations,
     Prior,
     RobustFit,
+    Uncertainty,
+    assess,
     fit_irls,
     prior_information,
     refit_visible,
+    without_one_edge,
 )
 from gripmon.track.edges.settings import MeasurementSettings
 from gripmon.track.edges.taught import TaughtEdges
-from gripmon.track.edges.uncertainty import CONTRADICTION_RATIO, NormalEquations, Uncertainty, assess, without_one_edge
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen again, px."""

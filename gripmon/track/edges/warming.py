@@ -18,10 +18,9 @@ from gripmon.track.edges.profiles import (
     usual_width_px,
     weigh,
 )
-from gripmon.track.edges.robust_fit import Prior, fit_irls
+from gripmon.track.edges.robust_fit import Prior, assess, contradictions_without, fit_irls
 from gripmon.track.edges.settings import CornerSettings, EdgeSettings, RobustFitSettings, SamplingSettings
 from gripmon.track.edges.settling import corner_rms
-from gripmon.track.edges.uncertainty import assess, contradictions_without
 
 
 def warm_up() -> float:

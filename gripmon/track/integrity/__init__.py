@@ -1,8 +1,16 @@
 """What may be promised of a transform: bounds on its error under everything that may be wrong, at a stated risk."""
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
-from gripmon.track.integrity.quantiles import bounds
-from gripmon.track.integrity.separation import Doubts, Separation, Sums, follow, telling, warm_up, with_and_without
+from gripmon.track.integrity.separation import (
+    Doubts,
+    Separation,
+    Sums,
+    bounds,
+    follow,
+    telling,
+    warm_up,
+    with_and_without,
+)
 
 __all__ = [
     "Doubts",

@@ -26,9 +26,18 @@ from gripmon.track.edges.kernel import (
     WIDTH_DECAY,
 )
 from gripmon.track.edges.profiles import Edgels
-from gripmon.track.edges.robust_fit import _ROUNDS_AGAIN, GATE_PX, NOT_SOLVED, ROUNDS, Prior, RobustFit
+from gripmon.track.edges.robust_fit import (
+    _ROUNDS_AGAIN,
+    GATE_PX,
+    NOT_SOLVED,
+    ROUNDS,
+    NormalEquations,
+    Prior,
+    RobustFit,
+    Uncertainty,
+    _without,
+)
 from gripmon.track.edges.settings import RobustFitSettings
-from gripmon.track.edges.uncertainty import NormalEquations, Uncertainty, _without
 
 
 class Fit(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
-from gripmon.track.integrity.quantiles import _LOG_RISK, SQUARES, Tails
+from gripmon.track.integrity.separation import _LOG_RISK, SQUARES, Tails
 
 
 def add_up(
