@@ -39,6 +39,7 @@ from gripmon.track.edges import (
     FingertipMeter,
     MeasurementSettings,
     agreeing_fingers,
+    edge_residuals_px,
     evidence,
     kernel,
     lines,
@@ -182,7 +183,7 @@ def test_what_is_read_off_a_measurement_is_what_numpy_reads():
     finger = GRIPPER.edge_finger[sampled.layout.edge]
     shares = [consensus.supported[finger == f].sum() / sampled.ok[finger == f].sum() for f in (0, 1)]
     assert agreeing_fingers(found, GRIPPER) == pytest.approx(shares, rel=CLOSE) and min(shares) < 0.8 < max(shares)
-    residual_px, edge = using.edge_residuals_px(found), sampled.layout.edge[candidates.sample]
+    residual_px, edge = edge_residuals_px(found, GRIPPER), sampled.layout.edge[candidates.sample]
     for e in range(EDGES):
         own = (edge == e) & (consensus.weight > 0.0)
         mean = np.average(consensus.residual_px[own], weights=consensus.weight[own]) if own.any() else np.nan
@@ -221,7 +222,7 @@ def test_after_warming_up_no_frame_waits_for_the_compiler():
         found = measure(image)
         found.corner_rms_px(found.cam_T_grip)
         agreeing_fingers(found, GRIPPER)
-        meter().edge_residuals_px(found)
+        edge_residuals_px(found, GRIPPER)
         measure(image, using=FingertipMeter(CAMERA, gripper_from_dict(cube_model()), MeasurementSettings(), 0.0))
     contradictions_without(VOTES[4], prior(7), np.zeros(7), SETTINGS)
     assert signatures() == before

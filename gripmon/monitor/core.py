@@ -65,7 +65,7 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
-from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
+from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, edge_residuals_px, trace_of
 
 RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
 
@@ -222,7 +222,7 @@ class Monitor:
             alerts += self._renew(drift, evidence.explanation, frame.stamp_ns)
             if self.reference is not before:
                 drift, origin = self._drift(), Origin.RECALIBRATION
-        taken = self._tracker.taken(standing.measurement, self._settings.update_corners)
+        taken = self._tracker.taken(standing.measurement)
         smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._noted(), *alerts)
         return measured_record(
             frame, self.reference, judgement, standing, self._gripper, taken, origin, smoothed, drift, alerts
@@ -305,7 +305,7 @@ class Monitor:
         # Motion that the profiles can follow from frame to frame is not a jump.
         looked_far = measurement.effort is not Effort.NARROW
         reach_px = self._settings.corners.sampling.reach_px
-        jumped = looked_far and self._tracker.moved_px(measurement, before_T) > reach_px
+        jumped = looked_far and measurement.moved_px(before_T) > reach_px
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
         sigma = np.sqrt(self._covariance.diagonal())
         shares = agreeing_fingers(measurement, self._gripper)
@@ -322,7 +322,7 @@ class Monitor:
         if motion.stepped:
             self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
-        residual_px = self._tracker.edge_residuals_px(measurement)
+        residual_px = edge_residuals_px(measurement, self._gripper)
         odd = self._watches.add(measurement.blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
         if self._standing.knocked:
             self._analysis.knocked()

@@ -118,7 +118,8 @@ class Tracker:
         self._gripper, self._settings = gripper, settings
         self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
         self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
-        self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        self.floor: Array = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        """(6, 6) covariance of the systematic error that no averaging removes."""
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
         """By how much the model may have each finger out of its place; teaching measures that."""
         self.taught_digest = "" if taught is None else taught.digest
@@ -129,11 +130,6 @@ class Tracker:
         searcher = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         self.searching = GripperSearch(searcher, settings.corners.search, settings.policy.hold_s)
         self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
-
-    @property
-    def floor(self) -> Array:
-        """(6, 6) covariance of the systematic error that no averaging removes."""
-        return self._floor
 
     def measure(self, frame: Frame, cam_T_grip: Array, now_s: float, rivals: tuple[Array, ...] = ()) -> Measurement:
         """Measure about ``cam_T_grip`` (4, 4), where the gripper is expected, and look further when clearly fewer edge
@@ -219,8 +215,8 @@ class Tracker:
         """
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         if self._settings.measurement == "edges":
-            return cam_T_grip, covariance + self._floor
-        taken = self.taken(measurement, self._settings.update_corners)
+            return cam_T_grip, covariance + self.floor
+        taken = self.taken(measurement)
         if np.count_nonzero(taken) >= 3:
             covariance_xy = measurement.corners.joint_covariance_xy(taken)
             try:
@@ -235,7 +231,7 @@ class Tracker:
                     covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
             except DegenerateGeometry:
                 pass  # The corners that are left lie on a line: the edges still determine the motion.
-        return cam_T_grip, covariance + self._floor
+        return cam_T_grip, covariance + self.floor
 
     @staticmethod
     def _corner_update(
@@ -249,17 +245,9 @@ class Tracker:
             measurement.prediction.cam_T_grip[:3, 3],
         )
 
-    def taken(self, measurement: Measurement, variant: str) -> NDArray[np.bool_]:
-        """(c,) the usable corners that a variant takes."""
-        return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[variant])
-
-    def moved_px(self, measurement: Measurement, before_T: Array) -> float:
-        """How far the measured edges are from where ``before_T`` (4, 4) would have them."""
-        return self._meter.moved_px(measurement, before_T)
-
-    def edge_residuals_px(self, measurement: Measurement) -> Array:
-        """(e,) mean residual of each edge, px; NaN where it isn't seen."""
-        return self._meter.edge_residuals_px(measurement)
+    def taken(self, measurement: Measurement) -> NDArray[np.bool_]:
+        """(c,) the usable corners that the configured variant takes."""
+        return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[self._settings.update_corners])
 
     def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
         """What the fingers show one by one in a frame that was measured; takes some times as long as the measurement,

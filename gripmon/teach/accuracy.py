@@ -24,7 +24,7 @@ from gripmon.teach.visibility import Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
-from gripmon.track.edges.profiles import Candidates, Edgels
+from gripmon.track.edges.profiles import Candidates, Edgels, weigh
 from gripmon.track.edges.robust_fit import RobustFit, Uncertainty, assess
 
 EDGE_POINT_SIGMA_PX = 0.05
@@ -192,7 +192,8 @@ class ForecastMeter(FingertipMeter):
         zero, one = np.zeros(len(sample)), np.ones(len(sample))
         # Steps of 40 grey levels of 255 in noise of 1.5, in focus.
         step = np.where(self._polarity[prediction.layout.edge[sample]] < 0, -40.0, 40.0)
-        return self._votes(Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0), prediction)
+        candidates = Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0)
+        return weigh(candidates, prediction, self._polarity, self._settings.consensus)
 
     def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
         """Uses the assumed errors: there is no scatter here."""

@@ -274,10 +274,10 @@ class _Meter(FingertipMeter):
         poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_SPREAD)]
         starts = [Expected(pose, jaw_opening_m, jaw_opening_m) for pose in poses if pose[2, 3] > 0.0]
         for zoom, kept in zip((ZOOMS[2], ZOOMS[1]), _KEPT, strict=True):
-            self._zoom_to(zoom)
+            self._zoom = zoom
             places = sorted((self._tried(image, start) for start in starts), key=lambda at: -at.share)
             starts = [at.expected for at in places[:kept]]
-        self._zoom_to(ZOOMS[0])
+        self._zoom = ZOOMS[0]
         return max((self._tried(image, start) for start in starts), key=lambda at: at.share).expected
 
 

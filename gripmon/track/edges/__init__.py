@@ -7,7 +7,7 @@ from gripmon.track.edges.ends import (
     has_lone_end,
     inner_edges,
 )
-from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers
+from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers, edge_residuals_px
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
 from gripmon.track.edges.readout import edge_sums, trace_of
 from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, NormalEquations, prior_information
@@ -35,6 +35,7 @@ __all__ = [
     "TaughtEdges",
     "TaughtModel",
     "agreeing_fingers",
+    "edge_residuals_px",
     "edge_sums",
     "edges_at_ends",
     "has_lone_end",

@@ -21,7 +21,7 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
 from gripmon.track.edges.prediction import FEWEST_SAMPLES
-from gripmon.track.edges.profiles import Edgels
+from gripmon.track.edges.profiles import Edgels, weigh
 from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
 from gripmon.track.edges.settling import ZOOMS, Expected, Measurement, Settler
 
@@ -68,8 +68,9 @@ class FingerMeter(Settler):
         ``jaw_reported``: the robot reported the opening of this frame.  A frame in which nothing agrees gives evidence
         without stretches.
         """
-        self._zoom_to(measurement.candidates.zoom)
-        edgels = self._votes(measurement.candidates, measurement.prediction)
+        self._zoom = measurement.candidates.zoom
+        settings = self._settings.consensus
+        edgels = weigh(measurement.candidates, measurement.prediction, self._polarity, settings)
         places = [
             self._finger_place(image, measurement, edgels, finger, elsewhere)
             for finger in range(len(self._gripper.finger_ids))
@@ -93,13 +94,6 @@ class FingerMeter(Settler):
             cells=_cells(image) / measurement.candidates.full_scale,
             reach_px=zoom * self._settings.sampling.reach_px,
         )
-
-    def edge_residuals_px(self, measurement: Measurement) -> Array:
-        """(e,) weighted mean of each edge's residuals in the joint fit, px; NaN for edges that none of them shows."""
-        consensus, edge = measurement.consensus, measurement.prediction.layout.edge
-        sample, edges = measurement.candidates.sample, len(self._gripper.edge_ids)
-        residual_px: Array = edge_means(sample, consensus.weight, consensus.residual_px, edge, edges)
-        return residual_px
 
     def _finger_place(
         self, image: Image, measurement: Measurement, edgels: Edgels, finger: int, elsewhere: tuple[Array, ...]
@@ -173,6 +167,14 @@ def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
     finger, fingers = gripper.edge_finger, len(gripper.finger_ids)
     shares = agreeing_shares(finger, prediction.layout.edge, prediction.ok, measurement.consensus.supported, fingers)
     return list(shares.tolist())
+
+
+def edge_residuals_px(measurement: Measurement, gripper: Gripper) -> Array:
+    """(e,) weighted mean of each edge's residuals in the joint fit, px; NaN for edges that it doesn't rest on."""
+    consensus, edge = measurement.consensus, measurement.prediction.layout.edge
+    sample, edges = measurement.candidates.sample, len(gripper.edge_ids)
+    residual_px: Array = edge_means(sample, consensus.weight, consensus.residual_px, edge, edges)
+    return residual_px
 
 
 @compiled

@@ -134,7 +134,7 @@ class FingertipMeter(FingerMeter):
         ``patience`` allows, it is looked for elsewhere, last of all where ``search`` proposes (if None, a search in
         this image): another place than one that may be true must show the fingers' ends.
         """
-        self._take(jaw_reported)
+        self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         expected = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
@@ -146,7 +146,7 @@ class FingertipMeter(FingerMeter):
         if best.consensus.share < satisfied:
             best = self._at_rivals(image, expected, rivals, best)
         if best.consensus.share >= self._settings.consensus.trusted_share:
-            self._zoom_to(self._fitting_zoom(best))
+            self._zoom = self._fitting_zoom(best)
         at_once = patience.at_once and best.consensus.share < satisfied
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
@@ -167,9 +167,6 @@ class FingertipMeter(FingerMeter):
     def _looks_at_ends(self, prediction: Prediction) -> bool:
         """Whether an end of a finger might be seen in this view."""
         return bool(np.isin(prediction.layout.edges, self._at_ends).any())
-
-    def _take(self, jaw_reported: bool) -> None:
-        self._prior = self._prior_reported if jaw_reported else self._prior_unreported
 
     def _at_rivals(self, image: Image, expected: Expected, rivals: tuple[Array, ...], best: Measurement) -> Measurement:
         """The best of the expected place and of others at which the gripper was; what has been fitted from there once
@@ -235,7 +232,7 @@ class FingertipMeter(FingerMeter):
         chosen = self._zoom
         others = [zoom for zoom in ZOOMS if zoom != chosen]
         for zoom in others[self._lost % len(others) :][:1] if self._lost else others:
-            self._zoom_to(zoom)
+            self._zoom = zoom
             beat = ELSEWHERE_SHARE_RATIO * best.consensus.share
             least = PROMISING * max(beat, self._settings.consensus.trusted_share)
             if self._rough_share(image, expected) < least:
@@ -244,7 +241,7 @@ class FingertipMeter(FingerMeter):
             # A coarse zoom reaches far and sees little: only where the edges are as blurred as it expects.
             if other.consensus.share > beat and self._fitting_zoom(other) == zoom:
                 best, chosen = other, zoom
-        self._zoom_to(chosen)
+        self._zoom = chosen
         if best.consensus.share > 0.0:
             # What is sampled there is chosen again: it was for a place that may be poor.
             self._prediction.pop(chosen, None)
@@ -300,8 +297,8 @@ class FingertipMeter(FingerMeter):
         """Where the gripper may be, best first, by a search in the whole neighbourhood; takes the time of many
         frames.
         """
-        self._zoom_to(sought.zoom)
-        self._take(sought.jaw_reported)
+        self._zoom = sought.zoom
+        self._prior = self._prior_reported if sought.jaw_reported else self._prior_unreported
         search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
         poses = search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search)
         places = self._near_places(image, expected) if sought.near else []

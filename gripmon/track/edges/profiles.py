@@ -27,6 +27,9 @@ BESIDE_PX = (2.0, 5.0)
 the zoomed image: clear of its blur.
 """
 
+FEWEST_WIDTHS = 20
+"""Edge points from which the blur is told."""
+
 _NEAR, _FAR = (round(way_px / STEP_PX) for way_px in BESIDE_PX)
 
 
@@ -151,17 +154,13 @@ def find_candidates(
         ok,
         kernel.taps,
         zoom * STEP_PX,
-        _threshold(kernel, noise, grey_range, settings),
+        max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range),
         zoom * noise * kernel.curvature_noise_px,
         _NEAR,
         _FAR,
         grey_range,
     )
     return Candidates(sample, offset_px, step, sigma_px, width_px, cut_off, noise, grey_range, zoom)
-
-
-def _threshold(kernel: _Kernel, noise: float, grey_range: float, settings: EdgeSettings) -> float:
-    return max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
 
 
 def estimate_noise(profiles: Array, quantum: float = 1.0) -> float:
@@ -214,10 +213,14 @@ def weigh(
     return Edgels(candidates, prediction, *worth)
 
 
-def usual_width_px(candidates: Candidates, weight: Array) -> tuple[int, float]:
-    """How many candidates have a ``weight`` (k,), and the median width of these, px; 0 without any."""
+def blur_px(candidates: Candidates, weight: Array, settings: EdgeSettings) -> float | None:
+    """Standard deviation of the blur across edges, px: of the median width of the candidates that have a ``weight``
+    (k,), what the derivative of Gaussian leaves; None with few of them.
+    """
     count, width_px = profile_kernel.usual_width(candidates.width_px, weight)
-    return count, width_px
+    if count < FEWEST_WIDTHS:
+        return None
+    return math.sqrt(max(width_px**2 - (candidates.zoom * settings.blur_px) ** 2, 0.0))
 
 
 def unevenness(image: Image, prediction: Prediction) -> float:

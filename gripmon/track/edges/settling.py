@@ -20,13 +20,13 @@ from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, pred
 from gripmon.track.edges.profiles import (
     Candidates,
     Edgels,
+    blur_px,
     estimate_noise,
     find_candidates,
     full_scale,
     profile_offsets_px,
     quantum,
     read_profiles,
-    usual_width_px,
     weigh,
 )
 from gripmon.track.edges.robust_fit import (
@@ -56,9 +56,6 @@ ZOOMS = (1, 2, 4)
 
 BLUR_AT_ZOOM = (0.7, 1.7)
 """Blur of the edges at zoom 1, px, below which the next finer and above which the next coarser zoom fits better."""
-
-FEWEST_WIDTHS = 20
-"""Edge points from which the blur is told."""
 
 
 class Effort(enum.IntEnum):
@@ -107,6 +104,10 @@ class Measurement:
         prediction = self.prediction
         opened_m = jaw_opening_m - prediction.jaw_opening_m
         return prediction.corners.cam_m + opened_m * prediction.corners.jaw_rate
+
+    def moved_px(self, cam_T_grip: Array) -> float:
+        """How far the measured gripper shows from where ``cam_T_grip`` (4, 4) puts it, px."""
+        return self.prediction.moved_px(perturbation_between(cam_T_grip, self.cam_T_grip))
 
     def corner_rms_px(self, cam_T_grip: Array) -> float | None:
         """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without
@@ -218,8 +219,13 @@ class Settler:
                 edgels, consensus, uncertainty = found
         if consensus is not moved:
             expected = self._moved(prediction, consensus.xi, expected)
-        geometry = self._geometry_of(prediction)
-        corners = intersect_edges(edgels, consensus, uncertainty.line_weight, geometry, settings.corners)
+        if self._geometry is None or self._geometry[0] is not prediction:
+            self._geometry = prediction, CornerGeometry.of(self._gripper, prediction, settings.corners)
+        corners = intersect_edges(edgels, consensus, uncertainty.line_weight, self._geometry[1], settings.corners)
+        jaw_known_sigma_m = jaw_surprise = 0.0
+        if len(self._prior) == 7:
+            jaw_known_sigma_m = float(self._prior[6] ** -0.5)
+            jaw_surprise = float((consensus.xi[6] - prior.mean[6]) * np.sqrt(prior.information[6]))
         return Measurement(
             prediction,
             edgels.candidates,
@@ -229,12 +235,12 @@ class Settler:
             expected.jaw_opening_m,
             uncertainty.covariance,
             expected.jaw_reported_m,
-            self._jaw_surprise(consensus.xi, prior),
+            jaw_surprise,
             Effort.NARROW,
             uncertainty.normal,
             expected.jaw_reported_m,
-            float(self._prior[6] ** -0.5) if len(self._prior) == 7 else 0.0,
-            self._blur_px(edgels.candidates, consensus.weight),
+            jaw_known_sigma_m,
+            blur_px(edgels.candidates, consensus.weight, settings.edges),
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:
@@ -247,16 +253,6 @@ class Settler:
             return min(2 * self._zoom, ZOOMS[-1])
         return max(self._zoom // 2, 1) if blur_px < finer * self._zoom else self._zoom
 
-    def _blur_px(self, candidates: Candidates, weight: Array) -> float | None:
-        count, width_px = usual_width_px(candidates, weight)
-        if count < FEWEST_WIDTHS:
-            return None
-        kernel_px = candidates.zoom * self._settings.edges.blur_px
-        return math.sqrt(max(width_px**2 - kernel_px**2, 0.0))
-
-    def _zoom_to(self, zoom: int) -> None:
-        self._zoom = zoom
-
     @property
     def _reach_px(self) -> float:
         return self._zoom * self._settings.sampling.reach_px
@@ -267,18 +263,15 @@ class Settler:
         """
         kept, laid_out = self._prediction.get(self._zoom), self._laid_out.get(self._zoom)
         if kept is not None and len(kept.uv_px):
-            start = self._from_prediction(kept, expected)
+            start = np.empty(len(self._prior))
+            start[:6] = perturbation_between(kept.cam_T_grip, expected.cam_T_grip)
+            start[6:] = expected.jaw_opening_m - kept.jaw_opening_m
             if kept.moved_px(start) <= self._settings.relinearise_px:
                 return kept, start
         if laid_out is None or self._layout_moved_px(laid_out[1], expected) > RELAYOUT_PX:
             laid_out = self._laid_out[self._zoom] = self._lay_out(expected), self._corner_pixels(expected)
         prediction = self._prediction[self._zoom] = self._predict(laid_out[0], expected)
         return prediction, np.zeros(len(self._prior))
-
-    def _geometry_of(self, prediction: Prediction) -> CornerGeometry:
-        if self._geometry is None or self._geometry[0] is not prediction:
-            self._geometry = prediction, CornerGeometry.of(self._gripper, prediction, self._settings.corners)
-        return self._geometry[1]
 
     def _lay_out(self, expected: Expected) -> EdgeLayout:
         sampling = self._settings.sampling
@@ -314,30 +307,10 @@ class Settler:
         profiles = read_profiles(image, prediction.map_x, prediction.map_y)
         noise = estimate_noise(profiles, quantum(image))
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges, self._zoom)
-        return self._votes(candidates, prediction)
-
-    def _votes(self, candidates: Candidates, prediction: Prediction) -> Edgels:
-        return weigh(candidates, prediction, self._polarity, self._settings.consensus)
+        return weigh(candidates, prediction, self._polarity, settings.consensus)
 
     def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
         return assess(edgels, consensus, self._prior)
-
-    def _jaw_surprise(self, xi: Array, prior: Prior) -> float:
-        """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a
-        jaw.
-        """
-        return float((xi[6] - prior.mean[6]) * np.sqrt(prior.information[6])) if len(self._prior) == 7 else 0.0
-
-    def _from_prediction(self, prediction: Prediction, expected: Expected) -> Array:
-        """(m,) from the prediction's pose and opening to the expected ones."""
-        xi = np.empty(len(self._prior))
-        xi[:6] = perturbation_between(prediction.cam_T_grip, expected.cam_T_grip)
-        xi[6:] = expected.jaw_opening_m - prediction.jaw_opening_m
-        return xi
-
-    def moved_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
-        """How far the measured gripper shows from where ``cam_T_grip`` had put it, px."""
-        return measurement.prediction.moved_px(perturbation_between(cam_T_grip, measurement.cam_T_grip))
 
     def _prior_about(self, prediction: Prediction, expected: Expected) -> Prior:
         mean, information = np.zeros(len(self._prior)), self._prior

@@ -11,11 +11,11 @@ from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction
 from gripmon.track.edges.profiles import (
+    blur_px,
     estimate_noise,
     find_candidates,
     profile_offsets_px,
     read_profiles,
-    usual_width_px,
     weigh,
 )
 from gripmon.track.edges.robust_fit import Prior, assess, contradictions_without, fit_irls
@@ -44,7 +44,7 @@ def warm_up() -> float:
     geometry = CornerGeometry(nothing, nothing, nothing, np.zeros((0, 3)), places, np.zeros(1, dtype=np.intp))
     corners = intersect_edges(edgels, consensus, line_weight, geometry, CornerSettings())
     prediction.moved_px(consensus.xi)
-    usual_width_px(candidates, consensus.weight)
+    blur_px(candidates, consensus.weight, EdgeSettings())
     here, edge, points_m = prediction.cam_T_grip, prediction.layout.edge, prediction.corners.cam_m
     corner_rms(corners.xy, corners.usable, points_m, here, here, prediction.corners.d_uv_d_xy)
     agreeing_shares(np.zeros(1, dtype=np.intp), edge, prediction.ok, consensus.supported, 1)

@@ -17,7 +17,7 @@ from gripmon.track.edges.profile_kernel import (
     SHARPNESS,
     SURELY,
 )
-from gripmon.track.edges.profiles import _FAR, _NEAR, Candidates, Edgels, _kernel, _pixels, _threshold
+from gripmon.track.edges.profiles import _FAR, _NEAR, Candidates, Edgels, _kernel, _pixels
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 
@@ -55,7 +55,8 @@ def find_candidates(
     height = np.abs(response)
     left, middle, right = height[:, :-2], height[:, 1:-1], height[:, 2:]
     curved = (middle - left) + (middle - right)
-    peak = (middle > left) & (middle >= right) & (middle > _threshold(kernel, noise, grey_range, settings))
+    least = max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
+    peak = (middle > left) & (middle >= right) & (middle > least)
     # A flat top is no peak of anything but rounding.
     peak &= (curved > FLAT_PEAK_CURVATURE * middle) & ok[:, None]
     sample, column = np.nonzero(peak)
