@@ -87,5 +87,5 @@ def test_an_explanation_that_fails_costs_no_frame(monkeypatch: pytest.MonkeyPatc
     for frame in frames_of("bump")[0]:
         record = monitor.process(frame)
         assert record.seq == frame.seq and record.cam_T_grip is not None
-        texts.add(monitor._analysis.known.text)
+        texts.add(monitor._analysis.causes.known.text)
     assert texts == {"", "cause analysis failed: RuntimeError: singular"}

@@ -1,4 +1,8 @@
-"""When to ask what moved: as long as something looks wrong, and at first, for what is normal."""
+"""What a frame says of the calibration: whether the gripper has moved against the reference, whether anything looks
+wrong, and what explains it.
+
+What explains it is asked as long as something looks wrong, and at first, for what is normal.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-from gripmon.judge.causes import CauseJudge
-from gripmon.judge.stream import CALM_FRAMES
+import numpy as np
+
+from gripmon.judge.causes import CauseJudge, Watches
+from gripmon.judge.drift import Baseline, Lasting, MotionWatch
+from gripmon.judge.policy import Evidence
+from gripmon.judge.stream import CALM_FRAMES, StreamFault, StreamWatch
+from gripmon.model.camera import Camera
 from gripmon.model.errors import in_short
-from gripmon.model.records import Array, Cause, EdgeEvidence, Explanation, Frame
+from gripmon.model.geometry import from_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturbation_between
+from gripmon.model.records import Array, Cause, Drift, EdgeEvidence, Explanation, Frame, ReferenceRecord
+from gripmon.monitor.answers import gripper_astray
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.standing import Standing
+from gripmon.monitor.tracker import Tracker
+from gripmon.track.edges import Effort, Measurement, agreeing_fingers, edge_residuals_px
 
 LULL_FRAMES = 3
 """Frames in a row in which nothing looks wrong up to which an explanation holds."""
@@ -19,6 +36,9 @@ GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20)
 """Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn,
 and after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
 """
+
+DOUBTED_FRAMES = 5
+"""Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
 
 FEWEST_FRAMES = CONCLUDED_AT[0]
 """Frames that must look wrong before it is said why: a change of light spoils one or two."""
@@ -147,3 +167,139 @@ class CauseAnalysis:
             return _Finding(episode, work(judge), judge.wants_baseline)
 
         self._backlog.add(task, *when_s)
+
+
+class FrameAnalysis:
+    """Gathers, frame by frame, what the decision rests on."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        tracker: Tracker,
+        configured: ReferenceRecord,
+        error: Array | None,
+    ):
+        """``configured``: the reference of the configuration, and its ``error`` (6,) as far as that is known."""
+        self._gripper, self._tracker = gripper, tracker
+        self._reach_px = settings.corners.sampling.reach_px
+        self.stream = StreamWatch(settings.stream)
+        self.watch = MotionWatch(settings.drift)
+        jaw = settings.jaw_sigma_m, settings.jaw_offset_sigma_m
+        self.causes = CauseAnalysis(CauseJudge(camera, gripper, settings.causes, np.zeros(6), *jaw))
+        self.of_configured = Baseline(_sigma(configured), settings.policy.settle_frames, error)
+        """What the configured reference was off by at the start."""
+        self._watches = Watches(len(gripper.finger_ids))
+        self._astray = 0
+
+    def rebase(self, reference: ReferenceRecord, configured: bool) -> None:
+        """Drift is reckoned from ``reference``, which is the ``configured`` one or a newer one."""
+        self._ref_cam_T_grip = from_record(reference.cam_T_grip)
+        if configured:
+            self.baseline, covariance = self.of_configured, np.zeros((6, 6))
+        else:
+            self.baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
+            covariance = np.reshape(reference.covariance, (6, 6))
+        self._baseline_weighed = False
+        self.watch.reset(covariance)
+        self.causes.rebase(_sigma(reference))
+        if reference.restores is None:
+            # How edges look from where the camera is now; an undo doesn't move it.
+            self._watches = Watches(len(self._gripper.finger_ids))
+
+    def begin_frame(self, frame: Frame, now_s: float) -> tuple[StreamFault, ...]:
+        """What is wrong with the stream; its rate goes to the drift test, and what is due of the causes counts."""
+        self.causes.catch_up(now_s)
+        faults = self.stream.add(frame)
+        for fault in faults:
+            if fault.kind == "gap":
+                self.causes.interrupted()
+        frames_per_s = self.stream.frames_per_s
+        if frames_per_s is not None:
+            self.watch.set_frames_per_s(frames_per_s)
+        return faults
+
+    def evidence(
+        self,
+        frame: Frame,
+        standing: Standing,
+        drift: Drift,
+        before_T: Array,
+        swing: Array,
+        doubtful: bool,
+        now_s: float,
+    ) -> Evidence:
+        """What a measured frame says for and against the reference.
+
+        ``before_T`` (4, 4): where the gripper was expected; ``swing`` (6,): variance of the mount's vibration;
+        ``doubtful``: the stream is.
+        """
+        measurement, cam_T_grip, covariance = standing.measurement, standing.cam_T_grip, standing.covariance
+        # Motion that the search lines can follow from frame to frame is not a jump.
+        looked_far = measurement.effort is not Effort.NARROW
+        jumped = looked_far and measurement.moved_px(before_T) > self._reach_px
+        shift = perturbation_between(self._ref_cam_T_grip, cam_T_grip)
+        shares = agreeing_fingers(measurement, self._gripper)
+        astray = gripper_astray(measurement, shares)
+        self._astray = self._astray + 1 if astray else 0
+        # Few doubtful frames tell nothing; many are how it is now.
+        if 0 < self._astray < DOUBTED_FRAMES or not standing.believed:
+            motion = self.watch.skip()
+        else:
+            since_start, changes, bias, finer = self._since_start(shift, covariance), covariance, None, standing.finer
+            if finer is not None:
+                changes, bias = finer.of_change, Lasting(finer.of_bias, finer.renewed)
+            motion = self.watch.add(since_start, changes, now_s, bias)
+        if motion.stepped:
+            self.causes.moved_again()
+        reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
+        residual_px = edge_residuals_px(measurement, self._gripper)
+        odd = self._watches.add(measurement.blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
+        if standing.knocked:
+            self.causes.knocked()
+        wrong = astray or motion.present or motion.suspicious or odd
+        error = self.baseline.error
+        return Evidence(
+            shift,
+            np.sqrt(covariance.diagonal()),
+            drift.translation_m,
+            drift.rotation_rad,
+            motion,
+            jumped,
+            self.explain(frame, measurement, wrong, standing.believed, now_s),
+            astray,
+            doubtful,
+            standing.protection,
+            standing.where_it_was,
+            swing,
+            standing.believed,
+            since_first=error is not None and bool(error.any()),
+            unproven=standing.unproven,
+        )
+
+    def _since_start(self, shift: Array, covariance: Array) -> Array | None:
+        """The shift (6,) less the reference's error; None while that isn't known yet."""
+        since_start = self.baseline.subtract(shift)
+        if since_start is not None and not self._baseline_weighed:
+            self._baseline_weighed = True
+            if self.baseline.error is not None and self.baseline.error.any():
+                # It was measured before one background: what such a frame claims, it is uncertain by.
+                self.watch.set_reference_covariance(covariance)
+        return since_start
+
+    def explain(self, frame: Frame, measurement: Measurement, wrong: bool, usual: bool, now_s: float) -> Explanation:
+        """What explains what the frames show, of which this is one more: see :meth:`CauseAnalysis.ask`."""
+        if self.stream.repeats:
+            return self.causes.known  # the image is an old one, what the robot reports is not
+        tracker, here = self._tracker, self._ref_cam_T_grip
+
+        def gather(kept: Frame) -> EdgeEvidence:
+            return tracker.evidence(kept, measurement, here)
+
+        return self.causes.ask(wrong, usual, frame, gather, here, now_s)
+
+
+def _sigma(reference: ReferenceRecord) -> Array:
+    """(6,) standard deviations of a reference, m and rad."""
+    return np.asarray(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()))

@@ -9,7 +9,6 @@ from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.judge.policy import Evidence, Judgement
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamFault
-from gripmon.model.gripper import Gripper
 from gripmon.model.poses import motion_between, to_record
 from gripmon.model.records import (
     Alert,
@@ -81,14 +80,14 @@ def measured_record(
     reference: ReferenceRecord,
     judgement: Judgement,
     standing: Standing,
-    gripper: Gripper,
-    taken: NDArray[np.bool_],
+    corners: tuple[CornerRecord, ...],
     origin: Origin,
     smoothed: Smoothed | None,
     drift: Drift,
     alerts: tuple[Alert, ...],
+    has_jaw: bool,
 ) -> FrameRecord:
-    """The record of a frame whose pose stands; ``taken`` (c,): corners used."""
+    """The record of a frame whose pose stands."""
     measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
     return FrameRecord(
         seq=frame.seq,
@@ -103,8 +102,8 @@ def measured_record(
         reference_id=reference.reference_id,
         revision=reference.revision,
         rms_px=measurement.corner_rms_px(cam_T_grip),
-        jaw_opening_m=measurement.jaw_opening_m if gripper.has_jaw else None,
-        corners=corner_records(measurement, gripper.corner_ids, taken),
+        jaw_opening_m=measurement.jaw_opening_m if has_jaw else None,
+        corners=corners,
         alerts=alerts,
         reason=judgement.reason,
         name=frame.name,

@@ -10,20 +10,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from gripmon.judge.causes import CauseJudge, Watches
-from gripmon.judge.drift import Baseline, Lasting, MotionWatch
 from gripmon.judge.inspection import inspect
-from gripmon.judge.policy import Evidence, Policy
+from gripmon.judge.policy import Evidence, Judgement, Policy
 from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.recalibrate import Refusal as Refused
 from gripmon.judge.references import CommandRefused, Keep
 from gripmon.judge.smoothing import PoseAverage
-from gripmon.judge.stream import StreamFault, StreamWatch
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
-from gripmon.model.poses import perturbation_between, to_record
+from gripmon.model.poses import to_record
 from gripmon.model.records import (
     Alert,
     Array,
@@ -31,8 +28,6 @@ from gripmon.model.records import (
     CommandName,
     CommandReply,
     CornerFault,
-    Drift,
-    EdgeEvidence,
     Explanation,
     Frame,
     FrameRecord,
@@ -47,14 +42,14 @@ from gripmon.model.records import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.monitor.analysis import CauseAnalysis
+from gripmon.monitor.analysis import FrameAnalysis
 from gripmon.monitor.answers import (
     NoteTaker,
     after_restart,
+    corner_records,
     drift_between,
     flat,
     frozen,
-    gripper_astray,
     measured_record,
     of_stream,
     smoothed_record,
@@ -65,12 +60,9 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
-from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, edge_residuals_px, trace_of
+from gripmon.track.edges import Measurement, TaughtEdges, trace_of
 
 RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
-
-DOUBTED_FRAMES = 5
-"""Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
 
 
 class Monitor:
@@ -95,13 +87,6 @@ class Monitor:
         # What was taught belongs to the gripper's edges: a new reference doesn't change it.
         self._tracker = Tracker(camera, gripper, settings, taught)
         self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
-        self._watch = MotionWatch(settings.drift)
-        self._stream = StreamWatch(settings.stream)
-        judge = CauseJudge(
-            camera, gripper, settings.causes, np.zeros(6), settings.jaw_sigma_m, settings.jaw_offset_sigma_m
-        )
-        self._analysis = CauseAnalysis(judge)
-        self._watches = Watches(len(gripper.finger_ids))
         self._average = PoseAverage(settings.smoothing)
         self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
@@ -112,14 +97,12 @@ class Monitor:
         self._measured_s: float | None = None
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
-        self._astray = 0
         self._jumped = False  # since the last frame that was believed
-        self._baseline_weighed = False
         self._restarted = state is not None  # and not yet said whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state, keep)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
-        sigma = np.sqrt(np.reshape(self._renewal.book.configured.covariance, (6, 6)).diagonal())
-        self._configured_baseline = Baseline(sigma, settings.policy.settle_frames, error)
+        configured = self._renewal.book.configured
+        self._analysis = FrameAnalysis(camera, gripper, settings, self._tracker, configured, error)
         self._begin()
         last = None if state is None else state.cam_T_grip
         self._located = last is not None  # here, or before a restart
@@ -127,7 +110,7 @@ class Monitor:
         self._trust.resume(None if last is None else self._cam_T_grip, self.reference, state)
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
-            self._watch.resume(moved=self._policy.drifting)
+            self._analysis.watch.resume(moved=self._policy.drifting)
 
     @property
     def reference(self) -> ReferenceRecord:
@@ -152,13 +135,12 @@ class Monitor:
     @property
     def state_revision(self) -> int:
         """Grows with each change of what :meth:`state` gives, the last transform aside."""
-        return (
-            self._renewal.book.changes + self._policy.alerts.changes + int(self._configured_baseline.error is not None)
-        )
+        known = self._analysis.of_configured.error is not None
+        return self._renewal.book.changes + self._policy.alerts.changes + int(known)
 
     def state(self) -> MonitorState:
         """What has to survive a restart."""
-        error = self._configured_baseline.error
+        error = self._analysis.of_configured.error
         return MonitorState(
             self._renewal.book.history,
             self._renewal.book.proposal,
@@ -178,94 +160,87 @@ class Monitor:
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
-        self._analysis.catch_up(self._now_s)
-        faults = self._look_at_stream(frame)
-        refusal = inspect(frame, self._camera, self._gripper, self._stream.pixels) or frozen(faults)
+        faults = self._analysis.begin_frame(frame, self._now_s)
+        self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)
+        refusal = inspect(frame, self._camera, self._gripper, self._analysis.stream.pixels) or frozen(faults)
         if refusal is not None:
             self._newest = None
-            return self._unmeasured(
-                frame,
-                f"{refusal[0]}: {refusal[1]}",
-                CornerFault.FRAME_REFUSED,
-                refusal=refusal[0],
-                explanation=of_stream(faults),
-            )
-        before_T = self._cam_T_grip
-        rivals = self._trust.rivals(self._ref_cam_T_grip)
-        measurement = self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
-        standing = self._trust.judge(frame, measurement, self._now_s)
+            reason = f"{refusal[0]}: {refusal[1]}"
+            return self._unmeasured(frame, reason, CornerFault.FRAME_REFUSED, of_stream(faults), refusal[0])
+        # Where the gripper is, and by how much that may be off.
+        before_T, rivals = self._cam_T_grip, self._trust.rivals(self._ref_cam_T_grip)
+        self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
+        standing = self._trust.judge(frame, self._newest, self._now_s)
         if standing is None:
-            explanation = self._explain(frame, measurement, wrong=True, usual=False)
-            return self._unmeasured(
-                frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation=explanation
-            )
-        self._standing = standing
-        measurement = self._newest = standing.measurement
+            explanation = self._analysis.explain(frame, self._newest, wrong=True, usual=False, now_s=self._now_s)
+            return self._unmeasured(frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation)
+        self._standing, self._newest = standing, standing.measurement
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
-        drift = self._drift()
-        evidence = self._evidence(frame, measurement, before_T, drift, doubtful=bool(faults))
+        # Whether that is still the reference, and what has moved if it isn't.
+        drift = drift_between(self._ref_cam_T_grip, self._cam_T_grip)
+        swing, doubtful = self._trust.swing, bool(faults)
+        evidence = self._analysis.evidence(frame, standing, drift, before_T, swing, doubtful, self._now_s)
         self._jumped = self._jumped or evidence.jumped
         if standing.believed:
             self._follow(standing, evidence.motion)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
-        alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
-            if evidence.motion.frames == 0 or not standing.believed:
-                judgement = replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
-            else:
-                self._restarted = False
-                alerts = (after_restart(self.reference, evidence, self._settings.policy.warn_m), *alerts)
+            judgement = self._after_restart(judgement, evidence)
+        alerts = judgement.alerts
+        # Past the limit, or when an operator wants it, the still frames become a new reference.
         origin = Origin.UPDATE
         if self._renewal.collect(frame, standing, judgement):
-            before = self.reference
-            alerts += self._renew(drift, evidence.explanation, frame.stamp_ns)
+            before, cause = self.reference, evidence.explanation
+            alerts += self._renewal.recalibrate(drift, self._cam_T_grip, cause, self._now_s, frame.stamp_ns)
             if self.reference is not before:
-                drift, origin = self._drift(), Origin.RECALIBRATION
-        taken = self._tracker.taken(standing.measurement)
+                self._begin()
+                drift, origin = drift_between(self._ref_cam_T_grip, self._cam_T_grip), Origin.RECALIBRATION
         smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._noted(), *alerts)
+        taken = self._tracker.taken(standing.measurement)
+        corners = corner_records(standing.measurement, self._gripper.corner_ids, taken)
         return measured_record(
-            frame, self.reference, judgement, standing, self._gripper, taken, origin, smoothed, drift, alerts
+            frame, self.reference, judgement, standing, corners, origin, smoothed, drift, alerts, self._gripper.has_jaw
         )
+
+    def _after_restart(self, judgement: Judgement, evidence: Evidence) -> Judgement:
+        """Suspect until a frame says whether the picture fits the reference; then that is told."""
+        if evidence.motion.frames == 0 or not evidence.believed:
+            return replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
+        self._restarted = False
+        told = after_restart(self.reference, evidence, self._settings.policy.warn_m)
+        return replace(judgement, alerts=(told, *judgement.alerts))
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
-        assert self._covariance is not None
         self._tracker.learn(standing.measurement, opening=not standing.grasped)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()
-        quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
-        self._average.add(self._cam_T_grip, self._covariance, quiet)
+        vibrates_anew = self._analysis.watch.vibrates_anew
+        quiet = self._policy.state is State.TRACKING and not motion.stepped and not vibrates_anew
+        self._average.add(standing.cam_T_grip, standing.covariance, quiet)
         if motion.stepped and not jumped:
             self._average.step(motion.step_frames)
-
-    def _renew(self, drift: Drift, explanation: Explanation, stamp_ns: int) -> tuple[Alert, ...]:
-        """Past the limit, or when an operator wants it: the still frames become a new reference."""
-        before = self.reference
-        alerts = self._renewal.recalibrate(drift, self._cam_T_grip, explanation, self._now_s, stamp_ns)
-        if self.reference is not before:
-            self._begin()
-        return alerts
 
     def learn(self) -> None:
         """Learn from the newest frame what nothing waits for, in some 2 ms; :meth:`process` does it first if no one
         has.
         """
         self._trust.learn()
-        self._watch.learn()
+        self._analysis.watch.learn()
 
     @property
     def pending(self) -> bool:
         """Whether there is something to do for :meth:`run_pending`."""
-        return self._tracker.searching.pending or self._analysis.pending
+        return self._tracker.searching.pending or self._analysis.causes.pending
 
     def run_pending(self) -> None:
         """Search for a lost gripper and work out what moved, which takes the time of some frames, in another thread
         than :meth:`process` if need be.  Without it :meth:`process` does that; the records are the same.
         """
         self._tracker.searching.run_pending()
-        self._analysis.run_pending()
+        self._analysis.causes.run_pending()
 
     def trace(self) -> MeasurementTrace | None:
         """The pixels behind the newest record; None if its frame was refused."""
@@ -276,7 +251,7 @@ class Monitor:
     def notes(self) -> MonitorNotes:
         """What the newest record was judged by; costs some microseconds."""
         measured = self._newest is not None and self._newest.trusted
-        return self._notes.take(self._watch, self._baseline, self._average, measured)
+        return self._notes.take(self._analysis.watch, self._analysis.baseline, self._average, measured)
 
     def _tick(self, frame: Frame) -> None:
         """Time passes to the frame's stamp; a clock that was set back stops it for this one frame only."""
@@ -285,90 +260,6 @@ class Monitor:
         self._stamp_s = stamp_s
         self._now_s += elapsed_s
         self._average.wander(elapsed_s)
-
-    def _look_at_stream(self, frame: Frame) -> tuple[StreamFault, ...]:
-        """What is wrong with the stream, told of in the next record; its rate, for the drift test."""
-        faults = self._stream.add(frame)
-        for fault in faults:
-            if fault.kind == "gap":
-                self._analysis.interrupted()
-        self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)
-        frames_per_s = self._stream.frames_per_s
-        if frames_per_s is not None:
-            self._watch.set_frames_per_s(frames_per_s)
-        return faults
-
-    def _evidence(
-        self, frame: Frame, measurement: Measurement, before_T: Array, drift: Drift, doubtful: bool
-    ) -> Evidence:
-        assert self._covariance is not None and self._standing is not None
-        # Motion that the profiles can follow from frame to frame is not a jump.
-        looked_far = measurement.effort is not Effort.NARROW
-        reach_px = self._settings.corners.sampling.reach_px
-        jumped = looked_far and measurement.moved_px(before_T) > reach_px
-        shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
-        sigma = np.sqrt(self._covariance.diagonal())
-        shares = agreeing_fingers(measurement, self._gripper)
-        astray = gripper_astray(measurement, shares)
-        self._astray = self._astray + 1 if astray else 0
-        # Few doubtful frames tell nothing; many are how it is now.
-        if 0 < self._astray < DOUBTED_FRAMES or not self._standing.believed:
-            motion = self._watch.skip()
-        else:
-            covariance, bias, finer = self._covariance, None, self._standing.finer
-            if finer is not None:
-                covariance, bias = finer.of_change, Lasting(finer.of_bias, finer.renewed)
-            motion = self._watch.add(self._since_start(shift), covariance, self._now_s, bias)
-        if motion.stepped:
-            self._analysis.moved_again()
-        reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
-        residual_px = edge_residuals_px(measurement, self._gripper)
-        odd = self._watches.add(measurement.blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
-        if self._standing.knocked:
-            self._analysis.knocked()
-        wrong = astray or motion.present or motion.suspicious or odd
-        explanation = self._explain(frame, measurement, wrong, usual=self._standing.believed)
-        return Evidence(
-            shift,
-            sigma,
-            drift.translation_m,
-            drift.rotation_rad,
-            motion,
-            jumped,
-            explanation,
-            astray,
-            doubtful,
-            self._standing.protection,
-            self._standing.where_it_was,
-            self._trust.swing,
-            self._standing.believed,
-            since_first=self._baseline.error is not None and bool(self._baseline.error.any()),
-            unproven=self._standing.unproven,
-        )
-
-    def _since_start(self, shift: Array) -> Array | None:
-        """The shift (6,) less the reference's error; None while that isn't known yet."""
-        assert self._covariance is not None
-        since_start = self._baseline.subtract(shift)
-        if since_start is not None and not self._baseline_weighed:
-            self._baseline_weighed = True
-            if self._baseline.error is not None and self._baseline.error.any():
-                # It was measured before one background: what such a frame claims, it is uncertain by.
-                self._watch.set_reference_covariance(self._covariance)
-        return since_start
-
-    def _explain(self, frame: Frame, measurement: Measurement, wrong: bool, usual: bool) -> Explanation:
-        if self._stream.repeats:
-            return self._analysis.known  # the image is an old one, what the robot reports is not
-        here = self._ref_cam_T_grip
-
-        def gather(kept: Frame) -> EdgeEvidence:
-            return self._tracker.evidence(kept, measurement, here)
-
-        return self._analysis.ask(wrong, usual, frame, gather, here, self._now_s)
-
-    def _drift(self) -> Drift:
-        return drift_between(self._ref_cam_T_grip, self._cam_T_grip)
 
     def command(self, command: Command, stamp_ns: int) -> CommandReply:
         """Do what an operator asks, between two frames; what can't be done is refused and changes nothing."""
@@ -388,29 +279,20 @@ class Monitor:
     def _begin(self) -> None:
         """Drift is reckoned from the reference in force."""
         book = self._renewal.book
-        covariance = np.reshape(self.reference.covariance, (6, 6))
-        self._ref_cam_T_grip = self._renewal.ref_cam_T_grip
-        if book.in_force == book.configured:
-            self._baseline, covariance = self._configured_baseline, np.zeros((6, 6))
-        else:
-            self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
-        self._baseline_weighed = False
-        self._watch.reset(covariance)
+        configured = book.in_force == book.configured
+        self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
+        self._analysis.rebase(self.reference, configured)
         self._trust.refer(self.reference)
-        if book.in_force != book.configured:
+        if not configured:
             self._trust.rebase(self.reference)
-        self._analysis.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
-        if self.reference.restores is None:
-            # How edges look from where the camera is now; an undo doesn't move it.
-            self._watches = Watches(len(self._gripper.finger_ids))
 
     def _unmeasured(
         self,
         frame: Frame,
         reason: str,
         fault: CornerFault,
+        explanation: Explanation,
         refusal: Refusal | None = None,
-        explanation: Explanation | None = None,
     ) -> FrameRecord:
         """The last transform held with a covariance that grows, or none when it is too old."""
         judgement = self._policy.unmeasured(self._now_s, frame.stamp_ns, refusal, self._measured_s, explanation)
@@ -434,7 +316,7 @@ class Monitor:
             cam_T_grip=to_record(self._cam_T_grip),
             covariance=flat(self._covariance + growth),
             smoothed=smoothed_record(self._average, self._tracker.floor + growth),
-            drift=self._drift(),
+            drift=drift_between(self._ref_cam_T_grip, self._cam_T_grip),
             protection=None if standing is None else self._trust.held(standing, growth, unseen_s, hidden),
         )
 

@@ -236,8 +236,3 @@ class Renewal:
             text += f"; it restores {current.restores}"
         kind = AlertKind.RESTORED if current.restores else AlertKind.RECALIBRATED
         return text, (*self._policy.recalibrated(now_s), Alert(kind, Cause.UNKNOWN, Severity.WARNING, text))
-
-    @property
-    def ref_cam_T_grip(self) -> Array:
-        """The transform (4, 4) of the reference in force."""
-        return from_record(self.book.current.cam_T_grip)

@@ -34,7 +34,7 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges
-from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
 
@@ -83,7 +83,6 @@ class Weigher:
         self._along = tracker.along  # (e,) which edges run along the fingers
         self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
         self._lone = has_lone_end(gripper)
-        self._floor = _floor(settings)
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
@@ -115,7 +114,7 @@ class Weigher:
 
     def sigma(self, now_s: float) -> Array:
         """(6,) standard deviations of where it is expected, m and rad."""
-        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor.diagonal()))
+        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._tracker.floor.diagonal()))
 
     def weigh(
         self,
@@ -139,44 +138,39 @@ class Weigher:
             return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG), False)
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
-        hypotheses = fits.hypotheses
-        # What would need a knock of the mount besides is not what happened.
+        hypotheses, anchor = fits.hypotheses, self.anchor
+        # The gate: a hypothesis that needs a knock of the mount besides is not what happened.
         holds = anchored.surprise <= CONTRADICTION_SQUARE
         displaced = not holds[0] and explained is None
-        again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
+        # The proof: the fingers' ends, where they may not be something else.
+        again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
-        kept = None if explained is None else hypotheses.keep[explained] > 0.0
         may_have_slid = self._lone and self._may_have_slid(measurement, cam_T_grip, displaced)
+        kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
+        # The priors: only that of the ends depends on the frame.  Then the probability that nothing but the frame tells
+        # where the fingers are along themselves.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
-        # How probable it is that only the frame tells where the fingers are along themselves.
         alone = 1.0
-        if self.anchor is not None and not (displaced or may_have_slid):
-            alone = self._knocked(now_s - self.anchor.now_s, hidden=True)
+        if anchor is not None and not (displaced or may_have_slid):
+            alone = self._knocked(now_s - anchor.now_s, hidden=True)
         jumped = alone * prior[hypotheses.ends] > risk
+        # What may have been wrong all along: by the frame, or by the anchor, to whose place the ends belong then.
         made_of = fits
-        if displaced or jumped or self.anchor is None:
-            counts = np.ones_like(hypotheses.sudden)  # what knocks the mount bends a finger, too
-            if self.anchor is None:
-                counts = ~hypotheses.sudden  # a finger is taken to be straight at first
-            rows = counts.copy()
-            rows[hypotheses.ends] = True
-            all_along = fits.doubts(cam_T_grip, prior).among(rows)
-            if jumped:
-                without, more = self._without_ends(measurement)
-                if displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
-                    proven, made_of = True, without
-                besides = alone * prior[hypotheses.ends] * hypotheses.prior
-                all_along += without.doubts(cam_T_grip, besides).among(counts & more)
+        if displaced or jumped or anchor is None:
+            all_along, without = self._doubts_of_frame(measurement, fits, prior, cam_T_grip, alone if jumped else None)
+            if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
+                proven, made_of = True, without
         else:
-            # The ends belong to where it was: what else may have been wrong all along the average knows, too.
-            all_along = self.anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
-        if self.anchor is None:
-            now = protection_of(all_along, risk)
+            all_along = anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        if anchor is None:
+            protection = protection_of(all_along, risk)
             if displaced:
-                now = larger(now, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
-            return Trust(now, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
+                away = perturbation_between(self._expected[0], cam_T_grip)
+                protection = larger(protection, self._not_as_expected(away))
+            return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
+        # What may be wrong since the anchor, and the most probable of it.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
@@ -187,6 +181,27 @@ class Weigher:
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and hypotheses.grasp >= 0 and bool(possible[hypotheses.grasp] > 0.0)
         return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
+
+    def _doubts_of_frame(
+        self, measurement: Measurement, fits: Refits, prior: Array, cam_T_grip: Array, alone: float | None
+    ) -> tuple[Doubts, Refits | None]:
+        """What may have been wrong all along by a frame's ``fits`` alone, with probabilities ``prior`` (h,).
+
+        ``alone``: if what looks like the fingers' ends may be something else, the probability that only the frame tells
+        where they are; the fits without the ends are given, too, then.
+        """
+        hypotheses = fits.hypotheses
+        # What knocks the mount bends a finger, too; but a finger is taken to be straight at first.
+        counts = ~hypotheses.sudden if self.anchor is None else np.ones_like(hypotheses.sudden)
+        rows = counts.copy()
+        rows[hypotheses.ends] = True
+        doubts = fits.doubts(cam_T_grip, prior).among(rows)
+        if alone is None:
+            return doubts, None
+        endless, more = hypotheses.without_ends()
+        without = Refits(measurement, endless, self._tracker.floor, self._model)
+        besides = alone * prior[hypotheses.ends] * hypotheses.prior
+        return doubts + without.doubts(cam_T_grip, besides).among(counts & more), without
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
@@ -210,7 +225,7 @@ class Weigher:
         at first that of the reference, and each after it; the rest a person has to say, by a new reference.
         """
         if self._slid is None:
-            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._floor
+            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor
             way = perturbation_between(self._reference_T, cam_T_grip)
             displaced = bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
         else:
@@ -275,11 +290,6 @@ class Weigher:
         knocked = self._knocked(unseen_s, hidden=True)
         return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
-    def _without_ends(self, measurement: Measurement) -> tuple[Refits, NDArray[np.bool_]]:
-        """The fits where all that was taken for the fingers' ends is something else, and (h,) which have more wrong."""
-        hypotheses, more = self._about(measurement.normal.edge)[0].without_ends()
-        return Refits(measurement, hypotheses, self._floor, self._model), more
-
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether a pose (4, 4) is as certain as it has to be by some fits: by those without the ends it needs none.
         Curved and tapered fingers tell by themselves where they are along themselves.
@@ -311,7 +321,7 @@ class Weigher:
             covariance = covariance.copy()
             covariance.flat[::7] += wander
             known = Known(expected_T, covariance, of_model)
-            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model, known)
+            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, self._model, known)
             self._newest = measurement, now_s, fits
         fits = self._newest[2]
         assert fits.anchored is not None
@@ -354,11 +364,6 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
     return hypotheses_of(names, *of_each, may_open)
 
 
-def _floor(settings: MonitorSettings) -> Array:
-    """(6, 6) covariance of the error that no averaging removes."""
-    return np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
-
-
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
     return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids))
 
@@ -373,5 +378,5 @@ def foresee_protection(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
     model = _model_error(tracker, gripper)
-    doubts = Refits(measurement, hypotheses, _floor(settings), model).doubts(measurement.cam_T_grip, hypotheses.prior)
+    doubts = Refits(measurement, hypotheses, tracker.floor, model).doubts(measurement.cam_T_grip, hypotheses.prior)
     return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
