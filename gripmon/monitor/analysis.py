@@ -40,9 +40,6 @@ and after how many more each further one: gathering takes as long as measuring, 
 DOUBTED_FRAMES = 5
 """Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
 
-FEWEST_FRAMES = CONCLUDED_AT[0]
-"""Frames that must look wrong before it is said why: a change of light spoils one or two."""
-
 CONFIRMED_AFTER_S = 1.0
 """From a further conclusion's frame to the one that it counts in, where a cause is known, so that it isn't urgent; and
 where frames come one right after the other, as in a replay, a second of them takes longer than the 20 to 40 ms of this.
@@ -142,8 +139,10 @@ class CauseAnalysis:
 
     @property
     def known(self) -> Explanation:
-        """What the frames so far have shown; for a frame that says nothing new."""
-        return self._explanation if self._asked >= FEWEST_FRAMES and self._calm <= LULL_FRAMES else Explanation()
+        """What the frames so far have shown; for a frame that says nothing new.  Nothing before the first conclusion is
+        due: a change of light spoils one or two frames.
+        """
+        return self._explanation if self._asked >= CONCLUDED_AT[0] and self._calm <= LULL_FRAMES else Explanation()
 
     def catch_up(self, now_s: float) -> None:
         """Take over what is due.  What has failed costs an explanation, not a frame."""

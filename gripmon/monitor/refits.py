@@ -19,7 +19,7 @@ from gripmon.judge.smoothing import MOST_SCATTER, SMALLEST_VARIANCE_RATIO
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, follow, telling, with_and_without
 
 SIGMA_INFLATION = 1.2
@@ -77,13 +77,6 @@ class ModelError(NamedTuple):
     finger: NDArray[np.intp]
     fingers: int
 
-    def pulls(self, normal: NormalEquations, rotation: Array) -> tuple[Array, NDArray[np.intp], int]:
-        """(v, m) by which that pulls at a fit, edge by edge: a finger that is longer, by all its edges together; and
-        the finger (v,) of each, of how many.  ``rotation`` (3, 3) from gripper to camera.
-        """
-        by_edge = normal.information[:, :, :3] @ (rotation @ (self.sigma_m * self.axis_grip))
-        return by_edge, self.finger[normal.edge], self.fingers
-
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
     """The protection levels at a ``risk``."""
@@ -113,8 +106,10 @@ class Refits:
             fitted_m = measurement.prediction.jaw_opening_m + float(xi[6])
             held[~hypotheses.opening, 6, 6] = max(measurement.jaw_known_sigma_m, 1e-6) ** -2
             pull[:, 6] = held[:, 6, 6] * (measurement.jaw_known_m - fitted_m)
-        pulls = model.pulls(normal, self._fit_T[:3, :3])
-        of = normal.pull, normal.information, normal.middle, pulls, hypotheses.keep, held, pull
+        # A longer finger pulls at a fit by all its edges together.
+        longer = normal.information[:, :, :3] @ (self._fit_T[:3, :3] @ (model.sigma_m * model.axis_grip))
+        of_model = longer, model.finger[normal.edge], model.fingers
+        of = normal.pull, normal.information, normal.middle, of_model, hypotheses.keep, held, pull
         self.anchored: Anchored | None = None
         """The same with the anchor; None where nothing is known of one."""
         if known is None:

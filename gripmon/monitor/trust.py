@@ -29,9 +29,6 @@ from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 PROOF_EVERY_FRAMES = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames; also after one without proof."""
 
-ALONG_Z = np.array([0.0, 0.0, 1.0])
-"""The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
-
 
 class _Candidate(NamedTuple):
     """A place where the gripper may be: its measurement, the pose (4, 4) with its covariance (6, 6), and its worth."""
@@ -55,7 +52,9 @@ class Integrity:
     ):
         self._tracker, self._policy = tracker, settings.policy
         self._weigher = Weigher(tracker, gripper, settings, reference)
-        self._look = GripperLook(camera, gripper, tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z)
+        # Fingers without a direction of their own are slid out of the gripper.
+        axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
+        self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
         self._finer = None
         if settings.look.enabled:
@@ -155,7 +154,7 @@ class Integrity:
         trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
-        if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
+        if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
             self._ends_seen = trust.proven
         here = _Candidate(measurement, cam_T_grip, covariance, trust)
@@ -242,7 +241,8 @@ class Integrity:
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """What to publish of a place, and whether it becomes the anchor."""
         measurement, cam_T_grip, covariance, trust = candidate
-        if trust.most_probable is not None and not trust.proven and (trust.displaced or self._short(trust)):
+        left_open = trust.most_probable is not None and not trust.proven
+        if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
@@ -299,10 +299,6 @@ class Integrity:
         if not self._look.ready or frame.image is None:
             return False
         return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_ODDS)
-
-    def _short(self, trust: Trust) -> bool:
-        """Whether the bound is above the alert limit."""
-        return past_alert_limit(trust.protection, self._policy) is not None
 
 
 def _reaching(standing: Standing, other_T: Array) -> Standing:

@@ -60,8 +60,6 @@ that the rate of knocks over all the time says too little.
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
 
-NOT_OFF = np.zeros((1, 6))
-
 CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
 
@@ -317,7 +315,7 @@ class Weigher:
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
-            of_model = NOT_OFF if self.anchor is None else self.anchor.of_model
+            of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
             covariance = covariance.copy()
             covariance.flat[::7] += wander
             known = Known(expected_T, covariance, of_model)

@@ -55,11 +55,6 @@ PROBE_REACH_PX = 4.0
 CONTINUATION_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
 
-CLEAR_OF_CURVE_PX = 2.0 * CONTINUATION_PX
-"""So far beside a continued side its curve is not a continuation of it, with as much again for what it is off
-by, px.
-"""
-
 CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
 
@@ -368,7 +363,8 @@ class FingerEnds:
         way = way / length
         curve = uv_px[layout.edge == places.curve[number]] - from_px
         forward, aside = curve @ way, np.abs(curve @ np.array([-way[1], way[0]]))
-        clear = forward[(forward > 0.0) & (aside > CLEAR_OF_CURVE_PX)]
+        # As much again as a continuation may be off by: the prediction is off by something, too.
+        clear = forward[(forward > 0.0) & (aside > 2.0 * CONTINUATION_PX)]
         return (here, from_px + clear.min() * way, way) if len(clear) else None
 
 

@@ -22,15 +22,13 @@ from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 _CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
 
-BESIDE_PX = (2.0, 5.0)
-"""From where to where the grey levels beside an edge are averaged, and texture is looked for that may shift it, px of
-the zoomed image: clear of its blur.
+BESIDE_SAMPLES = (4, 10)
+"""From where to where beside an edge grey levels are averaged and texture is looked for that may shift it, in samples
+of a search line: 2 to 5 px of the zoomed image, clear of the edge's blur.
 """
 
 FEWEST_WIDTHS = 20
 """Edge points from which the blur is told."""
-
-_NEAR, _FAR = (round(way_px / STEP_PX) for way_px in BESIDE_PX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +154,7 @@ def find_candidates(
         zoom * STEP_PX,
         max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range),
         zoom * noise * kernel.curvature_noise_px,
-        _NEAR,
-        _FAR,
+        *BESIDE_SAMPLES,
         grey_range,
     )
     return Candidates(sample, offset_px, step, sigma_px, width_px, cut_off, noise, grey_range, zoom)
@@ -232,7 +229,7 @@ def unevenness(image: Image, prediction: Prediction) -> float:
     """
     profiles = read_profiles(image, prediction.map_x, prediction.map_y)
     middle = profiles.shape[1] // 2
-    near, far = (min(round(way_px / STEP_PX), middle) for way_px in BESIDE_PX)
+    near, far = (min(samples, middle) for samples in BESIDE_SAMPLES)
     right = profiles[:, middle + near : middle + far + 1].mean(axis=1)
     left = profiles[:, middle - far : middle - near + 1].mean(axis=1)
     square, count, all_of_them = 0.0, 0, []

@@ -35,7 +35,7 @@ more than such a part; texture gives 1 to 2.
 NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
 
 ROUNDS = 6
-_ROUNDS_AGAIN = ROUNDS // 2  # from a start that is nearly right
+"""Re-weightings at most; half as many from a start that is nearly right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def fit_irls(
         prior.information,
         start,
         settings.start_width_px if width_px is None else width_px,
-        ROUNDS if width_px is None else _ROUNDS_AGAIN,
+        ROUNDS if width_px is None else ROUNDS // 2,
         settings.start_width_px,
         GATE_PX * candidates.zoom,
         settings.support_sigmas,

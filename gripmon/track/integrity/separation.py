@@ -35,8 +35,12 @@ SQUARES = chdtri(np.array([[1.0], [3.0]]), 10.0**_LOG_RISK)
 """
 
 GUIDE_STEP = 0.25
-_STEPS = np.arange(0.0, SQUARES.max(), GUIDE_STEP)
-GUIDE = np.stack([np.searchsorted(row, _STEPS, side="right").clip(1, len(row) - 1) - 1 for row in SQUARES])
+GUIDE = np.stack(
+    [
+        np.searchsorted(row, np.arange(0.0, SQUARES.max(), GUIDE_STEP), side="right").clip(1, len(row) - 1) - 1
+        for row in SQUARES
+    ]
+)
 """(2, n) where a square's place in the table is found from on, for each :data:`GUIDE_STEP`."""
 
 

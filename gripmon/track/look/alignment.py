@@ -23,13 +23,11 @@ from gripmon.model.records import Array, Image, LookPixels
 from gripmon.track.look import kernel
 from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.blocks import BLOCK_PX, INNER, blocks_in, gradients, jacobian_of, most_telling
+from gripmon.track.look.core import CHANGED_CORRELATION, FEWEST_VIEWS
 from gripmon.track.look.placed import LINEAR_PX, Placed, motion_between, moved
 
 LEARNT_BLOCKS, MEASURED_BLOCKS = 128, 32
 """Of which the most telling ones are measured, a thousand pixels; twice as many scatter by a tenth less."""
-
-FEWEST_VIEWS = 12
-"""Learnt frames from which a pixel's scatter is known to a fifth."""
 
 MOST_VIEWS = 256
 """Frames that a mean reaches back: a change shows as scatter for as long, then as the new look."""
@@ -54,9 +52,6 @@ UNLIKE = 2.0
 """Root mean square of a block's residuals, in standard deviations, from which it looks otherwise than learnt: noise
 gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is learnt again: what covered it is gone.
 """
-
-RENEWED = 0.5
-"""Correlation of a block with what it was first, below which it shows something else."""
 
 _KINDS = ("<u2", "<f4", "<f4", "<f4", "<f4", "<u2")
 """How places, means, variances, first means, counts and unlike frames are kept."""
@@ -108,7 +103,9 @@ class LookAlignment:
         """(p,) blocks that are known and textured; and those (p,) that look as at first."""
         now, first = (m - m.mean(axis=1, keepdims=True) for m in (self._mean, self._at_first))
         told = (self._count >= FEWEST_VIEWS) & (np.sqrt((first**2).mean(axis=1)) > 2.0 * LEAST_DN)
-        return told, (now * first).sum(axis=1) > RENEWED * np.sqrt((now**2).sum(axis=1) * (first**2).sum(axis=1))
+        return told, (now * first).sum(axis=1) > CHANGED_CORRELATION * np.sqrt(
+            (now**2).sum(axis=1) * (first**2).sum(axis=1)
+        )
 
     def renew(self) -> None:
         """The present look counts as the first."""

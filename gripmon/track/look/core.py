@@ -36,7 +36,9 @@ FORGET_S = 4.0 * 3600.0
 """Time after which a frame counts 1/e, s: a shift of work; dirt and wear take hours, lamps and daylight minutes."""
 
 FEWEST_VIEWS = 12
-"""Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
+"""Frames with new backgrounds before a look counts: what isn't the gripper's then averages to 1/sqrt(12) = 0.3, and a
+pixel's scatter is known to 1/sqrt(24) = 0.2.
+"""
 
 MANY_VIEWS, RELEARN_S = 100, 0.1
 """Frames learnt one after the other, what isn't the gripper's averages to a tenth; then so many seconds apart: frames
@@ -46,17 +48,16 @@ of a fast camera show nearly the same, and forgetting takes hours.
 LAY_OUT_AGAIN_S = 60.0
 """Pause before fingers that weren't in view are looked for again, s: it takes as long as some frames."""
 
-CHANGED_BACKGROUND_CORRELATION = 0.5
-"""Correlation of a patch beside a finger with the last learnt frame's, below which its background is another one."""
+CHANGED_CORRELATION = 0.5
+"""Correlation of some pixels with what they showed before, below which they show something else: a patch beside a
+finger another background, a block on it another look.
+"""
 
 CHANGED_BACKGROUND_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
 """Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
-
-KEPT_SLIDE_TRIES = FEWEST_VIEWS // len(SLIDES_M)
-"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
 
 ELSEWHERE_M = 2e-3
 """From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
@@ -73,10 +74,16 @@ DISAGREEING_FRAME_WEIGHT = 0.125
 SMALLEST_CONTRAST_LEVELS = 1.0
 """Contrast (root mean square) below which a patch has none, in steps of grey."""
 
-_U, _V = np.meshgrid(np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS), np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS))
-_LIGHT = np.linalg.qr(np.column_stack([np.ones(POINTS), _U.ravel(), _V.ravel()]))[0]
-_TEXTURE = (np.eye(POINTS) - _LIGHT @ _LIGHT.T).astype(np.float32)
-"""(POINTS, POINTS), symmetric: takes brightness and both slopes out of a patch."""
+
+def _without_light() -> Array:
+    """(POINTS, POINTS), symmetric: takes brightness and both slopes out of a patch."""
+    side = np.linspace(-1.0, 1.0, PATCH_SIDE_POINTS)
+    u, v = np.meshgrid(side, side)
+    light = np.linalg.qr(np.column_stack([np.ones(POINTS), u.ravel(), v.ravel()]))[0]
+    return np.eye(POINTS) - light @ light.T
+
+
+_TEXTURE = _without_light().astype(np.float32)
 
 
 class GripperLook:
@@ -308,7 +315,8 @@ class GripperLook:
         if self.views >= len(SLIDES_M):  # before, there is little that a slid image could agree with
             now = slice(pair, pair + 2)
             tried = self._tried[now]
-            self._tried[now] = np.maximum(kept * tried, np.minimum(tried, KEPT_SLIDE_TRIES)) + 1.0
+            # Old tries are forgotten down to as many as the fewest views hold of each slide.
+            self._tried[now] = np.maximum(kept * tried, np.minimum(tried, FEWEST_VIEWS // len(SLIDES_M))) + 1.0
             self._chance[now] += (agree[1:] - self._chance[now]) / self._tried[now, None]
 
     def _choose(self) -> None:
@@ -348,4 +356,4 @@ def another_background(now: NDArray[np.float32], before: NDArray[np.float32]) ->
     """Whether enough of the patches beside the fingers (n, POINTS) show something else than before."""
     if not len(now):
         return True  # nothing but the gripper is in view
-    return bool(np.mean(np.einsum("np,np->n", now, before) < CHANGED_BACKGROUND_CORRELATION) > CHANGED_BACKGROUND_SHARE)
+    return bool(np.mean(np.einsum("np,np->n", now, before) < CHANGED_CORRELATION) > CHANGED_BACKGROUND_SHARE)

@@ -18,8 +18,10 @@ from gripmon.model.records import Array, Image
 ROUNDS = 2
 """Re-weightings: a third one changed no scatter that was measured in its second digit."""
 
-FAR = 3.0
-"""Standard deviations that a residual counts for at most in the frame's own scatter."""
+CLIP_SIGMAS = 3.0
+"""Standard deviations that a residual counts for at most in the frame's own scatter, and a grey level in a strip's
+mean: a bright thing in front of a finger weighs no more than a line on it.
+"""
 
 GAINS = (0.25, 4.0)
 """Of a patch's light; beyond, it shows something else."""
@@ -112,7 +114,7 @@ def _residuals(
         for n in range(values.shape[1]):
             if weight[p, n] > 0.0:
                 count += 1
-                squares += min(off[n] * off[n] * weight[p, n], FAR * FAR)
+                squares += min(off[n] * off[n] * weight[p, n], CLIP_SIGMAS * CLIP_SIGMAS)
     return max(1.0, math.sqrt(squares / max(count, 1)))
 
 

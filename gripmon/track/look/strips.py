@@ -19,6 +19,7 @@ from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
+from gripmon.track.look.kernel import CLIP_SIGMAS
 
 LENGTH_PX, REACH_PX = 64, 40
 """How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: 3 to 9 mm
@@ -33,11 +34,6 @@ STRIP_LINES = 3
 
 SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
 """A tenth of a millimetre must do no harm, and light that falls off along the finger says nothing."""
-
-CLIP_RMS = 3.0
-"""Root mean squares of what was learnt that a grey level counts at most: a bright thing in front of a finger weighs no
-more than a line on it.
-"""
 
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
@@ -91,7 +87,7 @@ class FingerStrips:
         if not self.ready:
             return None
         strips = self._read(image, cam_T_grip, jaw_opening_m)
-        most = CLIP_RMS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
+        most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
         np.clip(strips, -most, most, out=strips)
         learnt = np.clip(self._mean, -most, most)
         # Gain and brightness are free: light changes.
@@ -155,7 +151,7 @@ class FingerStrips:
         gripper = self._gripper
         points_m = gripper.points_grip_m(jaw_opening_m)
         eye_m = invert(cam_T_grip)[:3, 3]
-        rows = []
+        rows, across = [], ((np.arange(STRIP_LINES) + 0.5) / STRIP_LINES).tolist()
         for edge in np.flatnonzero(~self._along & gripper.edge_view(points_m, eye_m).visible).tolist():
             ends = gripper.edge_points[edge].tolist()
             for face in self._faces(points_m, eye_m, ends):
@@ -163,7 +159,7 @@ class FingerStrips:
                 # At the fingers' roots there are edges across them, too.
                 if ways and ways[0][2] < 0.0:
                     both = np.stack([ways[0], ways[-1]])
-                    rows += [(points_m[ends], both, share, gripper.edge_finger[edge]) for share in _ACROSS]
+                    rows += [(points_m[ends], both, share, gripper.edge_finger[edge]) for share in across]
         if not rows:
             return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp)
         share = np.array([[1.0 - row[2], row[2]] for row in rows])
@@ -199,6 +195,3 @@ class FingerStrips:
             passed |= further
             begin += sorted(further)
         return out
-
-
-_ACROSS = ((np.arange(STRIP_LINES) + 0.5) / STRIP_LINES).tolist()

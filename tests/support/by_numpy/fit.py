@@ -27,7 +27,6 @@ from gripmon.track.edges.kernel import (
 )
 from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.robust_fit import (
-    _ROUNDS_AGAIN,
     GATE_PX,
     NOT_SOLVED,
     ROUNDS,
@@ -59,7 +58,7 @@ def fit_irls(
     shared = edgels.edge_spread_px**2
     xi, spread, spread_px = start, 1.0, LARGEST_SPREAD_PX
     near = _near(edgels, start, max(width, TUKEY * LARGEST_SPREAD_PX))
-    rounds = ROUNDS if width_px is None else _ROUNDS_AGAIN
+    rounds = ROUNDS if width_px is None else ROUNDS // 2
     for round_ in range(rounds):
         if round_:
             width *= WIDTH_DECAY

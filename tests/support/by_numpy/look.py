@@ -8,7 +8,7 @@ import numpy as np
 
 from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array, Image
-from gripmon.track.look.kernel import FAR, GAINS, ROUNDS
+from gripmon.track.look.kernel import CLIP_SIGMAS, GAINS, ROUNDS
 
 
 def read(image: Image, weights: Array, base_px: Array, flow: Array, motion: Array) -> Array:
@@ -44,7 +44,7 @@ def align(
         residual = _residual(values, mean, robust) - jacobian @ motion
         counted = (weight > 0.0) & np.isfinite(residual)
         squares = np.where(counted, residual**2 * weight, 0.0)
-        scatter = max(1.0, math.sqrt(np.minimum(squares, FAR**2).sum() / max(np.count_nonzero(counted), 1)))
+        scatter = max(1.0, math.sqrt(np.minimum(squares, CLIP_SIGMAS**2).sum() / max(np.count_nonzero(counted), 1)))
         robust = np.where(counted, weight * np.clip(1.0 - squares / (TUKEY * scatter) ** 2, 0.0, None) ** 2, 0.0)
         pull_of_patch = np.einsum("pn,pni->pi", robust * np.where(counted, residual, 0.0), jacobian)
         information = np.einsum("pn,pni,pnj->ij", robust, jacobian, jacobian) + np.diag(prior)

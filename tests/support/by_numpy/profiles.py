@@ -17,7 +17,7 @@ from gripmon.track.edges.profile_kernel import (
     SHARPNESS,
     SURELY,
 )
-from gripmon.track.edges.profiles import _FAR, _NEAR, Candidates, Edgels, _kernel, _pixels
+from gripmon.track.edges.profiles import BESIDE_SAMPLES, Candidates, Edgels, _kernel, _pixels
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 
@@ -91,7 +91,8 @@ def _unrest(response: Array, sample: NDArray[np.intp], column: NDArray[np.intp])
     columns = response.shape[1]
     row = sample * columns
     last = columns - 1
-    ends = [np.minimum(np.maximum(column + k, 0), last) for k in (-_FAR, -_NEAR, _NEAR, _FAR)]
+    near, far = BESIDE_SAMPLES
+    ends = [np.minimum(np.maximum(column + k, 0), last) for k in (-far, -near, near, far)]
     a, b, c, d = (running[row + end] for end in ends)
     total = (b - a) + (d - c)
     count = (ends[1] - ends[0]) + (ends[3] - ends[2])
