@@ -304,7 +304,7 @@ def test_a_wrongly_reported_jaw_opening_is_noticed_and_mostly_corrected(reported
     opened = plain_scenario(jaw=JawScript(knots=((0.0, 0.036), (1.0, 0.036))))
     found = measure(picture(opened), jaw_opening_m=0.036 + reported_offset_m)
     assert found.jaw_opening_m == pytest.approx(0.036, abs=3e-5)
-    assert found.jaw_surprise == pytest.approx(-reported_offset_m / 5e-5, abs=0.8), "in sigmas of the report"
+    assert found.jaw_innovation == pytest.approx(-reported_offset_m / 5e-5, abs=0.8), "in sigmas of the report"
     unreported = meter().measure(
         picture(opened), nominal_cam_T_grip(), 0.036 + reported_offset_m, 0.9, NARROW, jaw_reported=False
     )

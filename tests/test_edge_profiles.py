@@ -160,7 +160,7 @@ def test_nothing_sampled_is_nothing_found():
 
 
 def test_a_blur_wider_than_the_profiles_is_refused():
-    with pytest.raises(ValueError, match=r"a blur of 5\.0 px needs profiles of at least"):
+    with pytest.raises(ValueError, match=r"a blur of 5\.0 px needs search lines of at least"):
         candidates_of(step_image(0.0, 1.0), 0.0, np.zeros(60), blur_px=5.0)
 
 

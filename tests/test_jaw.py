@@ -91,14 +91,14 @@ def test_a_jaw_that_moves_without_a_report_is_noticed_and_what_was_learnt_is_dro
     rng = np.random.default_rng(5)
     knowledge = JawKnowledge(SIGMA_M, OFFSET_SIGMA_M)
     _, out, errors_m = run(knowledge, rng, [0.034] * 40 + [0.0344] * 5, [0.034] * 45)
-    assert max(abs(f.surprise) for f in out[:40]) < UNREPORTED_MOTION_SIGMAS < abs(out[40].surprise)
+    assert max(abs(f.innovation) for f in out[:40]) < UNREPORTED_MOTION_SIGMAS < abs(out[40].innovation)
     assert np.abs(errors_m[40:]).max() < 5.0 * IMAGE_SIGMA_M
 
 
 def test_an_exact_report_leaves_everything_as_it_is():
     covariance = np.diag([1e-12] * 7)
     out = JawKnowledge(0.0, OFFSET_SIGMA_M).fuse(0.034, 0.0340001, covariance)
-    assert out.jaw_opening_m == 0.0340001 and not out.xi.any() and out.surprise == 0.0
+    assert out.jaw_opening_m == 0.0340001 and not out.xi.any() and out.innovation == 0.0
     np.testing.assert_array_equal(out.covariance, covariance[:6, :6])
     assert JawKnowledge(0.0, OFFSET_SIGMA_M).report_sigma_m == 0.0
     assert SYSTEMATIC_M > 0.0

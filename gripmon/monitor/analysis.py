@@ -38,7 +38,7 @@ and after how many more each further one: gathering takes as long as measuring, 
 """
 
 DOUBTED_FRAMES = 5
-"""Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
+"""Frames in a row in which the gripper contradicts its model, from which on the drift test takes them all the same."""
 
 CONFIRMED_AFTER_S = 1.0
 """From a further conclusion's frame to the one that it counts in, where a cause is known, so that it isn't urgent; and

@@ -148,7 +148,7 @@ def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
     """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
     not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
     """
-    if abs(measurement.jaw_surprise) > UNREPORTED_MOTION_SIGMAS:
+    if abs(measurement.jaw_innovation) > UNREPORTED_MOTION_SIGMAS:
         return True
     return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
 

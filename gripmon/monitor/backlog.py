@@ -80,6 +80,6 @@ class Backlog(Generic[_T]):
             task = self._undone.popleft()
             try:
                 task.result = task.work()
-            except Exception as error:  # noqa: BLE001  told by whoever takes it
+            except Exception as error:  # noqa: BLE001  raised or reported by whoever takes it
                 task.result = error
             task.done = True

@@ -78,8 +78,9 @@ class Monitor:
         state: MonitorState | None = None,
         keep: Keep = lambda _: "",
     ):
-        """``state``, where given, is what :meth:`state` said before a restart: its newest reference counts then.
-        ``keep`` is asked before any other gets into force: what can't be kept is only proposed, or refused.
+        """``state``, where given, is what :meth:`state` gave before a restart: its newest reference counts then.
+        ``keep`` is called before any other comes into force: a reference that can't be kept is only proposed, or
+        refused.
 
         Raises ValueError for a state that doesn't hold together.
         """
@@ -98,7 +99,7 @@ class Monitor:
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
         self._jumped = False  # since the last frame that was believed
-        self._restarted = state is not None  # and not yet said whether the picture fits
+        self._restarted = state is not None  # and not yet known whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state, keep)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
         configured = self._renewal.book.configured
@@ -156,7 +157,7 @@ class Monitor:
         not looked at after that.
         """
         self.learn()
-        self._due += self._trust.told()
+        self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
@@ -196,7 +197,7 @@ class Monitor:
             if self.reference is not before:
                 self._begin()
                 drift, origin = drift_between(self._ref_cam_T_grip, self._cam_T_grip), Origin.RECALIBRATION
-        smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._noted(), *alerts)
+        smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._take_due(), *alerts)
         taken = self._tracker.taken(standing.measurement)
         corners = corner_records(standing.measurement, self._gripper.corner_ids, taken)
         return measured_record(
@@ -204,12 +205,12 @@ class Monitor:
         )
 
     def _after_restart(self, judgement: Judgement, evidence: Evidence) -> Judgement:
-        """Suspect until a frame says whether the picture fits the reference; then that is told."""
+        """Suspect until a frame shows whether the picture fits the reference; then an alert reports which."""
         if evidence.motion.frames == 0 or not evidence.believed:
             return replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
         self._restarted = False
-        told = after_restart(self.reference, evidence, self._settings.policy.warn_m)
-        return replace(judgement, alerts=(told, *judgement.alerts))
+        compared = after_restart(self.reference, evidence, self._settings.policy.warn_m)
+        return replace(judgement, alerts=(compared, *judgement.alerts))
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
@@ -224,8 +225,8 @@ class Monitor:
             self._average.step(motion.step_frames)
 
     def learn(self) -> None:
-        """Learn from the newest frame what nothing waits for, in some 2 ms; :meth:`process` does it first if no one
-        has.
+        """Learn from the newest frame what no decision waits for, in some 2 ms.  :meth:`process` does it first where
+        the caller hasn't.
         """
         self._trust.learn()
         self._analysis.watch.learn()
@@ -273,7 +274,7 @@ class Monitor:
         if self.reference is not before:
             self._begin()
         wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
-        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # no one reads a look
+        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # 150 kB that only a restart needs
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:
@@ -304,7 +305,7 @@ class Monitor:
             verdict=judgement.verdict,
             state=judgement.state,
             corners=unmeasured_corners(self._gripper.corner_ids, fault),
-            alerts=(*self._noted(), *judgement.alerts),
+            alerts=(*self._take_due(), *judgement.alerts),
         )
         if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
             return blank
@@ -320,6 +321,6 @@ class Monitor:
             protection=None if standing is None else self._trust.held(standing, growth, unseen_s, hidden),
         )
 
-    def _noted(self) -> list[Alert]:
-        noted, self._due = self._due, []
-        return noted
+    def _take_due(self) -> list[Alert]:
+        due, self._due = self._due, []
+        return due

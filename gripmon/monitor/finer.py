@@ -43,11 +43,11 @@ from gripmon.track.look import (
 )
 
 DIFFERENT = 0.5
-"""Share of a finger's blocks that look otherwise than at first, from which it looks different: grasps hide a half."""
+"""Share of a finger's blocks that no longer look as at first, from which it looks different: grasps hide a half."""
 
 DIFFERENT_S = 300.0
-"""For how long it does, or the look contradicts the edges, until that is told and the look learnt again, s: robots hold
-what they grasp for seconds or a minute.
+"""For how long it does, or the look contradicts the edges, until an alert reports it and the look is learnt again, s:
+robots hold what they grasp for seconds or a minute.
 """
 
 
@@ -175,10 +175,10 @@ class FinerLook:
         elif not measured and self._alignment.views > views:
             self._fusion.place(pending.cam_T_grip, pending.of_background, pending.jaw_opening_m)
         self._count(pending.stamp_ns)
-        self._tell(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
+        self._report_lasting(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
 
     def _count(self, stamp_ns: int) -> None:
-        """The version that the frame belongs to; once it measures, that is told."""
+        """The version that the frame belongs to; an alert reports when it begins to measure."""
         if not self._alignment.views:
             return
         if self.version is None:
@@ -199,12 +199,12 @@ class FinerLook:
             return measurement.jaw_opening_m, math.sqrt(measurement.covariance[6, 6])
         return measurement.jaw_known_m, measurement.jaw_known_sigma_m
 
-    def told(self) -> list[Alert]:
-        """What there is to tell since the last call."""
+    def take_alerts(self) -> list[Alert]:
+        """Alerts since the last call."""
         due, self._due = self._due, []
         return due
 
-    def _tell(self, different: NDArray[np.bool_], now_s: float, stamp_ns: int) -> None:
+    def _report_lasting(self, different: NDArray[np.bool_], now_s: float, stamp_ns: int) -> None:
         """Fingers (f,) that look different, and a look that contradicts the edges, once they have for long enough."""
         wrong = np.append(different, self._fusion.contradicts)
         self._since_s = np.where(wrong, np.minimum(self._since_s, now_s), np.inf)

@@ -1,5 +1,4 @@
-"""The fit of one frame made once more under each hypothesis, and the anchor: the average of those that proved where the
-gripper is.
+"""The fit of one frame repeated under each hypothesis, and the anchor: the average of the poses that proved themselves.
 
 An edge that has belonged to something else since the first frame bends the average, too, so that the average is kept
 without it as well: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
@@ -29,7 +28,7 @@ UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
 """Stands for no bound at all."""
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
-"""So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
+"""Frames that the prior (errors don't scatter at all) is worth, and frames over which the scatter is averaged."""
 
 YOUNG_VARIANCE_RATIO = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
@@ -37,7 +36,7 @@ little more off than is believed of any average.
 """
 
 CONFIRMING_FRAMES = 5
-"""Further frames that have to prove a place after a knock in full."""
+"""Frames after a knock, besides the first, that have to prove the new place in full."""
 
 NOTHING, UNKNOWN = -1, 1e12
 """Stands for no fit, and the factor on another one's covariance that makes it tell nothing."""
@@ -51,10 +50,12 @@ def _vague(count: int, m: int) -> Array:
 
 
 class Anchored(NamedTuple):
-    """Fits with the anchor's pose as one more measurement, and how much that surprises each of them, (h,)."""
+    """Fits with the anchor's pose as one more measurement, and the normalised innovation ``square`` (h,) of that
+    against each fit without.
+    """
 
     fits: Separation
-    surprise: Array
+    square: Array
 
 
 class Known(NamedTuple):
@@ -117,8 +118,8 @@ class Refits:
         else:
             at, covariance = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor
             # The free fit's distance from the anchor, in units of both covariances.
-            self._free, fits, surprise = with_and_without(*of, at, covariance, known.of_model, SIGMA_INFLATION**2)
-            self.anchored = Anchored(fits, surprise)
+            self._free, fits, square = with_and_without(*of, at, covariance, known.of_model, SIGMA_INFLATION**2)
+            self.anchored = Anchored(fits, square)
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
@@ -213,7 +214,7 @@ class Anchor:
 
     @property
     def confirmed(self) -> bool:
-        """Whether so many frames have proved the place that a further one needs to prove less."""
+        """Whether enough frames have proved the place since a knock; a further one needs to prove less then."""
         return self._to_confirm <= 0
 
     def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float) -> None:

@@ -142,7 +142,7 @@ class Renewal:
         if isinstance(outcome, Refusal):
             self._policy.not_recalibrated()
             if self.book.proposal is not None:
-                self.book.reject()  # of another place, and no longer told of
+                self.book.reject()  # of another place, and no longer in the alerts
             why = "as an operator wanted" if asked else "though past the limit"
             return self._policy.refused(f"not calibrated again, {why}: {outcome.text}", explanation, now_s, stamp_ns)
         moved = (
@@ -175,7 +175,7 @@ class Renewal:
         """A new reference that would be forgotten waits: until it can be kept, or until an operator accepts it."""
         self._keep_again_s = now_s + KEEP_AGAIN_S
         if not asked and self._unkept is not None and self._unkept is self.book.proposal:
-            return ()  # said before
+            return ()  # the alert is open already
         self.book.propose(draft)
         self._unkept = draft
         text = f"{why}; it is tried again every {KEEP_AGAIN_S:g} s"

@@ -165,8 +165,8 @@ class Tracker:
         return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
     def learn(self, measurement: Measurement, opening: bool) -> None:
-        """The gripper was where it was measured: that is what it usually shows, and, if the ``opening`` that was seen
-        is to be believed, too, the report's error.
+        """The gripper was where it was measured: that is what it usually shows, and, if the seen ``opening`` is
+        believed as well, the report's error.
         """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
@@ -206,7 +206,7 @@ class Tracker:
             covariance=covariance,
             jaw_known_m=fused.known_m,
             jaw_known_sigma_m=fused.known_sigma_m,
-            jaw_surprise=max(measurement.jaw_surprise, fused.surprise, key=abs),
+            jaw_innovation=max(measurement.jaw_innovation, fused.innovation, key=abs),
         )
 
     def update(self, measurement: Measurement) -> tuple[Array, Array]:

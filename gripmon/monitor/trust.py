@@ -27,7 +27,9 @@ from gripmon.track.edges import Measurement
 from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
 PROOF_EVERY_FRAMES = 4
-"""While the gripper is where it was, its ends are looked at in one of so many frames; also after one without proof."""
+"""Frames from one look at the fingers' ends to the next, while the gripper is where it was and the last look proved
+it.
+"""
 
 
 class _Candidate(NamedTuple):
@@ -108,9 +110,9 @@ class Integrity:
         if self._finer is not None:
             self._finer.learn()
 
-    def told(self) -> list[Alert]:
-        """What the gripper's look has to tell."""
-        return [] if self._finer is None else self._finer.told()
+    def take_alerts(self) -> list[Alert]:
+        """Alerts about the gripper's look since the last call."""
+        return [] if self._finer is None else self._finer.take_alerts()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed, else the anchor's."""

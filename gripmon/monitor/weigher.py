@@ -1,8 +1,8 @@
 """How far a measured pose may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
 
-Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
-looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
-creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+Two things keep a fit honest beside its own residuals.  Only the fingers' ends show a motion along the fingers: it is
+checked whether they are seen as ends.  And a mount stays where it was a moment ago, but for its creep, unless it was
+knocked, which is rare: the average of the poses that proved themselves is the anchor.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ VIBRATION_FRAMES = 20.0
 """Proven frames over which the mount's vibration is learnt."""
 
 MISREAD_PROBABILITY = 0.1
-"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
-border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
+"""Probability that what is seen where a finger's end is expected is something else, and that each further corner of it
+is: what a border shows that may be anywhere within the search lines' reach, and is within a tenth of it.
 """
 
 ONE_EDGE_PX = 2.0
@@ -85,7 +85,7 @@ class Weigher:
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
         self._model = _model_error(tracker, gripper)
-        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
+        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
@@ -137,11 +137,11 @@ class Weigher:
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses, anchor = fits.hypotheses, self.anchor
-        # The gate: a hypothesis that needs a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= CONTRADICTION_SQUARE
+        # The gate: a hypothesis that also needs a knock of the mount is not what happened.
+        holds = anchored.square <= CONTRADICTION_SQUARE
         displaced = not holds[0] and explained is None
         # The proof: the fingers' ends, where they may not be something else.
-        again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
+        again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         may_have_slid = self._lone and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
@@ -186,7 +186,7 @@ class Weigher:
         """What may have been wrong all along by a frame's ``fits`` alone, with probabilities ``prior`` (h,).
 
         ``alone``: if what looks like the fingers' ends may be something else, the probability that only the frame tells
-        where they are; the fits without the ends are given, too, then.
+        where they are; then the fits without the ends are returned as well.
         """
         hypotheses = fits.hypotheses
         # What knocks the mount bends a finger, too; but a finger is taken to be straight at first.
@@ -210,7 +210,7 @@ class Weigher:
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
-            # Knocked while no one watched, or marks on the fingers, or a wrong model: a person has to say.
+            # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to say which.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
@@ -264,9 +264,9 @@ class Weigher:
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
     def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
-        """Probability that ends that are seen where they are expected are none; ``kept`` (v,): the measured edges that
-        count.  A finger's root is no end, and a single straight border shows what edges on one line do, of whatever
-        fingers they are.
+        """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
+        measured edges that count.  A finger's root is no end, and a single straight border shows what edges on one line
+        do, of whatever fingers they are.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]

@@ -37,7 +37,7 @@ class Fused:
     covariance: Array
     jaw_opening_m: float
     sigma_m: float
-    surprise: float
+    innovation: float
     known_m: float
     known_sigma_m: float
 
@@ -87,9 +87,9 @@ class JawKnowledge:
         seen_variance = 1.0 / image
         error_m = seen_variance * (jaw_opening_m - reported_m) / variance  # of the report, by this image alone
         self._travel(reported_m)
-        surprise = (error_m - self._mean.sum()) / math.sqrt(seen_variance + self._known_variance)
+        innovation = (error_m - self._mean.sum()) / math.sqrt(seen_variance + self._known_variance)
         known_m, known = float(self._mean.sum()), self._known_variance
-        contradicted = abs(surprise) > UNREPORTED_MOTION_SIGMAS
+        contradicted = abs(innovation) > UNREPORTED_MOTION_SIGMAS
         if contradicted:
             known_m, known = 0.0, prior
         fused = 1.0 / (image + 1.0 / known)
@@ -103,7 +103,7 @@ class JawKnowledge:
             0.5 * (conditioned + conditioned.T),
             opening_m,
             math.sqrt(fused),
-            surprise,
+            innovation,
             reported_m + known_m,
             math.sqrt(known),
         )

@@ -1,4 +1,4 @@
-"""Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
+"""Fingertip corners from images: predicted edges, sub-pixel edgel hypotheses, one joint fit, intersections."""
 
 from gripmon.track.edges.ends import (
     FingerEnds,

@@ -41,7 +41,7 @@ that makes a corner seen (``corners.neighbourhood_px``).
 """
 
 PROBES = 10
-"""Profiles on it: one each 1.5 px, since neighbours see the same pixels."""
+"""Search lines on it: one each 1.5 px, since neighbours see the same pixels."""
 
 PROBES_SKIPPED = 2
 """Probes next to a corner that another edge of the finger may run through."""
@@ -104,10 +104,11 @@ class FingerEndsSeen:
 
 @dataclass(frozen=True, slots=True)
 class _Probes:
-    """Profiles beyond places, for one prediction; c extensions of :data:`PROBES` each.
+    """Search lines beyond places, for one prediction; c extensions of :data:`PROBES` each.
 
-    ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's profile next to it, ``ok`` (c *
-    PROBES,).  ``turns``: for each place where a side turns into a curve, the profiles of the stretches that show it.
+    ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's search line next to it, ``ok`` (c *
+    PROBES,).  ``turns``: for each place where a side turns into a curve, the search lines of the stretches that show
+    it.
     """
 
     place: NDArray[np.intp]
@@ -249,7 +250,7 @@ class FingerEnds:
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
         prediction, candidates = measurement.prediction, measurement.candidates
-        # Where the measurement has them: the edge filter sees less far than the profiles reach.
+        # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
         shift_px = np.repeat(offset_px[:, None] * prediction.normal[probes.sample], PROBES, axis=0).astype(np.float32)
         profiles = read_profiles(image, probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:])
@@ -327,8 +328,8 @@ class FingerEnds:
     def _turn(
         self, prediction: Prediction, number: int, here: int, clear_px: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-        """The profiles that show a side turn into a curve: of the side's end, of the curve beside it, and of the curve
-        from where it has left the side's direction, ``clear_px`` (2,), on; :data:`BEYOND_PX` long each.
+        """The search lines that show a side turn into a curve: of the side's end, of the curve beside it, and of the
+        curve from where it has left the side's direction, ``clear_px`` (2,), on; :data:`BEYOND_PX` long each.
 
         A straight border beside or across the finger is like two of them at most.
         """
@@ -344,8 +345,9 @@ class FingerEnds:
         return on_side, beside, curve[(travelled_px >= left_px) & (travelled_px < left_px + reach_px)]
 
     def _beyond(self, prediction: Prediction, slot: int, edge: int, number: int) -> tuple[int, Array, Array] | None:
-        """Beyond a place at an end of a sampled edge: the edge's profile next to it, where (2,), px, to look from, and
-        the way (2,) in which the edge would go on.  None if it is too short for one, or its curve goes the same way.
+        """Beyond a place at an end of a sampled edge: the edge's search line next to it, where (2,), px, to look from,
+        and the way (2,) in which the edge would go on.  None if it is too short for one, or its curve goes the same
+        way.
         """
         layout, places, uv_px = prediction.layout, self._places, prediction.uv_px
         ends = layout.first[slot], np.append(layout.first, len(layout.edge))[slot + 1] - 1

@@ -1,8 +1,8 @@
 """Each finger by itself: where its own edge points agree, whatever the others do.
 
 The joint fit may have followed a bent finger, or split the difference between pose and jaw opening.  What has moved is
-therefore judged from the candidates again, with a rigid motion for every finger: all that one cause can do (camera
-moved, one finger bent, jaw elsewhere) are special cases of that.
+therefore judged from the edgel hypotheses again, with a rigid motion for every finger: all that one cause can do
+(camera moved, one finger bent, jaw elsewhere) are special cases of that.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
 
 FINGER_ELSEWHERE_RATIO = 1.2
-"""Factor by which more profiles of a finger must agree elsewhere than where the gripper as a whole shows."""
+"""Factor by which more search lines of a finger must agree elsewhere than where the gripper as a whole shows."""
 
 FINGER_SEEN_SHARE = 0.5
-"""Share of a finger's profiles that must agree with where it is said to be, or it is looked for farther away.  What
+"""Share of a finger's search lines that must agree with where it is expected, or it is looked for farther away.  What
 fewer show may be anything that has an edge or two: a shadow, a finger's other side, what lies behind.
 """
 
 FINGER_FOUND_SHARE = 0.55
-"""Share of a finger's profiles that must agree there: other things have a straight edge or two as well."""
+"""Share of a finger's search lines that must agree there: other things have a straight edge or two as well."""
 
 FEWEST_SHARE = 0.4
-"""Part of a stretch's profiles, and no fewer than an edge needs, that must agree for it to count as seen."""
+"""Part of a stretch's search lines, and no fewer than an edge needs, that must agree for it to count as seen."""
 
 _STEP_PX = 2.0
 _REFINED = 3
@@ -48,7 +48,7 @@ _FIXED = 1e12  # information of an opening that stays
 
 
 class _Place(NamedTuple):
-    """A finger's own fit on some votes, and the share of its profiles that agree."""
+    """A finger's own fit on some edgels, and the share of its search lines that agree."""
 
     edgels: Edgels
     fit: RobustFit
@@ -162,7 +162,7 @@ class FingerMeter(Settler):
 
 
 def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
-    """Share of each finger's profiles that agree with the measured pose; 1 for a finger that isn't sampled."""
+    """Share of each finger's search lines that agree with the measured pose; 1 for a finger that isn't sampled."""
     prediction = measurement.prediction
     finger, fingers = gripper.edge_finger, len(gripper.finger_ids)
     shares = agreeing_shares(finger, prediction.layout.edge, prediction.ok, measurement.consensus.supported, fingers)
@@ -179,7 +179,7 @@ def edge_residuals_px(measurement: Measurement, gripper: Gripper) -> Array:
 
 @compiled
 def agreeing_shares(finger: Any, edge: Any, ok: Any, supported: Any, fingers: int) -> Any:
-    """(f,) share of each finger's profiles in the image that are ``supported`` (n,); 1 without any."""
+    """(f,) share of each finger's search lines in the image that are ``supported`` (n,); 1 without any."""
     agreeing, sampled = np.zeros(fingers), np.zeros(fingers)
     for n in range(len(edge)):
         agreeing[finger[edge[n]]] += supported[n]
@@ -220,12 +220,12 @@ def _cells(image: Image) -> Array:
 
 
 def finger_of(meter: FingerMeter, edgels: Edgels) -> NDArray[np.intp]:
-    """(n,) the finger of each profile."""
+    """(n,) the finger of each search line."""
     return np.asarray(meter._gripper.edge_finger[edgels.prediction.layout.edge])
 
 
 def _shifted(edgels: Edgels, own: NDArray[np.bool_], base: Array) -> list[Array]:
-    """The most promising starts that shift a finger, of which the profiles ``own`` (n,) are, in the image."""
+    """The most promising starts that shift a finger, of which the search lines ``own`` (n,) are, in the image."""
     prediction, candidates = edgels.prediction, edgels.candidates
     active = np.flatnonzero((edgels.weight > 0.0) & own[candidates.sample])
     if not prediction.pixels_per_m > 0.0 or not len(active):
@@ -299,7 +299,7 @@ _EMPTY = _Stretches(
 
 
 def _points(place: _Place) -> NDArray[np.intp]:
-    """Candidates of a fit on well seen stretches: of two in one profile the heavier counts."""
+    """Edgel hypotheses of a fit on well seen stretches: of two in one search line the heavier counts."""
     prediction, candidates = place.edgels.prediction, place.edgels.candidates
     index = np.flatnonzero(place.fit.weight)
     index = index[np.lexsort((-place.edgels.weight[index], candidates.sample[index]))]

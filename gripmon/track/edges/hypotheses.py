@@ -210,7 +210,7 @@ def _levels(values: Floats, per_level: float) -> NDArray[np.uint8]:
 
 
 class ProfileScore:
-    """Evidence along profiles across the outlines: to the pixel, for poses that are nearly right.
+    """Evidence along search lines across the outlines: to the pixel, for poses that are nearly right.
 
     Strengths are averaged over neighbouring points of an edge, and ranked among all that were read first.
     """
@@ -273,7 +273,7 @@ class ProfileScore:
         """Poses that the evidence up to ``reach`` cells beside the outlines pulls them to: of all rounds the one with
         the highest score, give or take a cell.
 
-        Each round is a least squares step to the evidence's means along the profiles, on a width that shrinks;
+        Each round is a least squares step to the evidence's means along the search lines, on a width that shrinks;
         ``sigma`` (6,), m and rad, keeps the whole way short where nothing pulls.
         """
         rotation, translation = poses.rotation.copy(), poses.translation_m.copy()
@@ -328,7 +328,7 @@ def rotations(omega: Array) -> Array:
 
 
 def apart(poses: Poses, points: OutlinePoints, window: Window, scores: Floats, cells: float, most: int) -> list[int]:
-    """Indices of the best poses, best first, whose outlines lie more than so many cells from those of better ones."""
+    """Indices of the best poses, best first, whose outlines lie at least ``cells`` from those of better ones."""
     column, row = _cells(points, poses, window)
     places = np.concatenate([column[:, ::6], row[:, ::6]], axis=1)
     taken = np.zeros(len(places), dtype=bool)

@@ -1,9 +1,9 @@
 """The joint fit and its covariance in machine code.
 
-k candidates sorted by profile, n profiles, e edges of the gripper, g stretches of agreed points, m unknowns (m, rad).
-Inside, everything has :data:`SIZE` unknowns: without a jaw the seventh has no derivative, and a prior that holds it at
-zero.  Tests hold the functions against those of their names in ``tests/support/by_numpy/fit.py``, :func:`fit` against
-``fit_irls``.
+k edgel hypotheses sorted by search line, n search lines, e edges of the gripper, g stretches of agreed points, m
+unknowns (m, rad).  Inside, everything has :data:`SIZE` unknowns: without a jaw the seventh has no derivative, and a
+prior that holds it at zero.  Tests hold the functions against those of their names in
+``tests/support/by_numpy/fit.py``, :func:`fit` against ``fit_irls``.
 """
 
 from __future__ import annotations
@@ -31,18 +31,21 @@ LARGEST_SPREAD_PX = 1.0
 """Robust spread (px) beyond which edge points are not believed to show the gripper's edges."""
 
 LARGEST_SPREAD, SMALLEST_SPREAD_PX, FEWEST_SPREAD = 3.0, 0.05, 12
-"""Bounds of the robust spread, in standard deviations and px, and residuals from which it is told."""
+"""Bounds of the robust spread, in standard deviations and px, and the least number of residuals that it is estimated
+from.
+"""
 
 INNER_SIGMAS, INNER_PX = 4.0, 0.3
-"""Residuals within so many standard deviations and px more tell the robust spread, however wide the weight still is."""
+"""The robust spread is estimated from residuals within 4 standard deviations and 0.3 px, however wide the weight is."""
 
 SMALLEST_STIFFNESS = 0.2
+"""Of a fit whose weights all fall off: below, the covariance would grow without bound."""
 
 FEWEST_EDGES = 3
 """Edges that must be seen for a fit to be believed at all."""
 
 FEWEST_AGREEING = 5
-"""Profiles of an edge that must agree for it to count as seen."""
+"""Search lines of an edge that must agree for it to count as seen."""
 
 SMALLEST_VARIANCE_RATIO = 0.1
 """Points are never taken to be better than by this factor of their variance."""
@@ -86,7 +89,7 @@ def fit(
 def _near(
     sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, start: Any, reach_px: float
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """The j candidates with a weight within ``reach_px`` of where ``start`` (m,) puts the edges: place among all,
+    """The j edgel hypotheses with a weight within ``reach_px`` of where ``start`` (m,) puts the edges: place among all,
     jacobian (j, SIZE), offset, sigma, weight and edge.
     """
     place = np.empty(len(sample), np.intp)
@@ -116,12 +119,12 @@ def _irls(
     near: Any, edge_spread_px: Any, mean: Any, prior: Any, xi: Any, width: float, rounds: int, start_width_px: float,
 ) -> tuple[bool, Any, Any, float, float]:  # fmt: skip
     """Iteratively re-weighted least squares; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
-    solved, weights of the candidates near by, 1/px², information (SIZE, SIZE), spread (px) and stiffness.
+    solved, weights of the edgel hypotheses near by, 1/px², information (SIZE, SIZE), spread (px) and stiffness.
 
     From round to round the width, at first that of the start's error, decays, and the robust spread s of the residuals
-    takes over: a candidate counts by Tukey's weight (1 - (r / reach)²)², zero beyond its reach, which is the root of
-    width² + (TUKEY s sigma)², at most max(width, TUKEY times the spread in px).  All points of an edge together are
-    worth no more than one with the spread that they share: w / (1 + spread² sum w).
+    takes over: an edgel hypothesis counts by Tukey's weight (1 - (r / reach)²)², zero beyond its reach, which is the
+    root of width² + (TUKEY s sigma)², at most max(width, TUKEY times the spread in px).  All points of an edge together
+    are worth no more than one with the spread that they share: w / (1 + spread² sum w).
     """
     _, jacobian, offset, sigma, base, edge = near
     count = len(offset)
@@ -255,12 +258,12 @@ def _judge(
     sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, independence: Any,
     start_width_px: float, gate_px: float, support_sigmas: float, support_share: float,
 ) -> tuple[Any, Any, Any, float]:  # fmt: skip
-    """Who agrees: the profiles (n,), each edge's share of them and whether it is seen (e,), and the share of pairs.
+    """Who agrees: the search lines (n,), each edge's share of them and whether it is seen (e,), and the share of pairs.
 
-    Held against chance: the density of candidates tells how many would lie in the gate anyway, of N independent
-    profiles N p +- sqrt(N p (1 - p)); profiles that see the same pixels agree by the same chance.  Edge responses end
-    before the profiles do: what was found tells how far candidates reach.  What chance supports is scattered, what the
-    gripper supports comes in runs: neighbours are counted, not profiles.
+    Held against chance: the density of edgel hypotheses tells how many would lie in the gate anyway, of N independent
+    search lines N p +- sqrt(N p (1 - p)); search lines that see the same pixels agree by the same chance.  Edge
+    responses end before the search lines do: what was found tells how far edgel hypotheses reach.  What chance supports
+    is scattered, what the gripper supports comes in runs: neighbours are counted, not search lines.
     """
     supported, edges = np.zeros(len(edge), np.bool_), len(independence)
     profiles, agreeing, others = np.zeros(edges), np.zeros(edges), np.zeros(edges)

@@ -23,7 +23,7 @@ from gripmon.track.edges.robust_fit import RobustFit
 from gripmon.track.edges.settings import CornerSettings
 
 SHOWN_BESIDE = 0.5
-"""Share of agreeing profiles next to a corner, over that on the rest of the edge, from which the corner is seen; on
+"""Share of agreeing search lines next to a corner, over that on the rest of the edge, from which the corner is seen; on
 each stretch of a turn into a curve, from which that is seen; of probes beyond an end, from which the edge goes on.
 """
 
@@ -45,8 +45,9 @@ class CornerGeometry:
     corner each, sorted by corner.
 
     ``corner``, ``slot`` among the sampled edges and ``edge`` of the gripper (p,); ``way`` (p, 3): the predicted corner
-    on the edge's line, and the line's direction; ``part`` (p, 4): first and last + 1 of the profiles beside the corner,
-    and of all on the edge.  ``fault`` (c,): why a corner can't be measured in this view whatever the image, or 0.
+    on the edge's line, and the line's direction; ``part`` (p, 4): first and last + 1 of the search lines beside the
+    corner, and of all on the edge.  ``fault`` (c,): why a corner can't be measured in this view whatever the image, or
+    0.
     """
 
     corner: NDArray[np.intp]
@@ -141,7 +142,7 @@ def intersect_edges(
     settings: CornerSettings,
 ) -> Corners:
     """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges
-    meet.  ``line_weight`` (k,) is what each candidate is worth for the line of its edge, 1/px².
+    meet.  ``line_weight`` (k,) is what each edgel hypothesis is worth for the line of its edge, 1/px².
 
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
     of the corner with ``(right - slope * direction) . shift = offset + slope * along``.

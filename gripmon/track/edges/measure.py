@@ -1,7 +1,7 @@
 """The corner measurement as one: from an image and an expected pose to edge points that agree, and corners.
 
-The cheap way is tried first: profiles about the expected pose and one robust fit.  Only when too few profiles agree
-are other starts tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
+The cheap way is tried first: search lines about the expected pose and one robust fit.  Only when too few search lines
+agree are other starts tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ ELSEWHERE_SHARE_RATIO = 1.3
 @dataclass(frozen=True, slots=True)
 class Patience:
     """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where
-    there is none.  ``at_once``: near by in this frame, else that is left to the search, too.
+    there is none.  ``at_once``: near by in this frame, else the search does that as well.
     """
 
     when_doubtful: bool
@@ -68,7 +68,7 @@ class Patience:
 
 class Sought(NamedTuple):
     """How a gripper is searched for: whether it is ``lost`` where it is expected, or only poor, and whether ``near``
-    by, too; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, and the one that a
+    by as well; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, and the one that a
     rough fit must show.
     """
 
@@ -129,10 +129,10 @@ class FingertipMeter(FingerMeter):
         """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to
         start from).
 
-        ``usual_share`` of the profiles agree when all is well.  With clearly less the ``rivals`` (4, 4) are looked at:
-        poses at which the gripper was.  If it is not there either, or no end of its fingers is seen there, and where
-        ``patience`` allows, it is looked for elsewhere, last of all where ``search`` proposes (if None, a search in
-        this image): another place than one that may be true must show the fingers' ends.
+        ``usual_share`` of the search lines agree when all is well.  With clearly less the ``rivals`` (4, 4) are looked
+        at: poses at which the gripper was.  If it is not there either, or no end of its fingers is seen there, and
+        where ``patience`` allows, it is looked for elsewhere, last of all where ``search`` proposes (if None, a search
+        in this image): another place than one that may be true must show the fingers' ends.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
@@ -306,7 +306,7 @@ class FingertipMeter(FingerMeter):
         return self._fitted_again(image, places, sought.least_share)
 
     def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
-        """The best of starts all over the reach of the profiles."""
+        """The best of starts all over the reach of the search lines."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
             return []

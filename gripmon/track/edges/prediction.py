@@ -23,22 +23,24 @@ from gripmon.track.edges.settings import SamplingSettings
 from gripmon.track.edges.taught import TaughtEdges
 
 STRETCH = 16
-"""Neighbouring profiles of an edge whose errors are taken together."""
+"""Neighbouring search lines of an edge whose errors are taken together."""
 
 STEP_PX = 0.5
-"""Distance of samples along a profile, px."""
+"""Distance of samples along a search line, px."""
 
 ROWS = 3
-"""Neighbouring rows of pixels along an edge that make one profile."""
+"""Neighbouring rows of pixels along an edge that make one search line."""
 
 FEWEST_SAMPLES = 4
-"""With fewer profiles, an edge has no line of its own, a stretch of one is not seen, a corner has nothing beside it."""
+"""With fewer search lines, an edge has no line of its own, a stretch of one is not seen, a corner has nothing beside
+it.
+"""
 
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
 SHORTEST_PX = float(FEWEST_AGREEING - 1)
-"""Less of an edge isn't sampled: as many profiles as must agree would be closer than a pixel."""
+"""Less of an edge isn't sampled: as many search lines as must agree would be closer than a pixel."""
 
 PLACES = 65
 """Places of an edge, evenly spaced, at which it is seen whether it lies in the image."""
@@ -62,7 +64,7 @@ class EdgeLayout:
 
     @cached_property
     def stretch(self) -> NDArray[np.intp]:
-        """(n,) number of the stretch that a profile belongs to: some :data:`STRETCH` neighbours on one edge."""
+        """(n,) number of the stretch that a search line belongs to: some :data:`STRETCH` neighbours on one edge."""
         starts = np.zeros(len(self.edge), dtype=np.intp)
         starts[self.first[1:]] = 1
         return np.arange(len(self.edge)) // STRETCH + np.cumsum(starts)
@@ -103,16 +105,16 @@ class Prediction:
 
     ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of someone walking
     along the edge. ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform
-    and, where the jaw opening is an unknown too, by the opening (px/m). In ideal coordinates: ``xy`` (n, 2) the places,
-    ``way_xy`` (n, 2) the edge's direction there, ``along`` (n,) the place along the edge's line, ``gain`` (n,) the
-    distance from the edge for each px of offset along the normal.
-    ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
-    in the image.  ``map_x``, ``map_y`` (r, n, s): where r neighbouring rows of each profile are read.
+    and, where the jaw opening is an unknown too, by the opening (px/m).  In ideal coordinates: ``xy`` (n, 2) the
+    places, ``way_xy`` (n, 2) the edge's direction there, ``along`` (n,) the place along the edge's line, ``gain`` (n,)
+    the distance from the edge for each px of offset along the normal. ``line_origin``, ``line_direction`` (e, 2): the
+    edges' lines in ideal coordinates.  ``ok`` (n,): the search line lies in the image.  ``map_x``, ``map_y`` (r, n, s):
+    where r neighbouring rows of each search line are read.
 
     With a taught model ``uv_px`` lies where the edge was taught to show, everything else is the sharp model's: what is
-    measured from there is the model's own motion.  ``edge_spread_m`` (e,): standard deviation of what a
-    bevel moves an edge by, or of what teaching left of that.  ``independence`` (e,): part of an edge's profiles that
-    see pixels of their own, see :func:`independent_part`.
+    measured from there is the model's own motion.  ``edge_spread_m`` (e,): standard deviation of what a bevel moves an
+    edge by, or of what teaching left of that.  ``independence`` (e,): part of an edge's search lines that see pixels of
+    their own, see :func:`independent_part`.
     """
 
     cam_T_grip: Array
@@ -156,7 +158,7 @@ class Prediction:
 
     @cached_property
     def profiles(self) -> NDArray[np.intp]:
-        """(e,) profiles inside the image, for every edge of the gripper."""
+        """(e,) search lines inside the image, for every edge of the gripper."""
         return np.bincount(self.layout.edge[self.ok], minlength=len(self.line_origin))
 
     def moved_px(self, xi: Array) -> float:
@@ -174,8 +176,8 @@ def lay_out(
     settings: SamplingSettings,
     taught: TaughtEdges | None = None,
 ) -> EdgeLayout:
-    """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its
-    length.
+    """Choose the sampled part of each visible edge: inside the image, away from its ends; search lines by the root of
+    its length.
 
     With a taught model creases that were taught are used, too.  An edge that shows otherwise than it was taught, as an
     outline or as a crease, counts as not taught: like is compared with like.
@@ -199,7 +201,7 @@ def lay_out(
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
         # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most
-        # one profile a pixel: closer ones see the same pixels again.
+        # one search line a pixel: closer ones see the same pixels again.
         share = np.sqrt(lengths)
         wanted_counts = np.maximum(np.round(settings.samples * share / share.sum()), FEWEST_AGREEING)
         counts = np.where(lengths > 0.0, np.minimum(wanted_counts, np.floor(lengths) + 1.0), 0.0).astype(int)
@@ -266,7 +268,7 @@ def predict(
         curved = gripper.edge_curved[edge]
         way_xy[curved] = _unit(((end - start)[:, :2] - xy * (end - start)[:, 2:])[curved])
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
-    # Rows as far apart as the profiles' pixels: noise and fine texture differ, the edge doesn't.
+    # Rows as far apart as the search lines' pixels: noise and fine texture differ, the edge doesn't.
     spacing_px = (offsets_px[1] - offsets_px[0]) / STEP_PX if len(offsets_px) > 1 else 1.0
     rows_px = (spacing_px * np.arange(-(ROWS // 2), ROWS // 2 + 1, dtype=np.float32)).astype(np.float32)
     map_x, map_y = prediction_kernel.maps(uv, normal, offsets_px.astype(np.float32), rows_px)
@@ -293,8 +295,8 @@ def predict(
 
 
 def independent_part(uv_px: Array, edge: NDArray[np.intp], edges: int, width_px: float) -> Array:
-    """(e,) by how much the mean of each edge's profiles, at ``uv_px`` (n, 2) of ``edge`` (n,), is less exact than that
-    of as many independent ones, as a factor on their number; 1 for edges without any.
+    """(e,) by how much the mean of each edge's search lines, at ``uv_px`` (n, 2) of ``edge`` (n,), is less exact than
+    that of as many independent ones, as a factor on their number; 1 for edges without any.
 
     Two that are ``width_px`` wide and less apart share pixels, and are correlated by the shared part of their width.
     """

@@ -1,7 +1,7 @@
 """The geometry of a prediction in machine code.
 
-n samples, s places along each profile, r rows of them, e edges of the gripper, v of them sampled; points in the camera
-frame (m), images of them in px.  Tests hold each function against that of its name in
+n samples, s places along each search line, r rows of them, e edges of the gripper, v of them sampled; points in the
+camera frame (m), images of them in px.  Tests hold each function against that of its name in
 ``tests/support/by_numpy/prediction.py``.
 """
 
@@ -121,7 +121,7 @@ def across_edges(
 
 @compiled
 def maps(uv_px: Any, normal: Any, offsets_px: Any, rows_px: Any) -> tuple[Any, Any]:
-    """Columns and rows of the image (r, n, s) where r rows of each profile are read: ``offsets_px`` (s,) along the
+    """Columns and rows of the image (r, n, s) where r rows of each search line are read: ``offsets_px`` (s,) along the
     normal and ``rows_px`` (r,) along the edge from ``uv_px`` (n, 2), in single precision as it is kept.
     """
     map_x = np.empty((len(rows_px), len(uv_px), len(offsets_px)), np.float32)

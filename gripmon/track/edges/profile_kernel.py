@@ -1,8 +1,8 @@
-"""Profiles and edge candidates in machine code.
+"""Search lines and edgel hypotheses in machine code.
 
-n profiles of s samples, k candidates, e edges of the gripper; grey levels, and px of the image or of the zoomed one.
-Tests hold each function against that of its name in ``tests/support/by_numpy/profiles.py``, but :func:`worth` against
-``weigh``.
+n search lines of s samples, k edgel hypotheses, e edges of the gripper; grey levels, and px of the image or of the
+zoomed one. Tests hold each function against that of its name in ``tests/support/by_numpy/profiles.py``, but
+:func:`worth` against ``weigh``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def read_profiles(image: Any, map_x: Any, map_y: Any) -> Any:
 
 @compiled
 def _whole_and_part(mapped: Any, n: int, size: float, whole: Any, part: Any) -> None:
-    """Pixel before each sample (r * s,) of profile ``n`` along one axis of the image, and the way on from there."""
+    """Pixel before each sample (r * s,) of search line ``n`` along one axis of the image, and the way on from there."""
     rows, _, samples = mapped.shape
     far = size - 1.0 + 2.0 * BEYOND_PX
     for r in range(rows):
@@ -179,8 +179,8 @@ def _interpolate(patch: Any, base: Any, width: int, across: Any, down: Any, grey
 
 @compiled
 def low_third_difference(profiles: Any) -> float:
-    """The lowest tenth of the sizes of third differences at whole pixels, of every third profile of half pixels (n, s),
-    grey levels; 0 without any, NaN where it isn't a number.
+    """The lowest tenth of the sizes of third differences at whole pixels, of every third search line of half pixels (n,
+    s), grey levels; 0 without any, NaN where it isn't a number.
     """
     count, samples = profiles.shape
     third = np.empty(((count + 2) // 3) * ((samples + 1) // 2))
@@ -226,7 +226,7 @@ def find_candidates(
     profiles: Any, ok: Any, taps: Any, step_px: float, threshold: float, peak_noise: float, near: int, far: int,
     full_scale: float,
 ) -> Any:  # fmt: skip
-    """Local extrema of the response of profiles (n, s) that are ``ok`` (n,) to the derivative of Gaussian ``taps``
+    """Local extrema of the response of search lines (n, s) that are ``ok`` (n,) to the derivative of Gaussian ``taps``
     (t,): sample, offset, step, sigma, width and how surely it is cut off, each (k,), as in ``profiles.Candidates``.
 
     A peak h above the ``threshold`` with neighbours l and r lies by the parabola through the three logarithms 0.5 (ln l
@@ -287,9 +287,9 @@ def find_candidates(
 
 @compiled
 def _unrest(change: Any, at: int, near: int, far: int) -> float:
-    """Root mean square change of the response from sample to sample around a candidate, but not at it, from the squares
-    ``change`` (r,).  What lies beside an edge, texture and noise alike, would go on under the edge, where it shifts the
-    peak.
+    """Root mean square change of the response from sample to sample around an edgel hypothesis, but not at it, from the
+    squares ``change`` (r,).  What lies beside an edge, texture and noise alike, would go on under the edge, where it
+    shifts the peak.
     """
     last = len(change) - 1
     a, b, c, d = max(at - far, 0), max(at - near, 0), min(at + near, last), min(at + far, last)
@@ -304,11 +304,11 @@ def _unrest(change: Any, at: int, near: int, far: int) -> float:
 @compiled
 def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: float) -> float:
     """From 0 for an edge that is surely whole to 1 for one whose bright side, ``side`` (-1 or 1) of its ``place`` in
-    profile ``n``, is surely cut off: there is grey of ``level`` within :data:`SURELY` to :data:`HARDLY` widths.
+    search line ``n``, is surely cut off: there is grey of ``level`` within :data:`SURELY` to :data:`HARDLY` widths.
 
     Overexposure cuts the upper part of a blurred step off; what is left is steepest nearer to the dark side, by up to
-    most of the edge's width.  By how much can't be told from the rest of the profile without knowing the lens's blur
-    exactly, so that such edges only get a larger standard deviation.
+    most of the edge's width.  By how much can't be told from the rest of the search line without knowing the lens's
+    blur exactly, so that such edges only get a larger standard deviation.
     """
     start = int(np.rint(place))
     for step in range(int(HARDLY * width) + 2):
@@ -337,13 +337,13 @@ def worth(
     sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
     independence: Any, point_floor_px: float, edge_floor_px: float,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
-    """What ``profiles.Edgels`` holds of the candidates: weight (k,), 1/px², spread and what a cut-off side adds to it
-    (e,), px.
+    """What ``profiles.Edgels`` holds of the edgel hypotheses: weight (k,), 1/px², spread and what a cut-off side adds
+    to it (e,), px.
 
-    A weight is one over the variance and that of the floor, and 0 where the ``polarity`` (e,) disagrees; profiles that
-    see the same pixels share what these are worth, ``independence`` (e,).  A whole edge is off by its bevel and a share
-    of the edges' median width; and by :data:`SATURATION_SHIFT_WIDTHS` of that where its bright side is cut off, high
-    steps counting more: they are the outline's, low ones texture beside it.
+    A weight is one over the variance and that of the floor, and 0 where the ``polarity`` (e,) disagrees; search lines
+    that see the same pixels share what these are worth, ``independence`` (e,).  A whole edge is off by its bevel and a
+    share of the edges' median width; and by :data:`SATURATION_SHIFT_WIDTHS` of that where its bright side is cut off,
+    high steps counting more: they are the outline's, low ones texture beside it.
     """
     count, edges = len(sample), len(bevel_px)
     weight = np.empty(count)

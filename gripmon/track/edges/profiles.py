@@ -1,7 +1,7 @@
-"""Step 3 of the corner measurement: sub-pixel edge candidates on the sampled profiles, and what each is worth.
+"""Step 3 of the corner measurement: sub-pixel edgel hypotheses on the sampled search lines, and what each is worth.
 
-The derivative of a Gaussian is applied to all profiles; every local extremum that stands out of the noise is a
-candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
+The derivative of a Gaussian is applied to all search lines; every local extremum that stands out of the noise is an
+edgel hypothesis.  Which of them belong to the gripper the joint fit decides.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ of a search line: 2 to 5 px of the zoomed image, clear of the edge's blur.
 """
 
 FEWEST_WIDTHS = 20
-"""Edge points from which the blur is told."""
+"""Edge points from which the blur is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal,
-    ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px``
-    (k,) standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a
-    Gaussian, ``cut_off`` (k,) from 0 to 1 how sure it is that its bright side is.  ``zoom``: factor on the lengths of
-    the profiles that were read.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of
-    the image's type.
+    """Edgel hypotheses of one image: ``sample`` (k,) index of the search line, ``offset_px`` (k,) along its normal,
+    ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px`` (k,)
+    standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a Gaussian,
+    ``cut_off`` (k,) from 0 to 1 how sure it is that its bright side is.  ``zoom``: factor on the lengths of the search
+    lines that were read.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of the
+    image's type.
     """
 
     sample: NDArray[np.intp]
@@ -64,7 +64,7 @@ class _Kernel:
 
 
 def profile_offsets_px(reach_px: float) -> Array:
-    """Sample positions (s,) of a profile along its normal, px, symmetric about the predicted edge."""
+    """Sample positions (s,) of a search line along its normal, px, symmetric about the predicted edge."""
     half = round(reach_px / STEP_PX)
     return np.arange(-half, half + 1) * STEP_PX
 
@@ -115,7 +115,9 @@ def quantum(image: Image) -> float:
 def _kernel(samples: int, blur_px: float, zoom: int) -> _Kernel:
     half = math.ceil(3.0 * blur_px / STEP_PX)
     if 2 * half + 5 > samples:
-        raise ValueError(f"a blur of {blur_px} px needs profiles of at least {(half + 2) * STEP_PX} px to both sides")
+        raise ValueError(
+            f"a blur of {blur_px} px needs search lines of at least {(half + 2) * STEP_PX} px to both sides"
+        )
     x = np.arange(-half, half + 1) * STEP_PX
     taps = x * np.exp(-0.5 * (x / blur_px) ** 2)
     # A unit step gives a response of one: the answer reads as the height of the step in grey levels.
@@ -141,9 +143,9 @@ def find_candidates(
     settings: EdgeSettings,
     zoom: int = 1,
 ) -> Candidates:
-    """Local extrema of the edge response of profiles (n, s), refined by a parabola through three responses.
+    """Local extrema of the edge response of search lines (n, s), refined by a parabola through three responses.
 
-    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`); the profiles' samples lie
+    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`); the search lines' samples lie
     ``zoom`` half pixels apart.  Nothing found is an empty result.
     """
     kernel = _kernel(profiles.shape[1], settings.blur_px, zoom)
@@ -161,7 +163,7 @@ def find_candidates(
 
 
 def estimate_noise(profiles: Array, quantum: float = 1.0) -> float:
-    """Standard deviation of the noise of a pixel, averaged as the profiles (n, s) are, from their quiet parts, grey
+    """Standard deviation of the noise of a pixel, averaged as the search lines (n, s) are, from their quiet parts, grey
     levels.
 
     Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that
@@ -170,14 +172,15 @@ def estimate_noise(profiles: Array, quantum: float = 1.0) -> float:
     """
     tenth = profile_kernel.low_third_difference(profiles)
     # Of a normal distribution a tenth lies within 0.1257 sigma; a third difference of white noise has variance 20,
-    # of which cubic interpolation at a random phase leaves 0.64 along the profile.
+    # of which cubic interpolation at a random phase leaves 0.64 along the search line.
     return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64)), quantum / math.sqrt(12.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Edgels:
-    """The candidates of one image with what they are worth: ``weight`` (k,) before the robust part, 1/px², zero where
-    the taught polarity disagrees; ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
+    """The edgel hypotheses of one image with what they are worth: ``weight`` (k,) before the robust part, 1/px², zero
+    where the taught polarity disagrees; ``edge_spread_px`` (e,) the standard deviation that all points of an edge
+    share.
 
     ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
     prefer other edges.
@@ -193,7 +196,7 @@ class Edgels:
 def weigh(
     candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], settings: RobustFitSettings
 ) -> Edgels:
-    """The candidates with their weights; ``polarity`` (e,) belongs to the gripper's edges."""
+    """The edgel hypotheses with their weights; ``polarity`` (e,) belongs to the gripper's edges."""
     worth = profile_kernel.worth(
         candidates.sample,
         candidates.step,
@@ -211,8 +214,8 @@ def weigh(
 
 
 def blur_px(candidates: Candidates, weight: Array, settings: EdgeSettings) -> float | None:
-    """Standard deviation of the blur across edges, px: of the median width of the candidates that have a ``weight``
-    (k,), what the derivative of Gaussian leaves; None with few of them.
+    """Standard deviation of the blur across edges, px: of the median width of the edgel hypotheses that have a
+    ``weight`` (k,), what the derivative of Gaussian leaves; None with few of them.
     """
     count, width_px = profile_kernel.usual_width(candidates.width_px, weight)
     if count < FEWEST_WIDTHS:
@@ -222,7 +225,7 @@ def blur_px(candidates: Candidates, weight: Array, settings: EdgeSettings) -> fl
 
 def unevenness(image: Image, prediction: Prediction) -> float:
     """Standard deviation of the grey level along the more even side of each edge, over that beside all edges together;
-    1 where nothing can be told.
+    1 where there is too little to tell.
 
     Along the gripper's outlines one side is the finger and the other whatever lies behind; where a background imitates
     them, both sides vary alike.

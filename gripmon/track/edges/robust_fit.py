@@ -22,14 +22,14 @@ from gripmon.track.edges.profiles import Edgels
 from gripmon.track.edges.settings import RobustFitSettings
 
 GATE_PX = 0.5
-"""A profile supports a fit if a candidate lies this close to it (px of the zoomed image)."""
+"""A search line supports a fit if an edgel hypothesis lies this close to it (px of the zoomed image)."""
 
 RESTART_WIDTH_PX = 0.4
 """Width of the robust weight at a start that is nearly right, px."""
 
 CONTRADICTION_RATIO = 3.0
-"""Stretches that contradict each other more than this call for an edge that is none, without which they do so by no
-more than such a part; texture gives 1 to 2.
+"""Ratio of the stretches' scatter to what independent errors give, above which one edge is taken to belong to something
+else, if the ratio falls by this factor without it; texture gives 1 to 2.
 """
 
 NOT_SOLVED = "the normal matrix of the joint fit is not positive definite"
@@ -50,14 +50,15 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class RobustFit:
-    """The common motion of the edge candidates.
+    """The common motion of the edgel hypotheses.
 
-    ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in
-    1/px², zero for those that don't belong, each edge's together limited by what its points share; ``information``
-    (m, m) of the edge points alone; ``spread_px`` robust size of the residuals, ``stiffness`` see :func:`_stiffness`;
-    ``supported`` (n,) whether a profile agrees; for all edges of the gripper ``edge_share``
-    (e,) share of its profiles that agree and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring
-    profiles in which both agree, on edges that are seen; zero with fewer than three such edges.
+    ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per edgel
+    hypothesis in 1/px², zero for those that don't belong, each edge's together limited by what its points share;
+    ``information`` (m, m) of the edge points alone; ``spread_px`` robust size of the residuals, ``stiffness``: factor
+    on ``information`` that gives the robust gradient's change by a small step; ``supported`` (n,) whether a search line
+    agrees; for all edges of the gripper ``edge_share`` (e,) share of its search lines that agree and ``edge_seen``
+    (e,). ``share``: part of all pairs of neighbouring search lines in which both agree, on edges that are seen; zero
+    with fewer than three such edges.
     """
 
     xi: Array
@@ -89,9 +90,9 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """``covariance`` (m, m) of the fit's unknowns; ``line_weight`` (k,) what each candidate is worth for the line of
-    its edge alone, 1/px², zero for those that don't belong; ``shared_px`` standard deviation that the points of a
-    stretch share; ``contradiction``: the weighted squares of the stretches' means over what independent errors of the
+    """``covariance`` (m, m) of the fit's unknowns; ``line_weight`` (k,) what each edgel hypothesis is worth for the
+    line of its edge alone, 1/px², zero for those that don't belong; ``shared_px`` standard deviation that the points of
+    a stretch share; ``contradiction``: the weighted squares of the stretches' means over what independent errors of the
     assumed size would give, about 1; ``normal``: what the covariance was made of.
     """
 
@@ -106,9 +107,9 @@ def fit_irls(
     edgels: Edgels, prior: Prior, start: Array, settings: RobustFitSettings, width_px: float | None = None
 ) -> RobustFit:
     """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``width_px`` (if None, from the
-    settings' ``start_width_px``) to what each candidate's own standard deviation and the measured scatter allow.
+    settings' ``start_width_px``) to what each edgel hypothesis's own standard deviation and the measured scatter allow.
 
-    With fewer candidates than unknowns the fit stays at the start and supports nothing.
+    With fewer edgel hypotheses than unknowns the fit stays at the start and supports nothing.
     """
     candidates, prediction = edgels.candidates, edgels.prediction
     solved, fitted = kernel.fit(
@@ -234,7 +235,7 @@ def _without(edgels: Edgels, left_out: int) -> Edgels:
 def fit_irls_from_grid(
     edgels: Edgels, prior: Prior, starts: Array, settings: RobustFitSettings, refine: int = 6
 ) -> RobustFit:
-    """Best fit from many starts (g, m): all are scored by the candidates near them, the best few refined."""
+    """Best fit from many starts (g, m): all are scored by the edgel hypotheses near them, the best few refined."""
     candidates = edgels.candidates
     jacobian = edgels.prediction.jacobian[candidates.sample].T
     active = edgels.weight > 0.0

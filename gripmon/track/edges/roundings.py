@@ -27,8 +27,8 @@ class GoesOn(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """One in a prediction: its two ``edges``, of each the profiles beside it, outwards from it, and how they ``go_on``
-    beyond it.
+    """One in a prediction: its two ``edges``, of each the search lines beside it, outwards from it, and how they
+    ``go_on`` beyond it.
     """
 
     edges: frozenset[int]
@@ -52,7 +52,7 @@ def crossing(
 
 
 def _tangent(prediction: Prediction, profile: int, towards_px: Array) -> Array:
-    """(2,) the way of the edge at a profile, of the two the one towards a place (2,)."""
+    """(2,) the way of the edge at a search line, of the two the one towards a place (2,)."""
     normal = prediction.normal[profile]
     way = np.array([-normal[1], normal[0]])
     return way if way @ (towards_px - prediction.uv_px[profile]) > 0.0 else -way
@@ -128,7 +128,7 @@ class Roundings:
         return Rounding(frozenset((one, other)), beside, (*straight, *(each for each in curved if each is not None)))
 
     def _sampled(self, prediction: Prediction, point: int, edge: int) -> tuple[int, NDArray[np.intp], bool] | None:
-        """The first edge that is looked at on the way from a point along an edge, its profiles from there on, and
+        """The first edge that is looked at on the way from a point along an edge, its search lines from there on, and
         whether others that are too short lie between.
         """
         layout, ends = prediction.layout, self._ends

@@ -1,4 +1,4 @@
-"""Finding the gripper again after a jump that is wider than the profiles reach.
+"""Finding the gripper again after a jump that is wider than the search lines reach.
 
 In a reduced image (``reduced``) the points on the predicted outlines vote for shifts, turns about the optical axis and
 scales.  The best places are shaken in all six directions, tilts included, then polished on an image of twice the

@@ -11,10 +11,10 @@ from msgspec import Meta
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the image is sampled around the predicted edges."""
 
-    samples: Annotated[int, Meta(ge=24, le=4096, description="profiles over all edges together")] = 320
-    reach_px: Annotated[float, Meta(ge=2.0, le=40.0, description="how far each profile reaches to both sides (px)")] = (
-        7.0
-    )
+    samples: Annotated[int, Meta(ge=24, le=4096, description="search lines over all edges together")] = 320
+    reach_px: Annotated[
+        float, Meta(ge=2.0, le=40.0, description="how far each search line reaches to both sides (px)")
+    ] = 7.0
     end_margin_px: Annotated[
         float,
         Meta(
@@ -31,7 +31,7 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 
 class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What counts as an edge candidate."""
+    """What counts as an edgel hypothesis."""
 
     blur_px: Annotated[float, Meta(ge=0.4, le=5.0, description="sigma of the derivative of Gaussian (px)")] = 0.65
     noise_factor: Annotated[
@@ -43,7 +43,7 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class RobustFitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How edge candidates agree on one motion."""
+    """How edgel hypotheses agree on one motion."""
 
     start_width_px: Annotated[
         float, Meta(ge=0.5, le=10.0, description="width of the robust weight at the prediction (px)")
@@ -68,19 +68,22 @@ class RobustFitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen"),
     ] = 4.0
     support_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
+        float,
+        Meta(ge=0.05, le=0.95, description="share of an edge's search lines that must agree for it to count as seen"),
     ] = 0.3
     trusted_share: Annotated[
         float,
         Meta(
             ge=0.05,
             le=0.95,
-            description="share of neighbouring profiles that must agree where the gripper was expected",
+            description="share of neighbouring search lines that must agree where the gripper was expected",
         ),
     ] = 0.3
     found_share: Annotated[
         float,
-        Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where it was looked for"),
+        Meta(
+            ge=0.05, le=0.95, description="share of neighbouring search lines that must agree where it was looked for"
+        ),
     ] = 0.42
 
 
@@ -123,9 +126,7 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         Meta(ge=64, le=1024, description="width of the reduced image, as far as the gripper can be in it (columns)"),
     ] = 160
     starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
-    eager_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="so many doubtful frames may look further one after the other")
-    ] = 4
+    eager_frames: Annotated[int, Meta(ge=1, le=1000, description="doubtful frames in a row that may look further")] = 4
     refill_frames: Annotated[
         int, Meta(ge=1, le=100000, description="good frames after which one more frame may look further")
     ] = 60
@@ -134,7 +135,7 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         Meta(
             ge=1,
             le=1000,
-            description="a gripper lost for longer than its transform is held is searched for in one of so many frames",
+            description="a gripper lost for longer than its transform is held is searched for once in N frames",
         ),
     ] = 15
 

@@ -1,4 +1,4 @@
-"""The corner measurement at one place: profiles about an expected pose, one robust fit, corners, covariance."""
+"""The corner measurement at one place: search lines about an expected pose, one robust fit, corners, covariance."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen again, px."""
 
 JAW_UNREPORTED_SIGMA_M = 0.02
-"""What is known about a jaw opening that no one reports, m: it changes by this much between frames at most."""
+"""Standard deviation of a jaw opening that is not reported, m: a bound on its change between frames."""
 
 ZOOMS = (1, 2, 4)
-"""Factors on all lengths along the profiles, for images that are out of focus."""
+"""Factors on all lengths along the search lines, for images that are out of focus."""
 
 BLUR_AT_ZOOM = (0.7, 1.7)
 """Blur of the edges at zoom 1, px, below which the next finer and above which the next coarser zoom fits better."""
@@ -70,7 +70,7 @@ class Effort(enum.IntEnum):
 class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
-    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_surprise``: the seen jaw opening against the
+    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_innovation``: the seen jaw opening less the
     reported one (``jaw_reported_m``), in standard deviations of the latter.
 
     ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far
@@ -78,7 +78,7 @@ class Measurement:
 
     ``blur_px``: standard deviation across the edges that agreed, None with few of them.
 
-    ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
+    ``trusted``: enough search lines agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
 
@@ -90,7 +90,7 @@ class Measurement:
     jaw_opening_m: float
     covariance: Array
     jaw_reported_m: float
-    jaw_surprise: float
+    jaw_innovation: float
     effort: Effort
     normal: NormalEquations
     jaw_known_m: float
@@ -222,10 +222,10 @@ class Settler:
         if self._geometry is None or self._geometry[0] is not prediction:
             self._geometry = prediction, CornerGeometry.of(self._gripper, prediction, settings.corners)
         corners = intersect_edges(edgels, consensus, uncertainty.line_weight, self._geometry[1], settings.corners)
-        jaw_known_sigma_m = jaw_surprise = 0.0
+        jaw_known_sigma_m = jaw_innovation = 0.0
         if len(self._prior) == 7:
             jaw_known_sigma_m = float(self._prior[6] ** -0.5)
-            jaw_surprise = float((consensus.xi[6] - prior.mean[6]) * np.sqrt(prior.information[6]))
+            jaw_innovation = float((consensus.xi[6] - prior.mean[6]) * np.sqrt(prior.information[6]))
         return Measurement(
             prediction,
             edgels.candidates,
@@ -235,7 +235,7 @@ class Settler:
             expected.jaw_opening_m,
             uncertainty.covariance,
             expected.jaw_reported_m,
-            jaw_surprise,
+            jaw_innovation,
             Effort.NARROW,
             uncertainty.normal,
             expected.jaw_reported_m,

@@ -94,7 +94,7 @@ class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     crease: bool
     brighter: Literal["left", "right", "any"] = "any"
     rms_px: Annotated[float, Meta(ge=0.0, description="of the edge points about the taught line (px)")] = 0.0
-    seen: Annotated[float, Meta(ge=0.0, le=1.0, description="part of its profiles that showed it")] = 1.0
+    seen: Annotated[float, Meta(ge=0.0, le=1.0, description="part of its search lines that showed it")] = 1.0
     left: Look | None = None
     right: Look | None = None
 

@@ -66,7 +66,7 @@ def _predict(prediction: Prediction) -> None:
 
 
 def _of_one_edge() -> Prediction:
-    """A prediction with four profiles on one edge and one corner; only its types count."""
+    """A prediction with four search lines on one edge and one corner; only its types count."""
     one, point = np.ones(1, dtype=bool), np.zeros((1, 2))
     edge, edges = np.zeros(4, dtype=np.intp), np.zeros(1, dtype=np.intp)
     corners = PredictedCorners(np.ones((1, 3)), np.zeros((1, 3)), point, point, np.ones((1, 2, 2)), one, one)

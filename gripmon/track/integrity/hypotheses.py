@@ -16,8 +16,8 @@ that the ends of one finger do, together, or the inner edges of all fingers, whi
 """
 
 WRONG_GRIPPER = 1e-3
-"""Probability that the gripper isn't as it is said to be: a finger bent, shifted in its holder or exchanged, or the jaw
-opening off by more than the report's standard deviation allows.
+"""Probability that the gripper isn't as its file and its jaw's report have it: a finger bent, shifted in its holder or
+exchanged, or the jaw opening off by more than the report's standard deviation allows.
 """
 
 

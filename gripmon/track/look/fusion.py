@@ -89,7 +89,7 @@ class LookFusion:
         """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one; None where they
         contradict each other, and before a bias is known.
 
-        What errors of the edges outlast all backgrounds no one knows: as a place, the result is to be trusted no more
+        Which errors of the edges outlast all backgrounds is unknown: as a place, the result is to be trusted no more
         than the edges.
         """
         difference = perturbation_between(cam_T_grip, look.cam_T_grip)
