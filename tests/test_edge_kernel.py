@@ -205,7 +205,7 @@ ENTRIES = {
 
 def signatures() -> dict[str, int]:
     """For how many combinations of types each function that Python calls is compiled."""
-    rooms = (kernel, profile_kernel, lines, prediction_kernel, settling, evidence)
+    rooms = (kernel, profile_kernel, lines, prediction, prediction_kernel, settling, evidence)
     functions = {name: f for room in rooms for name, f in vars(room).items() if hasattr(f, "signatures")}
     return {name: len(functions[name].signatures) for name in ENTRIES}
 

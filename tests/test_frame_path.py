@@ -25,7 +25,7 @@ from gripmon.record.recorder import Recorder
 from gripmon.simulate import Scenario, Simulator
 
 COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames
-MOST_FILES, MOST_FUNCTIONS, MOST_CALLS = 40, 199, 242
+MOST_FILES, MOST_FUNCTIONS, MOST_CALLS = 39, 199, 242
 MOST_CONSTANTS = 423
 """Named at the top of the rooms that a frame passes: what can't be justified goes, and one idea has one number."""
 PACKAGE = str(Path(gripmon.__file__).parent)

@@ -52,7 +52,7 @@ def test_both_predict_the_same(lens: object, gripper: str, way: str, monkeypatch
     for name in ("map_x", "map_y"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=3e-7, atol=1e-4, err_msg=name)
     xi = np.array([1e-3, -2e-3, 5e-4, 0.01, -0.02, 0.005])
-    motions = [by.largest_motion(one.jacobian, xi) for by in (prediction_kernel, by_numpy)]
+    motions = [by.largest_motion(one.jacobian, xi) for by in (prediction, by_numpy)]
     assert motions[0] == pytest.approx(motions[1], rel=CLOSE)
 
 

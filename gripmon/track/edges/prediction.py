@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.compiled import compiled
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
@@ -165,7 +167,19 @@ class Prediction:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
         linearisation pose.
         """
-        return float(prediction_kernel.largest_motion(self.jacobian, xi))
+        return float(largest_motion(self.jacobian, xi))
+
+
+@compiled
+def largest_motion(jacobian: Any, xi: Any) -> float:
+    """Largest of the motions |J xi| of n samples by their ``jacobian`` (n, 6 or 7), px; 0 of none."""
+    largest = 0.0
+    for n in range(len(jacobian)):
+        moved = 0.0
+        for i in range(len(xi)):
+            moved += jacobian[n, i] * xi[i]
+        largest = max(largest, abs(moved))
+    return largest
 
 
 def lay_out(

@@ -16,18 +16,6 @@ from gripmon.model.compiled import compiled
 
 
 @compiled
-def largest_motion(jacobian: Any, xi: Any) -> float:
-    """Largest of the motions |J xi| of n samples by their ``jacobian`` (n, 6 or 7), px; 0 of none."""
-    largest = 0.0
-    for n in range(len(jacobian)):
-        moved = 0.0
-        for i in range(len(xi)):
-            moved += jacobian[n, i] * xi[i]
-        largest = max(largest, abs(moved))
-    return largest
-
-
-@compiled
 def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
     """First and last fraction and length in px (e, 3) of the longest run of each edge that is ``inside`` the image
     (e, c), less the margin; zeros if nothing is left, or the edge isn't ``wanted`` (e,).  Of edges ``uv_px`` (e, c, 2)
