@@ -22,7 +22,7 @@ from gripmon.judge.policy import Policy
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamWatch
 from gripmon.monitor import Monitor, Tracker
-from gripmon.monitor.analysis import CauseAnalysis
+from gripmon.monitor.analysis import CauseAnalysis, FrameAnalysis
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import Weigher
 from gripmon.track.edges import FingertipMeter
@@ -45,7 +45,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "update and judge": (
         (Tracker, "update"),
         (Integrity, "judge"),
-        (Monitor, "_evidence"),
+        (FrameAnalysis, "evidence"),
         (Monitor, "process"),
         (PoseAverage, "add"),
         (Policy, "measured"),
