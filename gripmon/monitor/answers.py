@@ -41,7 +41,7 @@ FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 
 
 def flat(covariance: Array) -> tuple[float, ...]:
-    """(6, 6) row by row."""
+    """A covariance (6, 6) row by row."""
     return tuple(covariance.ravel().tolist())
 
 
@@ -112,12 +112,14 @@ def measured_record(
 
 
 def unmeasured_corners(names: tuple[str, ...], fault: CornerFault) -> tuple[CornerRecord, ...]:
-    """None of them was measured, for one reason."""
+    """All corners unmeasured, for one reason."""
     return tuple(CornerRecord(name, None, None, False, fault) for name in names)
 
 
 def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float) -> Alert:
-    """Whether the picture fits the reference from which the monitor went on: by what is worth a warning, m."""
+    """The alert whether the picture fits the reference that the monitor went on from, within ``worth_m``, what is worth
+    a warning, m.
+    """
     off_m = float(np.linalg.norm(evidence.shift[:3]))
     fits = not evidence.motion.present and off_m <= worth_m + 5.0 * float(np.linalg.norm(evidence.sigma[:3]))
     text = f"restarted from {reference.reference_id}, revision {reference.revision}; the picture " + (
@@ -128,7 +130,7 @@ def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float
 
 
 def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
-    """An image that repeats an earlier one shows what was, not what is."""
+    """The refusal of an image that repeats an earlier one, with the reason; None where none does."""
     for fault in faults:
         if fault.kind == "frozen":
             return Refusal.FROZEN, fault.text
@@ -136,7 +138,7 @@ def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
 
 
 def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
-    """What the stream says of images that are refused: that they come from another camera, or are no new ones."""
+    """What the stream explains of refused images: another camera, or repeated images."""
     for fault in faults:
         if fault.kind in ("replaced", "frozen"):
             known = CauseWeight(fault.cause, 1.0)
@@ -145,8 +147,9 @@ def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
 
 
 def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
-    """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
-    not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
+    """Whether the gripper contradicts its model: one finger is where the transform has it and another, though sampled,
+    is not (hidden or bent), or the seen jaw opening is not the reported one.  ``shares``: of each finger's search lines
+    that agree.
     """
     if abs(measurement.jaw_innovation) > UNREPORTED_MOTION_SIGMAS:
         return True
@@ -162,7 +165,7 @@ class NoteTaker:
         self._of: tuple[int, Array | None] = (-1, None)
 
     def take(self, watch: MotionWatch, baseline: Baseline, average: PoseAverage, measured: bool) -> MonitorNotes:
-        """``measured``: whether the newest frame was, so that it may have been tested."""
+        """``measured``: the newest frame was, so that it may have been tested."""
         refreshes, offset = watch.test.refreshes, baseline.error
         if self._limits is None or self._of[0] != refreshes or self._of[1] is not offset:
             self._of = refreshes, offset

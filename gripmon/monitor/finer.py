@@ -52,8 +52,8 @@ robots hold what they grasp for seconds or a minute.
 
 
 class _Pending(NamedTuple):
-    """A frame that may be learnt: its image, pose (4, 4), covariance (6, 6) of the edges' errors that are others before
-    another background, opening, times, and what the look measured in it.
+    """A frame that may be learnt: its image, pose (4, 4), covariance (6, 6) of the edges' errors that change with the
+    background, opening, times, and the motion that the look measured in it.
     """
 
     image: Image
@@ -97,7 +97,7 @@ class FinerLook:
         """Of the look that is learnt; None before its first frame."""
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """The reference in force: what is learnt against the edges stays, a new version names it."""
+        """The reference in force.  What is learnt against the edges stays; the next version names the new reference."""
         self._reference = reference
 
     def state(self) -> FinerLookRecord | None:
@@ -108,7 +108,7 @@ class FinerLook:
         return FinerLookRecord(self._edges, self.version, pixels, self._fusion.state(), tuple(self._since_ns))
 
     def restore(self, record: FinerLookRecord) -> None:
-        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it isn't of this gripper, or was
+        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it is of another gripper, or was
         learnt against other edges.
         """
         if record.edges != self._edges:
@@ -128,9 +128,9 @@ class FinerLook:
         self._since_s = np.array([np.inf if since is None else 0.0 for since in self._since_ns])
 
     def refine(self, frame: Frame, standing: Standing, now_s: float, swing: Array) -> Standing:
-        """The same with the pose as edges and look have it together, and bounds that are by as much wider as that is
-        from the edges'; unchanged where the look has nothing to say, contradicts them, or isn't that of a rigid
-        gripper: a finger or the jaw isn't where it should be.  ``swing`` (6,): as the edges show it.
+        """The pose fused from edges and look, with bounds wider by how far it is from the edges' pose.  Unchanged where
+        the look measures nothing, contradicts the edges, or the gripper isn't rigid: a finger or the jaw isn't where it
+        should be.  ``swing`` (6,): variance of the vibration by the edges.
         """
         self._pending = None
         measurement = standing.measurement

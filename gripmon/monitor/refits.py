@@ -59,8 +59,8 @@ class Anchored(NamedTuple):
 
 
 class Known(NamedTuple):
-    """The anchor as a measurement: its pose (4, 4), the covariance (6, 6), and by how much it is off by the model,
-    (f, 6) or (1, 6) of zeros.
+    """The anchor as a measurement: its pose (4, 4), the covariance (6, 6), and its error (f, 6) where a finger's length
+    is off by its standard deviation, or (1, 6) of zeros.
     """
 
     anchor_T: Array
@@ -69,8 +69,8 @@ class Known(NamedTuple):
 
 
 class ModelError(NamedTuple):
-    """What the gripper file may be wrong by: each finger longer or shorter by ``sigma_m``, along ``axis_grip`` (3,);
-    ``finger`` (e,) that each edge belongs to, of ``fingers``.
+    """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
+    (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to.
     """
 
     sigma_m: float
@@ -80,7 +80,7 @@ class ModelError(NamedTuple):
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
-    """The protection levels at a ``risk``."""
+    """The protection levels at an integrity ``risk``."""
     position_m, rotation_rad, name = doubts.levels(risk)
     return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, name)
 
@@ -127,11 +127,11 @@ class Refits:
 
     @property
     def edges(self) -> NDArray[np.intp]:
-        """(v,) that the fits are made of."""
+        """(v,) edges that the fits are made of."""
         return self._normal.edge
 
     def shifts(self, base_T: Array) -> Array:
-        """(h, 6) from a pose (4, 4) near by to the fits by the frame alone."""
+        """(h, 6) perturbations from a pose (4, 4) near by to the fits by the frame alone."""
         return perturbation_between(base_T, self._fit_T) + self._free.shift
 
     def doubts(self, cam_T_grip: Array, prior: Array, anchored: Anchored | None = None) -> Doubts:
@@ -150,7 +150,7 @@ class Refits:
 
 
 def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:
-    """A bound on the error of one pose as one of another, ``away`` (6,) from it."""
+    """The bound of a pose made that of another pose, ``away`` (6,) from it."""
     return Protection(
         bound.position_m + float(np.linalg.norm(away[:3])),
         bound.rotation_rad + float(np.linalg.norm(away[3:])),
@@ -160,14 +160,14 @@ def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:
 
 
 def larger(one: Protection, other: Protection) -> Protection:
-    """The larger one of two bounds, for position and for rotation."""
+    """The larger of two bounds, for position and for rotation; the hypothesis is that of the larger position."""
     first, second = (one, other) if one.position_m >= other.position_m else (other, one)
     return Protection(first.position_m, max(first.rotation_rad, second.rotation_rad), first.risk, first.hypothesis)
 
 
 class Lasting(NamedTuple):
-    """What may have been wrong all along: g hypotheses about all of a gripper's edges with their ``name`` and ``prior``
-    (g,), and ``doubted``, the edges that each doubts; an opening that is doubted counts as one more edge.
+    """Hypotheses that may have held since the first frame: g of them about all of a gripper's edges, with ``name`` and
+    ``prior`` (g,), and ``doubted``, the edges that each leaves out; a doubted opening counts as one more edge.
     """
 
     name: tuple[str, ...]
@@ -176,14 +176,14 @@ class Lasting(NamedTuple):
 
     @classmethod
     def of(cls, every: Hypotheses) -> Lasting:
-        """Those of hypotheses about all edges that don't begin at some moment."""
+        """Those of some hypotheses about all edges that don't begin at some moment."""
         rows = np.flatnonzero(~every.sudden)
         doubted = _doubted(every, np.arange(every.keep.shape[1]))
         return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
 
     def rows(self, hypotheses: Hypotheses, edges: NDArray[np.intp]) -> NDArray[np.intp]:
-        """(g,) which of some hypotheses about the seen ``edges`` (v,) each of these is; -1 where nothing of what is
-        seen is beyond its doubt.
+        """(g,) which of the ``hypotheses`` about the seen ``edges`` (v,) each lasting one is; -1 where it leaves no
+        seen edge.
         """
         number = {doubted: k for k, doubted in reversed([*enumerate(_doubted(hypotheses, edges))])}
         known = frozenset[int]().union(*number)
@@ -250,10 +250,10 @@ class Anchor:
         self.of_model: Array = self._filters.of_model[0]
 
     def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
-        """What may have been wrong all along with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,) of those,
-        ``wander`` (6,) being the variance of the way that the gripper may have gone since.
+        """What may have been wrong since the first frame with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,)
+        of them; ``wander`` (6,): variance of the motion since the anchor.
 
-        Under each hypothesis either the average or the frame tells: which knows more, but the frame where they differ.
+        Under each hypothesis the average or the frame counts, whichever knows more; the frame where they differ.
         """
         at = perturbation_between(self._base_T, cam_T_grip)
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)

@@ -14,12 +14,12 @@ from gripmon.track.look import Fused
 class Trust:
     """What one measurement is worth.
 
-    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such, or it needs none;
-    ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount
-    explains that, too; ``grasped``: that may be something between the fingers; ``may_have_slid``: a
-    lone finger along itself, its end being seen elsewhere than it was.  ``most_probable``: the fits with the
-    anchor, and the number of the most probable hypothesis; None where there is none.  ``ends``: as they were seen.
-    ``fits``: what it was made of, without the ends where it needs none; None where no edge is seen.
+    ``protection``: of the pose that was asked about.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
+    ``displaced``: the pose is not where the anchor has it.  ``ambiguous``: something else than a knock of the mount
+    explains that as well; ``grasped``: an object between the fingers may be that.  ``may_have_slid``: a lone finger may
+    have moved along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
+    hypothesis; None where all are excluded.  ``ends``: as they were seen.  ``fits``: what the bound was made of,
+    without the ends where they aren't needed; None where no edge is seen.
     """
 
     protection: Protection
@@ -35,7 +35,7 @@ class Trust:
     @property
     def instead(self) -> tuple[int, Array, Array] | None:
         """Number of the most probable hypothesis, with the pose (4, 4) and covariance (6, 6) that the anchor and the
-        rest of the edges give under it; None where there is none.
+        kept edges give under it; None where all are excluded.
         """
         if self.most_probable is None or self.fits is None:
             return None
@@ -47,11 +47,11 @@ class Trust:
 class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
 
-    ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
-    it; ``where_it_was``: the anchor has it there; ``grasped``: something between the fingers may have shifted their
-    inner edges, and with them the opening; ``knocked``: it is there from this frame on; ``unproven``: nothing in the
-    frame proves it, though something did before; ``finer``: what the gripper's look makes of it, which then is the
-    pose.
+    ``believed``: the gripper is taken to be there, so that averages, the drift test and learning use it.
+    ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
+    edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
+    nothing in the frame proves the pose, though an earlier frame proved one.  ``finer``: the fusion of edges and look
+    that the pose is; None: the edges' alone.
     """
 
     measurement: Measurement

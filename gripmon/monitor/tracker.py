@@ -39,12 +39,13 @@ CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, followed in a later frame.  Only the first one for a gripper
-    that was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
+    """Searches for a gripper that isn't seen, one search at a time, beside the frames: begun with one frame's image,
+    followed in a later frame.  Only the first search after the gripper was lost runs within its frame: a knocked
+    gripper is found at once, and one frame is late.
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly.  A lost gripper is searched
-    for all the time as long as the last transform is held: it may come back at any moment, and goes on moving; then in
-    one of several frames.  What was found beside a doubtful fit is followed as long again: a place has to show the
+    for all the time as long as the last transform is held, and then in one of several frames: it goes on moving, and
+    may come back at any moment.  What was found beside a doubtful fit is followed for as long: a place has to show the
     fingers' ends, and clutter hides them in some frames.
     """
 
@@ -87,8 +88,8 @@ class GripperSearch:
         return Patience(self._credit >= 1.0, when_lost, at_once)
 
     def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
-        """Places to follow in this frame: what was found in an earlier one, or here if the gripper is just lost; else
-        none, and a search begins with a copy of the image.
+        """Places to follow in this frame: those that an earlier frame's search found, or this one's if the gripper was
+        just lost; else none, and a search begins with a copy of the image.
         """
         if self._found is not None:
             return self._found
@@ -100,7 +101,7 @@ class GripperSearch:
         return ()
 
     def end_frame(self, measurement: Measurement) -> None:
-        """What came of this frame."""
+        """Count what the frame has shown."""
         pays = measurement.looked_far and self._found is None
         earned = -1.0 if pays else 1.0 / self._settings.refill_frames
         self._credit = min(max(self._credit + earned, 0.0), float(self._settings.eager_frames))
@@ -165,8 +166,8 @@ class Tracker:
         return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
     def learn(self, measurement: Measurement, opening: bool) -> None:
-        """The gripper was where it was measured: that is what it usually shows, and, if the seen ``opening`` is
-        believed as well, the report's error.
+        """Learn from a frame whose pose is believed: the share of search lines that usually agree, and, if the seen
+        ``opening`` is believed as well, the report's error.
         """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
@@ -189,7 +190,7 @@ class Tracker:
         return self._meter.along
 
     def with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
-        """The same with the opening's error as earlier frames have shown it."""
+        """The measurement with the opening's error as earlier frames have shown it."""
         if reported_m is None or not self._gripper.has_jaw:
             return measurement
         if self._jaw.exact:
@@ -250,8 +251,8 @@ class Tracker:
         return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[self._settings.update_corners])
 
     def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
-        """What the fingers show one by one in a frame that was measured; takes some times as long as the measurement,
-        and may run in another thread.
+        """What each finger shows by itself in a measured frame; takes several times as long as the measurement, and may
+        run in another thread.
         """
         assert frame.image is not None
         reported = frame.jaw_opening_m is not None

@@ -33,7 +33,7 @@ it.
 
 
 class _Candidate(NamedTuple):
-    """A place where the gripper may be: its measurement, the pose (4, 4) with its covariance (6, 6), and its worth."""
+    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), and its worth."""
 
     measurement: Measurement
     cam_T_grip: Array
@@ -71,23 +71,23 @@ class Integrity:
         self._ends_seen = False
 
     def look_state(self, reference: ReferenceRecord) -> LookRecord | None:
-        """What survives a restart of the gripper's own look; None before it is learnt."""
+        """The gripper's look for the state file; None before it is learnt."""
         record = self._look.state(reference.reference_id)
         finer = None if self._finer is None else self._finer.state()
         return record if record is None or finer is None else msgspec.structs.replace(record, finer=finer)
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the way between proven poses, m² and rad²: vibration; of refined ones, if the newest is."""
+        """(6,) variance of the vibration between proven poses, m² and rad²; of refined poses if the newest is one."""
         return self._weigher.swing if self._finer_swing is None else self._finer_swing
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """The reference in force."""
+        """Tell the look which reference is in force."""
         if self._finer is not None:
             self._finer.refer(reference)
 
     def rebase(self, reference: ReferenceRecord) -> None:
-        """There is a new reference."""
+        """Expect the gripper at a new reference."""
         self._weigher.rebase(reference)
 
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
@@ -143,7 +143,7 @@ class Integrity:
         return standing
 
     def _refined(self, look: FinerLook, frame: Frame, standing: Standing, now_s: float) -> Standing:
-        """The same as the look refines it, unless that would make it worth less: finer, but past an alert limit."""
+        """The pose refined by the look, unless that puts a protection level past its alert limit."""
         finer = look.refine(frame, standing, now_s, self._weigher.swing)
         if past_alert_limit(finer.protection, self._policy) and not past_alert_limit(standing.protection, self._policy):
             finer = standing
@@ -174,8 +174,8 @@ class Integrity:
         return self._against_its_place(frame, here, trust, now_s)
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
-        """A displaced pose, or where the fingers show that it has slid from along them: something else was taken for
-        their ends.  If the gripper isn't measured there either, the same without the ends.
+        """A displaced pose, corrected where the fingers' look shows that it has slid along them, because something else
+        was taken for their ends.  If the gripper isn't measured there either: the same pose, bounded without the ends.
         """
         slide_m = self._slide_m(frame, here)
         if slide_m is None:
@@ -193,8 +193,9 @@ class Integrity:
         return measurement.prediction.moved_px(perturbation_between(self._weigher.expected[0], cam_T_grip))
 
     def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
-        """A displaced pose against the gripper's place: the one that is proven, else the place, where the mount rarely
-        leaves it.  ``at_first``: what the displaced one was worth at the first look.
+        """A displaced pose against the expected place.  The proven one is published; where both or neither are, the
+        expected place, since mounts are knocked rarely.  ``at_first``: what the displaced pose was worth before its
+        ends were looked at strictly.
         """
         there = self._at_its_place(frame, now_s)
         proven = here.trust.proven
@@ -208,8 +209,8 @@ class Integrity:
         return _reaching(standing, here.cam_T_grip)
 
     def _held(self, frame: Frame, now_s: float) -> Standing | None:
-        """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing
-        proved that place, or too little is seen there.
+        """For a frame in which the gripper wasn't found: what is measured at the anchor.  None without an anchor, where
+        too little is seen there, or where the bound is past an alert limit.
         """
         there = None if self._weigher.anchor is None else self._at_its_place(frame, now_s)
         if there is None:
@@ -218,8 +219,8 @@ class Integrity:
         return None if past_alert_limit(standing.protection, self._policy) else standing
 
     def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
-        """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
-        look like their ends elsewhere.  None also where too little of the sides is seen there.
+        """The measurement at the expected place, if the gripper may still be there: marks on the fingers and borders
+        beside them look like ends elsewhere.  None where that is excluded, or too little of the sides is seen.
         """
         weigher = self._weigher
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
@@ -228,8 +229,8 @@ class Integrity:
         return there
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
-        """The measurement at a pose (4, 4) with what lies within the standard deviations (6,) of it; None where nothing
-        is seen.
+        """The measurement at a pose (4, 4), of edges within the standard deviations (6,) of it; None where no edge is
+        seen.
         """
         measurement = self._tracker.measure_held(frame, cam_T_grip, sigma)
         if measurement.consensus.share == 0.0:
@@ -262,9 +263,9 @@ class Integrity:
         return Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
-        """Whether the mount was knocked, the edges showing ``beside_px`` from the old place: so rare that one lucky
-        frame doesn't say so, unless that is no farther than a creep takes them.  Another one has to prove it before the
-        old place is proven again, or something else explains it; it may ring meanwhile.
+        """Whether the mount was knocked; the edges show ``beside_px`` from the old place.  Knocks are so rare that one
+        frame doesn't suffice, unless the motion is as small as a creep.  Further frames have to prove the new place
+        before the old one is proven again or something else explains the motion; the mount may ring meanwhile.
         """
         if not trust.proven:
             return False
@@ -272,7 +273,9 @@ class Integrity:
         return self._elsewhere >= (1 if beside_px < ONE_EDGE_PX else self._policy.confirm_frames)
 
     def _by_anchor(self, frame: Frame, measurement: Measurement, trust: Trust, now_s: float) -> Standing:
-        """What the frame leaves open the anchor tells."""
+        """Publish the pose under the most probable hypothesis, by the anchor and the edges that it keeps: the frame
+        alone leaves it open.
+        """
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
         seen = self._look_supports(frame, measurement, cam_T_grip)
@@ -281,15 +284,17 @@ class Integrity:
         return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
     def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
-        """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""
+        """Whether the gripper's look is seen at the expected place, and so much less at this pose that it can't be
+        here.
+        """
         if not self._look.ready or frame.image is None:
             return False
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
     def _slide_m(self, frame: Frame, here: _Candidate) -> Array | None:
-        """By how much (3,), gripper frame, the fingers are seen to stand along themselves from a candidate's pose; None
-        where they don't.
+        """(3,) motion along the fingers, gripper frame, by which their look is seen beside a candidate's pose; None
+        where it isn't.
         """
         if frame.image is None:
             return None
@@ -304,7 +309,7 @@ class Integrity:
 
 
 def _reaching(standing: Standing, other_T: Array) -> Standing:
-    """The same where the gripper may as well be at another pose (4, 4)."""
+    """The same with a bound that includes another possible pose (4, 4), and not believed."""
     away = perturbation_between(standing.cam_T_grip, other_T)
     bound = reaching(standing.protection, away, "the fingers stand elsewhere, where their ends are seen, too")
     return replace(standing, protection=bound, believed=False)

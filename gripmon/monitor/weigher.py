@@ -65,8 +65,8 @@ CORNERS_WHERE_EXPECTED = 3
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
-    """(6,) variance of the way between one pose and the next, after one more ``way`` (6,) that the poses' own errors,
-    of variances ``noise`` (6,), are part of.
+    """(6,) variance of the mount's vibration after one more ``way`` (6,) between consecutive poses; ``noise`` (6,):
+    variances that the poses' own errors add to it.
     """
     # A knock is not a vibration, but what rings after it is.
     most = CONTRADICTION_SQUARE * (noise + swing)
@@ -74,7 +74,7 @@ def swinging(swing: Array, way: Array, noise: Array) -> Array:
 
 
 class Weigher:
-    """Bounds for one monitor's measurements, and the anchor that they rest on."""
+    """Protection levels of one monitor's measurements, and the anchor that they rest on."""
 
     def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
@@ -96,8 +96,8 @@ class Weigher:
         self.rebase(reference)
 
     def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
-        """Where to expect the gripper before anything proves it: at a reference, or at the pose (4, 4) that was known
-        last.  What an older reference left unexplained is over.
+        """Expect the gripper at a reference, or at the pose (4, 4) that was known last, until a frame proves where it
+        is.  What was unexplained at an older reference no longer counts.
         """
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
@@ -124,10 +124,10 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
     ) -> Trust:
-        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
+        """Bound the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
 
-        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there;
+        ``ends``: the fingers' ends as seen; None where they were not looked at.  ``explained``: number of the
+        hypothesis under which the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.
         ``slid``: the fingers are seen elsewhere along themselves, so that what was taken for their ends is something
         else.
         """
@@ -183,10 +183,11 @@ class Weigher:
     def _doubts_of_frame(
         self, measurement: Measurement, fits: Refits, prior: Array, cam_T_grip: Array, alone: float | None
     ) -> tuple[Doubts, Refits | None]:
-        """What may have been wrong all along by a frame's ``fits`` alone, with probabilities ``prior`` (h,).
+        """What may have been wrong since the first frame, by this frame's ``fits`` alone, with probabilities ``prior``
+        (h,).
 
-        ``alone``: if what looks like the fingers' ends may be something else, the probability that only the frame tells
-        where they are; then the fits without the ends are returned as well.
+        ``alone``: the probability that only this frame shows where the fingers' ends are, if what looks like them may
+        be something else; then the fits without the ends are returned as well.
         """
         hypotheses = fits.hypotheses
         # What knocks the mount bends a finger, too; but a finger is taken to be straight at first.
@@ -202,7 +203,7 @@ class Weigher:
         return doubts + without.doubts(cam_T_grip, besides).among(counts & more), without
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
-        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
+        """Take a proven pose (4, 4) with its covariance (6, 6) into the anchor, or begin a new anchor with it."""
         assert trust.fits is not None
         rows = self._about(trust.fits.edges)[1]
         self._slid = trust.may_have_slid
@@ -218,9 +219,9 @@ class Weigher:
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
-        """Whether the end of a lone finger may be something else though its corners are seen: there are other corners
-        than its own, of marks on it and of what is beside it.  It proves a place from which the edges don't show apart,
-        at first that of the reference, and each after it; the rest a person has to say, by a new reference.
+        """Whether a lone finger may have slid along itself though corners are seen: they may be those of a mark on it
+        or of what lies beside it.  They prove a place that the edges don't distinguish from the reference's, and then
+        each place within a step of the proven one; elsewhere a person has to say so, by a new reference.
         """
         if self._slid is None:
             covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor
@@ -232,8 +233,8 @@ class Weigher:
         return bool(self._slid) or (displaced and measurement.prediction.moved_px(way) >= ONE_EDGE_PX)
 
     def held(self, protection: Protection, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The bounds of a transform that was measured ``unseen_s`` ago, with the covariance (6, 6) of what may have
-        happened since on top; ``hidden``: not the image is bad, but nothing is seen of the gripper in it.
+        """The protection level of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
+        ``growth``.  ``hidden``: the image is good, but the gripper isn't seen in it.
         """
         risk = protection.risk
         if self._knocked(unseen_s, hidden) > risk:
@@ -245,12 +246,12 @@ class Weigher:
         )
 
     def _knocked(self, unseen_s: float, hidden: bool) -> float:
-        """Probability that the mount was knocked since then; ``hidden``: something is at the gripper."""
+        """Probability that the mount was knocked within ``unseen_s``; ``hidden``: something hides the gripper."""
         return max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
-        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
-        further corner.
+        """How often the fingers' ends are seen where the pose has them: for each finger once by its edges, and once
+        more by each further corner.
         """
         return self._times(self._across(measurement), ends)
 
@@ -279,8 +280,8 @@ class Weigher:
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
-        proven, of which their ends' edges say nothing: each side may be misread as an end may.  Before anything is
-        proven, to exclude one just now.
+        proven (before anything is proven: just now).  The edges at the ends don't show such a knock; each side may be
+        misread as an end may.
         """
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
@@ -289,14 +290,14 @@ class Weigher:
         return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
-        """Whether a pose (4, 4) is as certain as it has to be by some fits: by those without the ends it needs none.
-        Curved and tapered fingers tell by themselves where they are along themselves.
+        """Whether the protection level of a pose (4, 4) by some fits is within the alert limits.  Curved and tapered
+        fingers show without their ends where they are along themselves.
         """
         bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
         return past_alert_limit(bound, self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
-        """The bound by what the first frames differ from the reference, ``away`` (6,)."""
+        """The protection level where the first frames differ from the reference by ``away`` (6,)."""
         risk = self._policy.integrity_risk
         covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
         position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
@@ -304,14 +305,14 @@ class Weigher:
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
+        """(6,) variance of the motion since the anchor: creep and vibration."""
         if self.anchor is None:
             return self.swing
         return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
 
     def _refitted(self, measurement: Measurement, now_s: float, wander: Array) -> tuple[Refits, Anchored]:
-        """The fits of a measurement, alone and with the anchor after a way with the variances ``wander`` (6,).  A frame
-        is weighed again when its ends were looked at, and for another pose that it allows.
+        """The fits of a measurement, alone and with the anchor after a motion of variances ``wander`` (6,).  They are
+        kept for the frame, which is weighed again once its ends are looked at, and for another pose that it allows.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
@@ -326,7 +327,7 @@ class Weigher:
         return fits, fits.anchored
 
     def _about(self, edges: NDArray[np.intp]) -> tuple[Hypotheses, NDArray[np.intp]]:
-        """What may be wrong with a fit of ``edges`` (v,), and which of it is what may have been wrong all along."""
+        """The hypotheses about a fit of ``edges`` (v,), and which of them each lasting hypothesis is."""
         key = edges.tobytes()
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
@@ -337,8 +338,8 @@ class Weigher:
 
 
 def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
-    """Whether the fingers' ends are seen as ends: where the gripper is expected fewer of their corners do, and where it
-    is seen ``again`` as noise has it, one of each finger.
+    """Whether the fingers' ends are seen as ends.  Where the gripper is expected fewer corners suffice; where its
+    innovation is within noise (``again``), one of each finger.
     """
     if ends is None:
         return False
@@ -347,7 +348,7 @@ def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
 
 
 def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
-    """Whether some edges are seen on one straight line of the image."""
+    """Whether some edges lie on one straight line of the image."""
     prediction = measurement.prediction
     uv_px = prediction.uv_px[np.isin(prediction.layout.edge, edges) & prediction.ok]
     if len(uv_px) == 0:
@@ -369,7 +370,7 @@ def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
 def foresee_protection(
     tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
 ) -> Protection:
-    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
+    """The protection level of a single frame that shows what the measurement does, with its fingers' ends proven."""
     if not len(measurement.normal.edge):
         return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
     hypotheses = _hypotheses_about(

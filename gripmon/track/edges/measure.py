@@ -169,9 +169,7 @@ class FingertipMeter(FingerMeter):
         return bool(np.isin(prediction.layout.edges, self._at_ends).any())
 
     def _at_rivals(self, image: Image, expected: Expected, rivals: tuple[Array, ...], best: Measurement) -> Measurement:
-        """The best of the expected place and of others at which the gripper was; what has been fitted from there once
-        isn't fitted again.
-        """
+        """The best of the expected place and of others at which the gripper was; none is fitted twice."""
         for rival in rivals:
             moved_px = best.prediction.moved_px
             away = perturbation_between(expected.cam_T_grip, rival), perturbation_between(best.cam_T_grip, rival)
@@ -210,7 +208,7 @@ class FingertipMeter(FingerMeter):
     def measure_held(
         self, image: Image, cam_T_grip: Array, sigma: Array, jaw_opening_m: float, usual_share: float
     ) -> Measurement:
-        """Measure at a pose (4, 4), with what lies within the standard deviations (6,) of it, m and rad, alone."""
+        """Measure at a pose (4, 4), of edges within the standard deviations (6,) of it, m and rad; nowhere else."""
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         held = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m, cam_T_grip, sigma)
         measurement = self._settle(image, held)
@@ -218,7 +216,7 @@ class FingertipMeter(FingerMeter):
         return measurement
 
     def _possible_opening_m(self, jaw_opening_m: float) -> float:
-        """Encoders report a little beyond the end at which a jaw stands."""
+        """An opening within the jaw's range: encoders report a little beyond its ends."""
         return min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
 
     def ends(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
@@ -226,8 +224,8 @@ class FingertipMeter(FingerMeter):
         return self._ends.seen(image, measurement, strict)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
-        """The best of the zooms: the image may have lost, or found, its focus.  Once the gripper is lost one of the
-        others is tried a frame, in turn.
+        """The best of the zooms: the image may have lost, or regained, its focus.  Once the gripper is lost, one other
+        zoom is tried a frame, in turn.
         """
         chosen = self._zoom
         others = [zoom for zoom in ZOOMS if zoom != chosen]
@@ -306,7 +304,7 @@ class FingertipMeter(FingerMeter):
         return self._fitted_again(image, places, sought.least_share)
 
     def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
-        """The best of starts all over the reach of the search lines."""
+        """The best start within the reach of the search lines."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
             return []
@@ -317,12 +315,12 @@ class FingertipMeter(FingerMeter):
         return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
 
     def _fitted_again(self, image: Image, places: list[_Place], least_share: float) -> Sequence[Expected]:
-        """The best of some places, where rough fits from there lead: those with so large a share."""
+        """Where rough fits from some places lead: the best of them with at least ``least_share``."""
         again = [self._tried(image, place.expected) for place in _best(places)]
         return [place.expected for place in _promising(again, least_share)]
 
     def _far_places(self, image: Image, expected: Expected, poses: Array, usual_share: float) -> list[_Place]:
-        """Proposed ``poses`` (s, 4, 4) up to the first that shows as well as usual."""
+        """Rough fits at proposed ``poses`` (s, 4, 4), up to the first that shows as much as usual."""
         found: list[_Place] = []
         layout = None
         for pose in poses:
@@ -334,7 +332,7 @@ class FingertipMeter(FingerMeter):
         return found
 
     def _tried(self, image: Image, expected: Expected, layout: EdgeLayout | None = None) -> _Place:
-        """One rough fit, on a layout that was made near by, or on its own."""
+        """One rough fit at a place, on its own layout unless one made near by is given."""
         prediction = self._predict(layout or self._lay_out(expected), expected)
         if not prediction.ok.any():
             return _Place(0.0, expected)
@@ -344,7 +342,7 @@ class FingertipMeter(FingerMeter):
         return _Place(fit.share, self._moved(prediction, fit.xi, expected))
 
     def _rough_share(self, image: Image, expected: Expected) -> float:
-        """What one rough fit shows from where the gripper is expected."""
+        """The share of a rough fit where the gripper is expected."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
             return 0.0
@@ -357,7 +355,7 @@ def _best(places: list[_Place], count: int = FITTED_AGAIN) -> list[_Place]:
 
 
 def _promising(places: list[_Place], least: float) -> list[_Place]:
-    """The best places with at least such a share, and only those that may turn out as good as the first."""
+    """The best places with at least the share ``least``, and only those that may turn out as good as the first."""
     best = _best(places, SETTLED)
     return [place for place in best if place.share >= max(least, NEARLY_AS_GOOD * best[0].share)]
 
@@ -373,5 +371,5 @@ def _seen_part(consensus: RobustFit, prediction: Prediction) -> float:
 
 
 def _completeness(consensus: RobustFit, prediction: Prediction) -> float:
-    """At a wrong opening one finger can agree alone: what agrees counts by how many edges it is spread over."""
+    """The share weighted by the part of the edges that are seen: at a wrong opening one finger can agree alone."""
     return consensus.share * _seen_part(consensus, prediction)
