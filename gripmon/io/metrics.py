@@ -165,11 +165,14 @@ class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     enabled: Annotated[bool, Meta(description="true: metrics for Prometheus over HTTP")] = False
     address: Annotated[
         str,
-        Meta(min_length=1, description="where to listen; whoever reaches it may read, 0.0.0.0 is every network"),
+        Meta(
+            min_length=1,
+            description="address to listen on, from which anyone may read; 0.0.0.0: all network interfaces",
+        ),
     ] = "127.0.0.1"
-    port: Annotated[int, Meta(ge=1, le=65535, description="TCP port, one for each monitor of a machine (no unit)")] = (
-        9464
-    )
+    port: Annotated[
+        int, Meta(ge=1, le=65535, description="TCP port; each monitor on a machine needs its own (no unit)")
+    ] = 9464
 
 
 class _Family(NamedTuple):

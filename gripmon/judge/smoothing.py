@@ -79,13 +79,11 @@ class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     creep_m_per_sqrt_s: Annotated[
         float,
-        Meta(
-            ge=0.0, le=0.1, description="random walk of the TCP's position, each axis (m per square root of a second)"
-        ),
+        Meta(ge=0.0, le=0.1, description="random walk of the TCP's position, per axis (m per square root of a second)"),
     ] = 1e-5
     creep_rad_per_sqrt_s: Annotated[
         float,
-        Meta(ge=0.0, le=1.0, description="random walk of the rotation, each axis (rad per square root of a second)"),
+        Meta(ge=0.0, le=1.0, description="random walk of the rotation, per axis (rad per square root of a second)"),
     ] = 1e-4
 
 

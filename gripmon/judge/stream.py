@@ -68,20 +68,26 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """When a stream of frames counts as faulty."""
 
     frozen_s: Annotated[
-        float, Meta(gt=0.0, le=3600.0, description="identical images for so long mean a frozen camera (s)")
+        float,
+        Meta(gt=0.0, le=3600.0, description="time of identical images after which the camera counts as frozen (s)"),
     ] = 1.0
-    frozen_frames: Annotated[int, Meta(ge=2, le=100000, description="and at least so many of them")] = 10
+    frozen_frames: Annotated[int, Meta(ge=2, le=100000, description="least number of identical images for that")] = 10
     frozen_coded_s: Annotated[
         float,
         Meta(
             gt=0.0,
             le=3600.0,
-            description="the same where images have come that repeat in large parts: H.264 and the like send nothing "
-            "for what stands still until their next whole image (s)",
+            description="the same for a stream whose images repeat in large parts: H.264 and similar codecs "
+            "send nothing for still parts until the next key frame (s)",
         ),
     ] = 10.0
     rate_s: Annotated[
-        float, Meta(gt=0.0, le=3600.0, description="a frame rate that is not the usual one for so long is a fault (s)")
+        float,
+        Meta(
+            gt=0.0,
+            le=3600.0,
+            description="time for which the frame rate must differ from the usual one to count as a fault (s)",
+        ),
     ] = 2.0
 
 

@@ -23,27 +23,33 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """The test's false-alarm rate, the noise of the arm and rate of wrong spots, and the severity of motions."""
 
     false_alarms_per_1000_pulses: Annotated[
-        float, Meta(gt=0.0, le=10.0, description="motions that an unmoved set-up may be said to have made (1/1000)")
+        float, Meta(gt=0.0, le=10.0, description="false alarms per 1000 pulses of an unmoved set-up (1/1000)")
     ] = 0.1
     arm_noise_m: Annotated[
         float,
-        Meta(ge=0.0, le=0.1, description="standard deviation of the arm's reported positions, each axis (m)"),
+        Meta(ge=0.0, le=0.1, description="standard deviation of the arm's reported positions, per axis (m)"),
     ] = 1e-4
     arm_noise_rad: Annotated[
         float,
-        Meta(ge=0.0, le=0.5, description="standard deviation of the arm's reported rotations, each axis (rad)"),
+        Meta(ge=0.0, le=0.5, description="standard deviation of the arm's reported rotations, per axis (rad)"),
     ] = 2e-4
     wrong_spots: Annotated[
-        float, Meta(gt=0.0, le=0.5, description="part of the pulses whose spot may be a reflection or none at all")
+        float,
+        Meta(
+            gt=0.0,
+            le=0.5,
+            description="expected fraction of pulses whose detected spot is a reflection or no spot at all",
+        ),
     ] = 0.2
     probable: Annotated[
-        float, Meta(gt=0.5, lt=1.0, description="probability from which a cause is named, else it is unknown")
+        float,
+        Meta(gt=0.5, lt=1.0, description="probability from which a cause is named; below it the cause is unknown"),
     ] = 0.9
     warn_m: Annotated[
-        float, Meta(gt=0.0, le=1.0, description="shift of the spots from which a motion is a warning (m)")
+        float, Meta(gt=0.0, le=1.0, description="shift of the spots at which a motion becomes a warning (m)")
     ] = 1e-3
     limit_m: Annotated[
-        float, Meta(gt=0.0, le=1.0, description="shift of the spots from which a motion is an error (m)")
+        float, Meta(gt=0.0, le=1.0, description="shift of the spots at which a motion becomes an error (m)")
     ] = 5e-3
     lost_pulses: (
         Annotated[
@@ -54,10 +60,11 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     ) = None
     """Absent: enough that wrong spots alone reach it less often than the false-alarm rate."""
     confirm_pulses: Annotated[
-        int, Meta(ge=1, le=1000, description="good pulses after a start, or after lost ones, until it counts as valid")
+        int,
+        Meta(ge=1, le=1000, description="good pulses after a start or a loss before the calibration counts as valid"),
     ] = 2
     update_alert_s: Annotated[
-        float, Meta(ge=0.0, le=3600.0, description="an open alert that changes is updated so often at most (s)")
+        float, Meta(ge=0.0, le=3600.0, description="shortest time between two updates of an open alert (s)")
     ] = 2.0
 
     @property

@@ -287,22 +287,28 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         Meta(
             ge=0.0,
             le=10.0,
-            description="of a pulse's frames those so near to its ends are left out: exposure, transfer, laser (s)",
+            description="frames this close to either end of a pulse are left out, for exposure, transfer and "
+            "the laser's rise (s)",
         ),
     ] = 0.05
     history_s: Annotated[
         float,
-        Meta(gt=0.0, le=600.0, description="frames are kept for so long, for pulses that are reported afterwards (s)"),
+        Meta(gt=0.0, le=600.0, description="how long frames are kept for pulses that are reported afterwards (s)"),
     ] = 3.0
-    history_bytes: Annotated[int, Meta(ge=1_000_000, description="memory for them; the oldest give way (bytes)")] = (
-        500_000_000
-    )
+    history_bytes: Annotated[
+        int, Meta(ge=1_000_000, description="memory for these frames; the oldest are dropped (bytes)")
+    ] = 500_000_000
     most_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="of a pulse at most as many frames, the last ones, are averaged (frames)")
+        int,
+        Meta(ge=1, le=1000, description="largest number of a pulse's frames that are averaged, the last ones (frames)"),
     ] = 8
     wait_s: Annotated[
         float,
-        Meta(gt=0.0, le=3600.0, description="so long after its end, from its arrival, frames of a pulse may come (s)"),
+        Meta(
+            gt=0.0,
+            le=3600.0,
+            description="time after the arrival of a pulse's end in which its frames may still come (s)",
+        ),
     ] = 10.0
 
 

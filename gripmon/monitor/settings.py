@@ -22,8 +22,8 @@ class LookSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     enabled: Annotated[
         bool,
         Meta(
-            description="whether pixels inside the fingers, learnt while the monitor runs, refine the "
-            "edges' transform; the protection level still rests on the edges"
+            description="true: pixels inside the fingers, learned while the monitor runs, refine the "
+            "transform that the edges give; the protection level still rests on the edges"
         ),
     ] = False
 
@@ -33,27 +33,25 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     measurement: Annotated[
         Literal["edges", "corners"],
-        Meta(description="what the update rests on: all agreed edge points, or the corners of equation (17)"),
+        Meta(description="what the pose update uses: all inlier edge points, or the corners as in equation (17)"),
     ] = "edges"
     update_corners: Annotated[
         Literal["all", "3P", "4P", "5P"],
         Meta(
-            description="with measurement: corners, which ones: all that are usable, or so many of them next to the TCP"
+            description="with measurement: corners, which corners are used: all usable ones, or the given "
+            "number nearest the TCP"
         ),
     ] = "all"
     recalibrate_corners: Annotated[
         Literal["all", "4P", "5P"],
-        Meta(
-            description="which corners a recalibration takes: all that are usable, or so many of them next to the TCP"
-        ),
+        Meta(description="which corners a recalibration uses: all usable ones, or the given number nearest the TCP"),
     ] = "all"
     bit_depth: Annotated[
         int,
         Meta(
             ge=8,
             le=16,
-            description="how many of the 16 bits of an image the camera fills, the lowest ones: 10 for Mono10, 12 for "
-            "Mono12 (bit)",
+            description="significant bits of a 16-bit image, the lowest ones: 10 for Mono10, 12 for Mono12 (bit)",
         ),
     ] = 16
     jaw_sigma_m: Annotated[
@@ -61,8 +59,8 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(
             ge=0.0,
             le=0.05,
-            description="standard deviation of the part of the reported jaw opening's error that changes as the jaw "
-            "moves; 0: the report is exact (m)",
+            description="standard deviation of the reported jaw opening's error, the part that changes as the "
+            "jaw moves; 0: the reported opening is exact (m)",
         ),
     ] = 5e-5
     jaw_offset_sigma_m: Annotated[
@@ -70,24 +68,24 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(
             ge=0.0,
             le=0.05,
-            description="standard deviation of the part that never changes; no effect where the report is exact (m)",
+            description="standard deviation of the constant part of that error; no effect where jaw_sigma_m is 0 (m)",
         ),
     ] = 2e-4
     floor_m: Annotated[
         float,
-        Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)"),
+        Meta(ge=0.0, le=0.01, description="systematic position error that averaging does not remove, per axis (m)"),
     ] = 2e-6
     floor_rad: Annotated[
         float,
-        Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)"),
+        Meta(ge=0.0, le=0.1, description="systematic rotation error that averaging does not remove, per axis (rad)"),
     ] = 5e-5
     model_sigma_m: Annotated[
         float,
         Meta(
             ge=0.0,
             le=0.01,
-            description="standard deviation of each finger's length in the gripper file, for the protection level; "
-            "none where edges were taught (m)",
+            description="standard deviation of each finger's length in the gripper file, for the protection "
+            "level; taken as 0 where edges were taught (m)",
         ),
     ] = 1e-4
     corners: MeasurementSettings = MeasurementSettings()

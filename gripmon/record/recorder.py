@@ -53,51 +53,62 @@ class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         Meta(
             ge=0.0,
             le=1000.0,
-            description="images and overlays a second of capture time, besides those at alerts and state changes (Hz)",
+            description="rate of recorded images and overlays in capture time, besides those at alerts and "
+            "state changes (Hz)",
         ),
     ] = 10.0
     image_every: Annotated[
-        int, Meta(ge=0, description="besides, the image of every n-th frame; 1: of every frame; 0: none (frames)")
+        int, Meta(ge=0, description="in addition, the image of every n-th frame; 1: every frame; 0: none (frames)")
     ] = 0
     around_alert_s: Annotated[
         float,
         Meta(
             ge=0.0,
             le=600.0,
-            description="so long before and after an alert every image is kept; 0: none but the usual ones (s)",
+            description="time before and after an alert in which every image is kept; 0: only the usual images (s)",
         ),
     ] = 5.0
     ring_bytes: Annotated[
-        int, Meta(ge=0, description="memory for the images before an alert; the oldest give way (bytes)")
+        int, Meta(ge=0, description="memory for the images before an alert; the oldest are dropped (bytes)")
     ] = 100_000_000
     image_format: Annotated[Literal["jpeg", "png"], Meta(description="png is lossless and about five times larger")] = (
         "jpeg"
     )
     jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="JPEG quality (%)")] = 85
     queue_frames: Annotated[
-        int, Meta(ge=1, le=100_000, description="frames that wait for a slow recording before frames are dropped")
+        int,
+        Meta(ge=1, le=100_000, description="length of the queue to the recording; when it is full, frames are dropped"),
     ] = 512
     queue_images: Annotated[
-        int, Meta(ge=1, le=256, description="images that wait for a slow recording before images are dropped")
+        int,
+        Meta(
+            ge=1,
+            le=256,
+            description="length of the queue of images to the recording; when it is full, images are dropped",
+        ),
     ] = 8
     flush_period_s: Annotated[
-        float, Meta(ge=0.05, le=10.0, description="how often the file is written: the most that a crash can lose (s)")
+        float,
+        Meta(
+            ge=0.05, le=10.0, description="period at which the file is written, and the most that a crash can lose (s)"
+        ),
     ] = 0.5
-    min_free_bytes: Annotated[
-        int, Meta(ge=0, description="space that the disk keeps; recording pauses below it (bytes)")
-    ] = 200_000_000
+    min_free_bytes: Annotated[int, Meta(ge=0, description="free disk space below which recording pauses (bytes)")] = (
+        200_000_000
+    )
     max_file_bytes: Annotated[
-        int, Meta(ge=100_000, description="a file this long is closed and the next begun (bytes)")
+        int, Meta(ge=100_000, description="size at which a file is closed and the next one begun (bytes)")
     ] = 500_000_000
     max_file_s: Annotated[
-        float, Meta(ge=1.0, description="a file this old is closed and the next begun once it holds frames (s)")
+        float, Meta(ge=1.0, description="age at which a file that holds frames is closed and the next one begun (s)")
     ] = 300.0
     budget_bytes: Annotated[
         int,
         Meta(
             ge=0,
-            description="all recordings of this robot and camera in the directory, earlier runs' too: beyond this the "
-            "oldest without a .pinned file are deleted; at least 4 * max_file_bytes; 0: no limit (bytes)",
+            description="limit for all recordings of this robot and camera in the directory, earlier runs "
+            "included: beyond it the oldest without a .pinned file are deleted; at least 4 * "
+            "max_file_bytes; 0: no limit (bytes)",
         ),
     ] = 50_000_000_000
 
@@ -121,7 +132,7 @@ class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         Meta(
             ge=10_000_000,
             le=64_000_000_000,
-            description="what is kept for viewers that join late or fall behind; the oldest goes (bytes)",
+            description="memory for viewers that join late or fall behind; the oldest data are dropped (bytes)",
         ),
     ] = 300_000_000
 

@@ -46,10 +46,10 @@ class ReferenceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     cam_T_grip: TransformSettings
     id: Annotated[str, Meta(min_length=1, description="name of this calibration in messages")] | None = None
     position_sigma_m: Annotated[
-        float, Meta(gt=0.0, le=0.1, description="its standard deviation in position, each axis (m)")
+        float, Meta(gt=0.0, le=0.1, description="standard deviation of the reference's position, per axis (m)")
     ] = 0.001
     rotation_sigma_rad: Annotated[
-        float, Meta(gt=0.0, le=0.5, description="its standard deviation in rotation, each axis (rad)")
+        float, Meta(gt=0.0, le=0.5, description="standard deviation of the reference's rotation, per axis (rad)")
     ] = 0.01
     covariance: (
         Annotated[
@@ -126,8 +126,8 @@ class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             str,
             Meta(
                 min_length=1,
-                description="table of the pulses (CSV), relative to this file, for a folder or a video; others come "
-                "over the network",
+                description="table of the pulses (CSV), relative to this file, for a folder or a video; live "
+                "pulses come over the network",
             ),
         ]
         | None
@@ -135,7 +135,7 @@ class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     no_spot_alert_after_s: (
         Annotated[
             float,
-            Meta(gt=0.0, description="an alert when no spot could be judged for this time; leave out: never (s)"),
+            Meta(gt=0.0, description="time without a usable spot after which there is an alert; absent: never (s)"),
         ]
         | None
     ) = None

@@ -207,8 +207,8 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         tuple[Literal["valid", "suspect"], ...],
         Meta(
             min_length=1,
-            description="which transforms are published on tf_topic and pose_topic; unknown ones never are, since tf "
-            "can't say that it isn't sure",
+            description="verdicts whose transforms are published on tf_topic and pose_topic; unknown is never "
+            "published, since tf has no field for it",
         ),
     ] = ("valid",)
     tf_topic: Annotated[str, Meta(description="topic of the tf2_msgs/TFMessage")] = "/tf"

@@ -295,11 +295,11 @@ class JointOpening(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     joints: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, max_length=8, description="names in JointState; of several the positions are added"),
+        Meta(min_length=1, max_length=8, description="joint names in JointState; the positions of several are summed"),
     ]
-    scale: Annotated[
-        float, Meta(description="metres of opening for a unit of the summed positions (m/m, or m/rad)")
-    ] = 1.0
+    scale: Annotated[float, Meta(description="metres of opening per unit of the summed positions (m/m, or m/rad)")] = (
+        1.0
+    )
     offset_m: Annotated[float, Meta(description="opening where the summed positions are zero (m)")] = 0.0
 
     def opening_m(self, positions: Mapping[str, float]) -> float | None:

@@ -37,7 +37,7 @@ class FolderSettings(
 
     path: Annotated[str, msgspec.Meta(min_length=1, description="folder with the images")]
     fps: Annotated[
-        float, msgspec.Meta(gt=0, le=10000, description="frames a second where there are no time stamps (1/s)")
+        float, msgspec.Meta(gt=0, le=10000, description="frame rate where there are no time stamps (1/s)")
     ] = 25.0
     timestamps: Annotated[
         str | None,

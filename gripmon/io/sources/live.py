@@ -129,7 +129,7 @@ class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     ]
     backend: Annotated[
         Backend | None,
-        msgspec.Meta(description="part of OpenCV that opens the device; absent: by the form of the device"),
+        msgspec.Meta(description="OpenCV backend that opens the device; absent: chosen by the form of the device"),
     ] = None
     width_px: Annotated[Pixels | None, msgspec.Meta(description="image width to ask for (px)")] = None
     height_px: Annotated[Pixels | None, msgspec.Meta(description="image height to ask for (px)")] = None
@@ -144,14 +144,15 @@ class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         float, msgspec.Meta(gt=0, le=120, description="longest wait for a URL's connection (s)")
     ] = 5.0
     read_timeout_s: Annotated[
-        float, msgspec.Meta(gt=0, le=120, description="a URL silent for so long is given up and opened again (s)")
+        float,
+        msgspec.Meta(gt=0, le=120, description="a URL that sends nothing for this time is closed and opened again (s)"),
     ] = 3.0
     retry_first_s: Annotated[
         float,
         msgspec.Meta(gt=0, le=60, description="pause before the first new attempt to connect, doubled each time (s)"),
     ] = 0.5
     retry_longest_s: Annotated[
-        float, msgspec.Meta(gt=0, le=600, description="the pause between attempts grows no longer than this (s)")
+        float, msgspec.Meta(gt=0, le=600, description="longest pause between attempts to connect (s)")
     ] = 10.0
 
 

@@ -60,12 +60,13 @@ class NetworkSettings(
     format: Annotated[
         Format,
         msgspec.Meta(
-            description="auto: raw, jpeg or png, whatever comes; ros2_image, ros2_compressed: sensor_msgs/Image, "
-            "CompressedImage"
+            description="auto: raw, JPEG or PNG, recognised by content; ros2_image, ros2_compressed: "
+            "sensor_msgs/Image, CompressedImage"
         ),
     ] = "auto"
     silent_after_s: Annotated[
-        float, msgspec.Meta(gt=0.0, le=3600.0, description="no frame for so long: the camera counts as gone (s)")
+        float,
+        msgspec.Meta(gt=0.0, le=3600.0, description="time without a frame after which the camera counts as lost (s)"),
     ] = 1.0
 
 

@@ -24,25 +24,29 @@ class SimulatedSettings(
     """A simulated camera with the configuration's lens, gripper and calibration."""
 
     scenario: Annotated[
-        str, msgspec.Meta(min_length=1, description="name of a scenario, or a file *.yaml with one")
+        str, msgspec.Meta(min_length=1, description="name of a built-in scenario, or a YAML file that describes one")
     ] = "demo"
     duration_s: Annotated[
         Annotated[float, msgspec.Meta(gt=0, le=1e7)] | None,
-        msgspec.Meta(description="length to which a named scenario is stretched; absent: its own (s)"),
+        msgspec.Meta(description="length to which a built-in scenario is stretched; absent: its own length (s)"),
     ] = None
     fps: Annotated[
         Annotated[float, msgspec.Meta(gt=0, le=1000)] | None,
-        msgspec.Meta(description="frame rate of a named scenario; absent: its own (1/s)"),
+        msgspec.Meta(description="frame rate of a built-in scenario; absent: its own (1/s)"),
     ] = None
-    seed: Annotated[int, msgspec.Meta(ge=0, le=2**32, description="of everything random (no unit)")] = 0
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**32, description="seed of the random numbers (no unit)")] = 0
     realtime: Annotated[
-        bool, msgspec.Meta(description="true: a live camera; false: every frame, as fast as they are asked for")
+        bool,
+        msgspec.Meta(
+            description="true: frames come at the camera's rate, as from a live camera; false: every frame, "
+            "as fast as it is processed"
+        ),
     ] = True
     ends: Annotated[
-        bool, msgspec.Meta(description="with realtime: end after the scenario; false: its last state goes on for ever")
+        bool, msgspec.Meta(description="with realtime: true: end with the scenario; false: continue in its last state")
     ] = False
     processes: Annotated[
-        int, msgspec.Meta(ge=1, le=4, description="with realtime: processes that take turns in rendering (number)")
+        int, msgspec.Meta(ge=1, le=4, description="with realtime: how many processes render the frames (number)")
     ] = 2
 
 

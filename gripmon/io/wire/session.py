@@ -153,18 +153,22 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     )
     connect: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="peers or routers to connect to")] = ()
     commands: Annotated[
-        bool, msgspec.Meta(description="true: whoever reaches the network may send commands (gripmon send)")
+        bool, msgspec.Meta(description="true: anyone on the network may send commands (gripmon send)")
     ] = True
-    multicast_scouting: Annotated[bool, msgspec.Meta(description="look for others by UDP multicast")] = False
+    multicast_scouting: Annotated[bool, msgspec.Meta(description="discover peers by UDP multicast")] = False
     zenoh_config: Annotated[
-        str | None, msgspec.Meta(description="path of a file of Zenoh's (json5, yaml) instead of the keys above")
+        str | None,
+        msgspec.Meta(description="path of a Zenoh configuration file (json5, yaml) that replaces the keys above"),
     ] = None
     retry_first_s: Annotated[
-        float, msgspec.Meta(gt=0.0, description="whom to connect to isn't there, or is gone: first pause (s)")
+        float, msgspec.Meta(gt=0.0, description="first pause before an attempt to connect again (s)")
     ] = 0.1
-    retry_longest_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 1.0
+    retry_longest_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="longest such pause; each is twice the one before (s)")
+    ] = 1.0
     jaw_max_age_s: Annotated[
-        float, msgspec.Meta(gt=0.0, description="a jaw opening received longer ago than this is not used (s)")
+        float,
+        msgspec.Meta(gt=0.0, description="time since its arrival after which a jaw opening is no longer used (s)"),
     ] = 1.0
 
 

@@ -57,9 +57,10 @@ class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """When a cause is named."""
 
     probable: Annotated[
-        float, Meta(gt=0.5, lt=1.0, description="probability from which a cause is named, else it is unknown")
+        float,
+        Meta(gt=0.5, lt=1.0, description="probability from which a cause is named; below it the cause is unknown"),
     ] = 0.9
-    frames: Annotated[int, Meta(ge=1, le=1000, description="newest frames that the evidence is taken from")] = 12
+    frames: Annotated[int, Meta(ge=1, le=1000, description="number of newest frames used as evidence")] = 12
 
 
 class CauseJudge:

@@ -23,14 +23,14 @@ class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     ] = 60.0
     tolerated_m: Annotated[
         float,
-        Meta(ge=0.0, le=0.1, description="shift of the TCP along a camera axis that is never worth an alarm (m)"),
+        Meta(ge=0.0, le=0.1, description="shift of the TCP along a camera axis that never raises an alarm (m)"),
     ] = 5e-6
     tolerated_rad: Annotated[
-        float, Meta(ge=0.0, le=1.0, description="turn about a camera axis that is never worth an alarm (rad)")
+        float, Meta(ge=0.0, le=1.0, description="turn about a camera axis that never raises an alarm (rad)")
     ] = 1e-4
     vibration_m: Annotated[
         float,
-        Meta(gt=0.0, le=0.1, description="vibration of the TCP, root mean square, from which there is an alert (m)"),
+        Meta(gt=0.0, le=0.1, description="root mean square vibration of the TCP that raises an alert (m)"),
     ] = 2e-5
 
     @property

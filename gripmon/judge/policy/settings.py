@@ -17,18 +17,23 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     warn_m: Annotated[
         float,
-        Meta(gt=0.0, le=1.0, description="shift of the TCP from which a drift is a warning; below, information (m)"),
+        Meta(
+            gt=0.0,
+            le=1.0,
+            description="shift of the TCP at which a drift becomes a warning; below it is information (m)",
+        ),
     ] = 1e-4
     warn_rad: Annotated[
-        float, Meta(gt=0.0, le=3.0, description="turn from which a drift is a warning; below, information (rad)")
+        float,
+        Meta(gt=0.0, le=3.0, description="turn at which a drift becomes a warning; below it is information (rad)"),
     ] = 3e-3
     limit_m: Annotated[
         float,
         Meta(
             gt=0.0,
             le=1.0,
-            description="shift of the TCP from which a drift is an error, and motion d of equation (14) past which the "
-            "reference is measured again (m)",
+            description="shift of the TCP at which a drift becomes an error, and motion d of equation (14) "
+            "beyond which the reference is measured again (m)",
         ),
     ] = 2.5e-3
     limit_rad: Annotated[
@@ -36,15 +41,20 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         Meta(
             gt=0.0,
             le=3.0,
-            description="turn from which a drift is an error, and rotation delta of equation (14) past which the "
-            "reference is measured again (rad)",
+            description="turn at which a drift becomes an error, and rotation delta of equation (14) beyond "
+            "which the reference is measured again (rad)",
         ),
     ] = 0.02
     update_alert_s: Annotated[
-        float, Meta(ge=0.0, le=3600.0, description="an open alert that changes is updated so often at most (s)")
+        float, Meta(ge=0.0, le=3600.0, description="shortest time between two updates of an open alert (s)")
     ] = 2.0
     clear_alert_s: Annotated[
-        float, Meta(ge=0.0, le=3600.0, description="what an alert is about must be over for so long to clear it (s)")
+        float,
+        Meta(
+            ge=0.0,
+            le=3600.0,
+            description="time for which the cause of an alert must be absent before the alert is cleared (s)",
+        ),
     ] = 1.0
     settle_frames: Annotated[
         int,
@@ -70,19 +80,19 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         ),
     ] = 2e-3
     image_alert_after_s: Annotated[
-        float, Meta(ge=0.0, le=3600.0, description="refused frames for so long give an alert (s)")
+        float, Meta(ge=0.0, le=3600.0, description="time of refused frames after which there is an alert (s)")
     ] = 1.0
     alert_limit_m: Annotated[
         float,
         Meta(
             gt=0.0,
             le=1.0,
-            description="error of the TCP's position that the task bears: a transform is valid while its protection "
-            "level is not above this (m)",
+            description="position error of the TCP that the task tolerates: a transform is valid while its "
+            "protection level is at most this (m)",
         ),
     ] = 1e-3
     alert_limit_rad: Annotated[
-        float, Meta(gt=0.0, le=3.0, description="error of the rotation that the task bears, likewise (rad)")
+        float, Meta(gt=0.0, le=3.0, description="rotation error that the task tolerates, likewise (rad)")
     ] = 0.035
     integrity_risk: Annotated[
         float,

@@ -14,17 +14,20 @@ class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     mode: Annotated[
         Literal["auto", "confirm", "off"],
         Meta(
-            description="auto: a sure new reference counts at once, any other waits for an operator; "
-            "confirm: every one waits for an operator; off: the reference stays"
+            description="auto: a new reference that is certain enough takes effect at once, any other waits "
+            "for an operator; confirm: every new reference waits for an operator; off: the "
+            "reference never changes"
         ),
     ] = "auto"
     frames: Annotated[
-        int, Meta(ge=4, le=1000, description="frames of a camera that stands still that are averaged at least")
+        int, Meta(ge=4, le=1000, description="least number of frames that are averaged, while the camera stands still")
     ] = 20
     most_frames: Annotated[
         int,
         Meta(
-            ge=4, le=1000, description="frames that are averaged at most, while fewer don't make the pose sure enough"
+            ge=4,
+            le=1000,
+            description="largest number of frames that are averaged, while fewer leave the pose too uncertain",
         ),
     ] = 60
     sure_sigma_m: Annotated[
@@ -36,7 +39,7 @@ class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
         ),
     ] = 1.7e-5
     largest_sigma_m: Annotated[
-        float, Meta(gt=0.0, le=0.01, description="the same from which it is refused altogether (m)")
+        float, Meta(gt=0.0, le=0.01, description="the same, from which the new reference is refused (m)")
     ] = 2e-4
     largest_step_m: Annotated[
         float,
@@ -51,7 +54,8 @@ class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
         Meta(
             gt=1.0,
             le=100.0,
-            description="size of the corners' residuals over what their covariances allow from which they are refused",
+            description="weighted RMS of the corners' residuals, over their standard deviations, from which "
+            "the new reference is refused",
         ),
     ] = 2.5
     worst_check_sigma_m: Annotated[
@@ -59,9 +63,10 @@ class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
         Meta(
             gt=0.0,
             le=0.1,
-            description="standard deviation of the TCP by the corners alone beyond which they check nothing (m)",
+            description="standard deviation of the TCP from the corners alone above which they are not used "
+            "as a check (m)",
         ),
     ] = 1e-3
     worst_check_sigma_rad: Annotated[
-        float, Meta(gt=0.0, le=3.0, description="the same of the rotation, each axis (rad)")
+        float, Meta(gt=0.0, le=3.0, description="the same for the rotation, per axis (rad)")
     ] = 0.05

@@ -11,22 +11,23 @@ from msgspec import Meta
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the image is sampled around the predicted edges."""
 
-    samples: Annotated[int, Meta(ge=24, le=4096, description="search lines over all edges together")] = 320
+    samples: Annotated[int, Meta(ge=24, le=4096, description="number of search lines on all edges together")] = 320
     reach_px: Annotated[
-        float, Meta(ge=2.0, le=40.0, description="how far each search line reaches to both sides (px)")
+        float,
+        Meta(ge=2.0, le=40.0, description="how far each search line extends to either side of the predicted edge (px)"),
     ] = 7.0
     end_margin_px: Annotated[
         float,
         Meta(
             ge=0.0,
             le=40.0,
-            description="part of an edge at each end that is left out: the neighbour edge shows there; down to half of "
-            "it where the edge is short (px)",
+            description="length left out at each end of an edge, where the neighbouring edge shows; down to "
+            "half of it on a short edge (px)",
         ),
     ] = 4.0
     creases: Annotated[
         bool,
-        Meta(description="use edges between two visible faces too; bevels shift them (taught ones are used anyway)"),
+        Meta(description="also use edges between two visible faces, which bevels shift (taught edges are always used)"),
     ] = False
 
 
@@ -65,24 +66,30 @@ class RobustFitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     ] = 0.02
     support_sigmas: Annotated[
         float,
-        Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen"),
+        Meta(ge=1.0, le=20.0, description="standard deviations above chance from which an edge counts as detected"),
     ] = 4.0
     support_share: Annotated[
         float,
-        Meta(ge=0.05, le=0.95, description="share of an edge's search lines that must agree for it to count as seen"),
+        Meta(
+            ge=0.05,
+            le=0.95,
+            description="fraction of an edge's search lines that must be inliers for it to count as detected",
+        ),
     ] = 0.3
     trusted_share: Annotated[
         float,
         Meta(
             ge=0.05,
             le=0.95,
-            description="share of neighbouring search lines that must agree where the gripper was expected",
+            description="fraction of neighbouring search lines that must be inliers at the predicted pose",
         ),
     ] = 0.3
     found_share: Annotated[
         float,
         Meta(
-            ge=0.05, le=0.95, description="share of neighbouring search lines that must agree where it was looked for"
+            ge=0.05,
+            le=0.95,
+            description="fraction of neighbouring search lines that must be inliers at a pose found by a search",
         ),
     ] = 0.42
 
@@ -112,30 +119,41 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     reach_m: Annotated[
         float,
         Meta(
-            ge=0.0, le=0.1, description="shift of the TCP across the optical axis, and along it, that is searched (m)"
+            ge=0.0,
+            le=0.1,
+            description="range of the TCP's shift that is searched, across the optical axis and along it (m)",
         ),
     ] = 0.012
     turn_rad: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")
+        float, Meta(ge=0.0, le=0.5, description="range of the turn about the optical axis that is searched (rad)")
     ] = 0.08
     tilt_rad: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="turn about the axes across the optical axis that is searched (rad)")
+        float,
+        Meta(
+            ge=0.0,
+            le=0.5,
+            description="range of the turn about the axes across the optical axis that is searched (rad)",
+        ),
     ] = 0.08
     coarse_columns: Annotated[
         int,
         Meta(ge=64, le=1024, description="width of the reduced image, as far as the gripper can be in it (columns)"),
     ] = 160
-    starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
-    eager_frames: Annotated[int, Meta(ge=1, le=1000, description="doubtful frames in a row that may look further")] = 4
+    starts: Annotated[int, Meta(ge=1, le=64, description="candidate poses that are tried on the full image")] = 12
+    eager_frames: Annotated[
+        int,
+        Meta(ge=1, le=1000, description="largest number of successive doubtful frames that may search a wider range"),
+    ] = 4
     refill_frames: Annotated[
-        int, Meta(ge=1, le=100000, description="good frames after which one more frame may look further")
+        int, Meta(ge=1, le=100000, description="good frames after which one more frame may search a wider range")
     ] = 60
     patient_every: Annotated[
         int,
         Meta(
             ge=1,
             le=1000,
-            description="a gripper lost for longer than its transform is held is searched for once in N frames",
+            description="once the gripper has been lost for longer than its transform is held, it is searched "
+            "for in every n-th frame",
         ),
     ] = 15
 
@@ -149,5 +167,10 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     corners: CornerSettings = CornerSettings()
     search: SearchSettings = SearchSettings()
     relinearise_px: Annotated[
-        float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed again (px)")
+        float,
+        Meta(
+            ge=0.05,
+            le=5.0,
+            description="motion away from the prediction beyond which the prediction is computed again (px)",
+        ),
     ] = 1.0
