@@ -13,7 +13,7 @@ from support.recorded import record
 from gripmon.model.geometry import from_record
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
 from gripmon.record.read import open_recordings
-from gripmon.record.table import FrameTable, TableBuilder
+from gripmon.record.table import FrameTable, TableBuilder, pose_matrices
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_matrices_are_those_of_the_geometry(records: list[FrameRecord], table: F
             assert np.isnan(matrix[:3]).all()
         else:
             assert np.allclose(matrix, from_record(r.cam_T_grip), atol=1e-14)
-    assert np.isfinite(table.matrices(smoothed=True)[0]).all() and np.isnan(table.matrices(smoothed=True)[1, :3]).all()
+    assert np.isfinite(pose_matrices(table.smoothed)[0]).all() and np.isnan(pose_matrices(table.smoothed)[1, :3]).all()
 
 
 def test_joining_keeps_each_frames_reference():

@@ -12,8 +12,8 @@ from support.recorded import HEIGHT_PX, WIDTH_PX
 from gripmon.model.records import State, Verdict
 from gripmon.record.columns import Palette
 from gripmon.record.process import ImageRing, Unframer, framed
+from gripmon.record.recorder import to_8_bit
 from gripmon.record.scene import _label_places
-from gripmon.record.worker import to_8_bit
 
 
 @given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))

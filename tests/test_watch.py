@@ -92,15 +92,15 @@ def test_the_rate_is_that_of_the_last_frames():
 
 def test_drift_and_protection_are_the_last_transforms_while_it_counts():
     watch = Watch(SETTINGS, now_s=0.0)
-    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+    assert (watch.last.tcp_shift_m, watch.last.sigma_m) == (None, None)
     covariance = np.diag([1e-10, 4e-10, 2.5e-9, 1.0, 1.0, 1.0]).ravel().tolist()
     watch.frame(frame_record(covariance=tuple(covariance)), now_s=1.0)
-    assert watch.tcp_shift_m == frame_record().drift.tcp_shift_m and watch.sigma_m == pytest.approx(5e-5)
-    assert watch.protection_m == 0.00045
+    assert watch.last.tcp_shift_m == frame_record().drift.tcp_shift_m and watch.last.sigma_m == pytest.approx(5e-5)
+    assert watch.last.protection_m == 0.00045
     watch.no_frame("unplugged", 9.0, 9)
-    assert (watch.tcp_shift_m, watch.sigma_m, watch.protection_m) == (None, None, None)
+    assert (watch.last.tcp_shift_m, watch.last.sigma_m, watch.last.protection_m) == (None, None, None)
     watch.frame(frame_record(drift=None, covariance=None, cam_T_grip=None, verdict=Verdict.SUSPECT), now_s=10.0)
-    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+    assert (watch.last.tcp_shift_m, watch.last.sigma_m) == (None, None)
 
 
 def test_standing_alerts_are_the_monitors_and_those_of_the_silence():

@@ -367,9 +367,9 @@ def percent(share: float) -> str:
     return f"{text.removesuffix('.0')} %"
 
 
-def count(number: int, one: str, many: str | None = None) -> str:
+def count(number: int, one: str) -> str:
     """``1 frame``, ``2 frames``."""
-    return f"{number} {one if number == 1 else many or one + 's'}"
+    return f"{number} {one if number == 1 else one + 's'}"
 
 
 def _measured(value: float, sigma: float | None) -> str:

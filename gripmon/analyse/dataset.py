@@ -18,13 +18,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
 from gripmon.analyse.stretches import Stretch, mountings_of
 from gripmon.model.errors import InputError
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Verdict
+from gripmon.record.table import pose_matrices
 
 TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
 _NONE = np.full(36, np.nan)
@@ -185,15 +185,6 @@ def _lines(measured: Measured, covariances: list[NDArray[np.float64]]) -> list[L
     return [Line(*plain, number, stretch, None) for number, stretch in enumerate(bare)]
 
 
-def matrices(cam_T_grip: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
-    """(n, 4, 4) of translations and quaternions x, y, z, w (n, 7)."""
-    values = np.reshape(np.array(cam_T_grip, float), (-1, 7))
-    out = np.tile(np.eye(4), (len(values), 1, 1))
-    if len(values):
-        out[:, :3, :3], out[:, :3, 3] = Rotation.from_quat(values[:, 3:]).as_matrix(), values[:, :3]
-    return out
-
-
 def _mountings(
     lines: Sequence[Line],
     covariances: Sequence[NDArray[np.float64]],
@@ -209,7 +200,7 @@ def _mountings(
             by_camera.setdefault(line.camera, []).append(place)
     for places in by_camera.values():
         stretches = [lines[place].stretch for place in places]
-        poses = matrices([one.cam_T_grip for one in stretches if one is not None and one.cam_T_grip is not None])
+        poses = pose_matrices([one.cam_T_grip for one in stretches if one is not None and one.cam_T_grip is not None])
         covariance = np.stack([covariances[place] for place in places]).reshape(-1, 6, 6)
         out[places] = mountings_of(poses, covariance, level, tolerance_m, tolerance_rad)
     return out

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gripmon.analyse.content import count
-from gripmon.analyse.dataset import Journal, Line, Written, matrices, moved
+from gripmon.analyse.dataset import Journal, Line, Written, moved
 from gripmon.analyse.page import rendered
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
@@ -95,7 +95,7 @@ def _mountings(written: Written) -> list[dict[str, Any]]:
             groups.setdefault((line.camera, number), []).append(line)
     out = []
     for (camera, number), lines in sorted(groups.items()):
-        at = matrices([line.stretch.cam_T_grip for line in lines if line.stretch and line.stretch.cam_T_grip])[:, :3, 3]
+        at = np.array([line.stretch.cam_T_grip[:3] for line in lines if line.stretch and line.stretch.cam_T_grip])
         middle = np.median(at, axis=0)
         out.append(
             {
@@ -116,6 +116,6 @@ def _points(written: Written, camera: str) -> tuple[list[str], np.ndarray, np.nd
     ]
     places = places[:: max(len(places) // _MOST_POINTS, 1)]
     stretches = [written.lines[place].stretch for place in places]
-    at = matrices([one.cam_T_grip for one in stretches if one is not None and one.cam_T_grip is not None])[:, :3, 3]
+    at = np.array([one.cam_T_grip[:3] for one in stretches if one is not None and one.cam_T_grip is not None])
     names = [f"{written.lines[place].episode}, stretch {written.lines[place].number}" for place in places]
     return names, at - at[0], written.mountings[places]

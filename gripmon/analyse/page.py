@@ -36,6 +36,7 @@ from gripmon.analyse.content import (
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.summary import CAUSES, cause_words
 from gripmon.model.records import AlertKind, CauseWeight, LookNote, Origin
+from gripmon.record.recorder import to_8_bit
 from gripmon.record.recordings import Picture
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all alerts
@@ -296,7 +297,8 @@ def _shown(
 ) -> Shown | None:
     left, top, right, bottom = box
     picture, believed = judged
-    crop = _bgr8(picture.image)[top:bottom, left:right]
+    image = to_8_bit(picture.image)
+    crop = (cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)[top:bottom, left:right]
     if not crop.size:
         return None
     scale = _WIDTH_PX / (right - left)
@@ -345,12 +347,3 @@ def _draw_look(
             colour = REFUSED if number in look.different else USED
             corners = (x - half, y - half), (x + half, y + half)
             cv2.rectangle(canvas, *corners, colour, 2 if number in look.different else 1, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _bgr8(image: NDArray[Any]) -> NDArray[Any]:
-    """Grey or BGR of any depth -> BGR of 8 bits."""
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    elif image.dtype != np.uint8:
-        image = np.clip(np.nan_to_num(image) * 255.0, 0.0, 255.0).astype(np.uint8)
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3])

@@ -16,7 +16,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from gripmon.analyse.smoothing import CHI2_MEDIAN, Bools, Ints, Smoothed, mean_squares, step_of
-from gripmon.model.geometry import skew
+from gripmon.model.geometry import left_jacobians
 from gripmon.model.records import Array
 
 MIN_FRAMES = 3
@@ -125,9 +125,6 @@ def wild_frames(run: Run) -> Bools:
     return out
 
 
-_SMALL_RAD = 1e-6
-
-
 def to_vectors(origin_T: Array, poses: Array) -> Array:
     """(n, 4, 4) -> (n, 6)."""
     turn = poses[:, :3, :3] @ origin_T[:3, :3].T
@@ -143,24 +140,14 @@ def to_poses(origin_T: Array, vectors: Array) -> Array:
     return out
 
 
-def jacobians(omega: Array) -> Array:
-    """Left Jacobians (n, 3, 3) of rotation vectors (n, 3)."""
-    angle = np.linalg.norm(omega, axis=1)
-    safe = np.where(angle > _SMALL_RAD, angle, 1.0)
-    first = np.where(angle > _SMALL_RAD, (1.0 - np.cos(safe)) / safe**2, 0.5)
-    second = np.where(angle > _SMALL_RAD, (safe - np.sin(safe)) / safe**3, 1.0 / 6.0)
-    cross = skew(omega)
-    return np.asarray(np.eye(3) + first[:, None, None] * cross + second[:, None, None] * (cross @ cross))
-
-
 def covariances_to_vectors(covariance: Array, vectors: Array) -> Array:
     """Covariances (n, 6, 6) of poses' errors -> those of the vectors (n, 6)."""
-    return _mapped(covariance, np.linalg.inv(jacobians(vectors[:, 3:])))
+    return _mapped(covariance, np.linalg.inv(left_jacobians(vectors[:, 3:])))
 
 
 def covariances_to_poses(covariance: Array, vectors: Array) -> Array:
     """The way back."""
-    return _mapped(covariance, jacobians(vectors[:, 3:]))
+    return _mapped(covariance, left_jacobians(vectors[:, 3:]))
 
 
 def _mapped(covariance: Array, turn: Array) -> Array:

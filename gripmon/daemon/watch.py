@@ -99,6 +99,9 @@ class Judged(NamedTuple):
     protection_m: float | None = None
 
 
+_NOTHING = Judged(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
+
+
 class Watch:
     """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
 
@@ -120,7 +123,7 @@ class Watch:
         self._drops = Drops(settings.dropped_alert_share)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
-        self._judged: Judged | None = None
+        self._judged = _NOTHING
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; the alerts that are due beside the record's own."""
@@ -204,24 +207,11 @@ class Watch:
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
-    def tcp_shift_m(self) -> tuple[float, float, float] | None:
-        """Of the last transform, if it still counts: against the reference, along the camera's axes, m."""
-        return self._judged.tcp_shift_m if self._judged is not None and self._holds else None
-
-    @property
-    def sigma_m(self) -> float | None:
-        """Of the last transform, if it still counts: the TCP's largest standard deviation along a camera axis, m."""
-        return self._judged.sigma_m if self._judged is not None and self._holds else None
-
-    @property
-    def protection_m(self) -> float | None:
-        """Of the last transform, if it still counts: the bound on the TCP's position error, m."""
-        return self._judged.protection_m if self._judged is not None and self._holds else None
-
-    @property
-    def _holds(self) -> bool:
-        """Does the last frame's state still hold?"""
-        return self._judged is not None and (self.state, self.verdict) == (self._judged.state, self._judged.verdict)
+    def last(self) -> Judged:
+        """What is kept of the last frame while its state and verdict still hold; else one that knows nothing."""
+        if (self.state, self.verdict) == (self._judged.state, self._judged.verdict):
+            return self._judged
+        return _NOTHING
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
         """All that is raised and not cleared, the monitor's and what comes from here, the oldest first."""

@@ -20,7 +20,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.setup import NAMES, LaserCalibration, LaserSetup, basis, origin_axes, pose_slopes, spots_on_plane
 from gripmon.laser.spots import Spot
 from gripmon.model.camera import Camera, make_camera
-from gripmon.model.geometry import from_record, perturb, skew
+from gripmon.model.geometry import from_record, left_jacobians, perturb, skew
 from gripmon.model.records import Array
 
 PARAMETERS = (
@@ -143,7 +143,7 @@ def predict_moved(calibrated: Calibrated, change: Array, base_T_ee: Array) -> Pr
 def _chart(origin: World, there: World, change: Array) -> Array:
     """(13, 13): a small addition to ``change``, as a perturbation by :data:`PARAMETERS` of the moved world."""
     out = np.eye(COUNT)
-    out[3:6, 3:6] = _left_jacobian(change[3:6])
+    out[3:6, 3:6] = left_jacobians(change[None, 3:6])[0]
     for first, before, after in (
         (6, origin.lit.normal_cam, there.lit.normal_cam), (9, origin.lit.direction_ee, there.lit.direction_ee),
     ):  # fmt: skip
@@ -163,17 +163,6 @@ def _with_axes(chart: Array, before: Array, after: Array) -> Array:
         shift = np.eye(3)[axis] - after / after[pierced] * (axis == pierced)
         chart[11:13, column] = shift[list(new)]
     return chart
-
-
-def _left_jacobian(omega: Array) -> Array:
-    """(3, 3): exp(omega + d) = exp(J d) exp(omega) for small d."""
-    angle = float(np.linalg.norm(omega))
-    turn = skew(omega)
-    if angle < 1e-4:
-        return np.eye(3) + 0.5 * turn
-    first, second = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    out: Array = np.eye(3) + first * turn + second * (turn @ turn)
-    return out
 
 
 def larger(a: Array, b: Array) -> Array:

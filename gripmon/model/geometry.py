@@ -44,6 +44,17 @@ def exp_rotation(omega: Array) -> Array:
     )
 
 
+def left_jacobians(omega: Array) -> Array:
+    """Rotation vectors (n, 3), rad -> left Jacobians J (n, 3, 3): ``exp(omega + d) = exp(J d) exp(omega)``, small d."""
+    angle = np.linalg.norm(omega, axis=1)
+    small = angle < 1e-6  # rad: the next term of the series is below rounding
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)[:, None, None]
+    cross = skew(omega)
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+
+
 def log_rotation(rotation: Array) -> Array:
     """Rotation matrix (3, 3) -> rotation vector (3,), angle in [0, pi]."""
     x, y, z, w = quaternion_xyzw(rotation)

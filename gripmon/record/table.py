@@ -121,17 +121,22 @@ class FrameTable:
         """Some rows: indexes, a mask or a slice."""
         return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in (*_COLUMNS, "reference")})
 
-    def matrices(self, smoothed: bool = False) -> FloatArray:
-        """(n, 4, 4) of ``cam_T_grip``, or of ``smoothed``; NaN where it is null."""
-        pose = self.smoothed if smoothed else self.cam_T_grip
-        x, y, z, w = (pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)).T
-        out = np.zeros((len(pose), 4, 4))
-        out[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1)
-        out[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1)
-        out[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
-        out[:, :3, 3] = pose[:, :3]
-        out[:, 3, 3] = 1.0
-        return out
+    def matrices(self) -> FloatArray:
+        """(n, 4, 4) of ``cam_T_grip``; NaN where it is null."""
+        return pose_matrices(self.cam_T_grip)
+
+
+def pose_matrices(poses: Any) -> FloatArray:
+    """(n, 4, 4) of positions and quaternions x, y, z, w (n, 7), which need not be unit; NaN where one is NaN."""
+    pose = np.reshape(np.asarray(poses, np.float64), (-1, 7))
+    x, y, z, w = (pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)).T
+    out = np.zeros((len(pose), 4, 4))
+    out[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1)
+    out[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1)
+    out[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
+    out[:, :3, 3] = pose[:, :3]
+    out[:, 3, 3] = 1.0
+    return out
 
 
 _VERDICT_CODES = {name: code for code, name in enumerate(FrameTable.VERDICTS)}

@@ -36,6 +36,7 @@ from gripmon.record.recorder import (
     Scene,
     Status,
     ViewSettings,
+    to_8_bit,
 )
 from gripmon.record.scene import make_blueprint
 
@@ -387,13 +388,3 @@ def measured_picture(blob: bytes, media_type: str, image: NDArray[np.generic]) -
         saturated_percent=100.0 * float(np.count_nonzero(grey >= 254)) / grey.size,
         sharpness=float(cv2.meanStdDev(laplacian)[1][0, 0]),
     )
-
-
-def to_8_bit(image: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """uint16 by its upper byte, float from 0..1; for looking only, so values beyond the range, NaN too, are clipped."""
-    if image.dtype == np.uint8:
-        return image.astype(np.uint8, copy=False)
-    if image.dtype == np.uint16:
-        return (image.astype(np.uint16, copy=False) >> 8).astype(np.uint8)
-    scaled = np.nan_to_num(image.astype(np.float32, copy=False) * np.float32(255.0), nan=0.0)
-    return np.clip(np.rint(scaled), 0.0, 255.0).astype(np.uint8)

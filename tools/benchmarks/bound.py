@@ -32,8 +32,6 @@ from gripmon.simulate.scenario import JawScript, Tilt
 
 BOUND_ROW = "standing"
 """The condition in which nothing differs between frames but noise."""
-WITHIN = 2.0
-"""To reach: spread over bound."""
 NEAR_EDGE_PX = 3.0
 _STEP_M, _STEP_RAD = 1e-5, 1e-4
 _LEVER_M = 0.1
