@@ -1,4 +1,4 @@
-"""What all recordings share: rows, columns in a stream, colours, parts of a layout, and what happened beside frames."""
+"""What all recordings share: rows, columns in a stream, colours, parts of a layout, and events beside the frames."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from gripmon.model.records import (
 from gripmon.record.recorder import Events, RecordingSettings, Scene, TraceNote
 
 APPLICATION_ID = "gripmon"
-_CLOCK_TOLERANCE_NS = 86_400_000_000_000  # between a frame and what belongs to none: a day
+_CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 
 Colour = tuple[int, int, int, int]
 
 
 class Palette:
-    """Colours (RGBA, 0..255) that the recording uses, the same meaning everywhere."""
+    """Colours (RGBA, 0..255) of the recording, with the same meaning everywhere."""
 
     GOOD: Colour = (70, 200, 110, 255)
     DOUBTFUL: Colour = (245, 175, 50, 255)
@@ -55,8 +55,8 @@ class Palette:
     CORNER_REFUSED: Colour = (255, 120, 60, 255)
     GRIPPER_FACE: Colour = (150, 160, 175, 110)
     REFERENCE: Colour = (255, 255, 255, 255)
-    BACKGROUND: Colour = (16, 18, 22, 255)  # also where the viewer is set to a light theme: the reference is white
-    WHOLE: Colour = (225, 228, 235, 255)  # a length or a share, beside its parts along the axes
+    BACKGROUND: Colour = (16, 18, 22, 255)  # also in the viewer's light theme: the reference is white
+    WHOLE: Colour = (225, 228, 235, 255)  # a length or a fraction, beside its components along the axes
     SHIFT: Colour = (255, 90, 200, 255)
     AXES: tuple[Colour, Colour, Colour] = ((240, 90, 90, 255), (90, 205, 105, 255), (95, 150, 255, 255))
 
@@ -80,7 +80,7 @@ def faded(colour: Colour, alpha: int) -> Colour:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """An encoded image and what was measured on it (grey values 0..255)."""
+    """An encoded image with its statistics (grey values 0..255)."""
 
     blob: bytes
     media_type: str
@@ -92,7 +92,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A frame; its ``limits`` are the ones that were in force, as far as they are known."""
+    """A frame; ``limits`` are those in force, None: unknown."""
 
     record: FrameRecord
     picture: Picture | None
@@ -105,7 +105,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class SpotRow:
-    """A pulse of a second camera's laser."""
+    """One pulse of a second camera's laser."""
 
     record: SpotRecord
     picture: Picture | None
@@ -125,7 +125,7 @@ class Sender:
             self.stream.log(path, archetype, static=True)
 
     def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
-        """Without stamps they are on the timeline of frames only."""
+        """Send columns; without stamps on the frame timeline only."""
         indexes = [rr.TimeColumn("frame", sequence=seqs)]
         if stamps_ns:
             times = np.array(stamps_ns, np.int64).astype("datetime64[ns]")
@@ -145,7 +145,7 @@ class Sender:
         self.scalars(path, rows, [() if value is None else (value,) for value in values])
 
     def lines(self, path: str, names: Sequence[str] | str, colours: Sequence[Colour] | Colour, width: float) -> None:
-        """How the curves of an entity look."""
+        """Set names, colours and width of an entity's curves."""
         count = 1 if isinstance(names, str) else len(names)
         self.static(path, rr.SeriesLines(names=names, colors=colours, widths=[width] * count))
 
@@ -173,7 +173,7 @@ class EventWriter:
     """Writes ``status/…`` where it changes, the log ``events`` for people, and ``alert``, ``command``, ``state``."""
 
     def __init__(self, send: Sender, whose: str = ""):
-        """``whose`` begins each line of the log, where there are two."""
+        """``whose`` is the prefix of each line of the log, where two runs share it."""
         self._send = send
         self._whose = f"{whose}: " if whose else ""
         self._state = self._verdict = ""
@@ -186,7 +186,7 @@ class EventWriter:
         self._state = self._verdict = ""
 
     def write(self, rows: Sequence[AnyRow], events: Events, more: Sequence[Line] = ()) -> None:
-        """``more`` are lines for the log that others have."""
+        """``more``: further lines for the log."""
         if rows:
             self._newest_stamp_ns = rows[-1].record.stamp_ns
         lines = [*more, *self._status(rows)]
@@ -199,20 +199,20 @@ class EventWriter:
         self._whole("command", events.commands)
         self._whole("state", events.states)
         for state in events.states:
-            # Without frames it is the daemon that knows the state.
+            # Without frames only the daemon knows the state.
             if state.state is State.STALE and self._newest_stamp_ns is not None:
                 self._change(self._on_frames_clock(state.stamp_ns), state.seq, state.state, state.verdict)
 
     def _on_frames_clock(self, stamp_ns: int) -> int:
-        """Frames of old files have old stamps: among them an alert of today, which belongs to no frame, would stretch
-        the timeline over years.
+        """Frames of old files have old stamps: an alert of today that belongs to no frame would stretch the timeline
+        over years.
         """
         if self._newest_stamp_ns is None or abs(stamp_ns - self._newest_stamp_ns) < _CLOCK_TOLERANCE_NS:
             return stamp_ns
         return self._newest_stamp_ns
 
     def _whole(self, path: str, messages: Sequence[AlertRecord | RecordedCommand | StateRecord]) -> None:
-        """Messages as JSON; before the first frame they have no place on the timeline of captures."""
+        """Messages as JSON; before the first frame they have no capture time."""
         if not messages:
             return
         known = self._newest_stamp_ns is not None
@@ -221,7 +221,7 @@ class EventWriter:
         self._send.columns(path, stamps_ns, [message.seq for message in messages], whole)
 
     def _status(self, rows: Sequence[AnyRow]) -> list[Line]:
-        """State and verdict where they change, and what happened as text."""
+        """Write state and verdict where they change; returns the changes and alerts as log lines."""
         lines = []
         for record in (row.record for row in rows):
             if record.state != self._state or record.verdict != self._verdict:
@@ -261,7 +261,7 @@ class Writer:
     """Writes the rows of its kind, a wrist camera's frames or a second camera's pulses, into one file."""
 
     def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int, about: str):
-        """Writes what this file is, and what the monitor ran with: each file stands alone.  ``about`` is for people."""
+        """Writes the description of this file and the monitor's configuration; ``about`` is text for people."""
         self._send = Sender(stream)
         self._events = EventWriter(self._send)
         meta = Meta(
@@ -284,19 +284,19 @@ class Writer:
         self._send.static("about", rr.TextDocument(about, media_type="text/markdown"))
 
     def write(self, rows: Sequence[Any], events: Events) -> None:
-        """Send everything that was gathered since the last call."""
+        """Send everything since the last call."""
         raise NotImplementedError
 
     def write_pictures(self, rows: Sequence[Any]) -> None:
-        """Send the pictures of rows that were written before without them."""
+        """Send the pictures of rows that were written earlier without them."""
         raise NotImplementedError
 
     def repeat(self) -> None:
-        """Write again, with the next row, what else is only written when it changes."""
+        """Write with the next row again what is otherwise only written on change."""
         self._events.repeat()
 
     def finish(self) -> None:
-        """Nothing more comes into this file."""
+        """Called when nothing more is written to this file."""
 
     def _write_records(self, rows: Sequence[AnyRow]) -> None:
         self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
@@ -319,7 +319,7 @@ def pose_columns(poses: Sequence[Transform | ArmPose]) -> rr.ComponentColumnList
 
 
 def pinhole(lens: LensSettings, image_plane_m: float, **looks: Any) -> rr.Pinhole:
-    """A camera without its distortion, with its image so far before it."""
+    """A camera without its distortion, with its image plane at a distance."""
     return rr.Pinhole(
         resolution=[lens.width_px, lens.height_px], focal_length=[lens.fx_px, lens.fy_px],
         principal_point=[lens.cx_px, lens.cy_px], camera_xyz=rr.ViewCoordinates.RDF,
@@ -338,7 +338,7 @@ def plot(
     legend: bool = True,
     shown: tuple[float, float] | None = None,
 ) -> rrb.TimeSeriesView:
-    """Curves over the time that all views share; ``shown`` is the range of the values, None: as they are."""
+    """Curves over the shared time axis; ``shown`` is the range of values, None: automatic."""
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents,

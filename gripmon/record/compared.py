@@ -1,4 +1,4 @@
-"""What lies beside a recorded run: a replay with other limits in one recording with it, or its corrected track."""
+"""A recorded run and its replay overlaid in one recording, and the corrected track of a run."""
 
 from __future__ import annotations
 
@@ -36,15 +36,18 @@ RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32
 _FLUSH_TIMEOUT_S = 30.0
 _FREE_BYTES = 64_000_000
-"""rerun's files don't say that the disk is full, and writing on may wait for ever: this must be free."""
-_LOOKS = ((REPLAYED, "", 255, 1.5), (RECORDED, f"{RECORDED}/", 110, 5.0))  # whose, where, opacity, width of its lines
+"""rerun doesn't report a full disk, and writing to one may block forever: this much must be free."""
+_LOOKS = (
+    (REPLAYED, "", 255, 1.5),
+    (RECORDED, f"{RECORDED}/", 110, 5.0),
+)  # run, path prefix, opacity, width of its lines
 
 _TRACK = "rig/corrected"
 _TRACK_ROWS_A_CHUNK = 65536
 
 
 class _Beside(Sender):
-    """Sends what was recorded, below its name."""
+    """Sends what was recorded, below the path ``recorded``."""
 
     def static(self, path: str, *archetypes: rr.AsComponents) -> None:
         super().static(f"{RECORDED}/{path}", *archetypes)
@@ -54,17 +57,18 @@ class _Beside(Sender):
 
 
 class ComparedRecorder(Recorder):
-    """A recorder for a replay: takes each frame with what ``source``, which gave it last, has recorded of it.
+    """Records a replay: each frame as it is judged now, together with what ``source`` recorded about it then.
 
-    The replay is the recording, with all its entities; what was recorded lies beside it below ``recorded``, with the
-    same names.  It writes in the caller's thread: a replay can wait.  The daemon's own alerts and state messages aren't
-    in it.
+    The replay has the usual entities; what was recorded has the same names below ``recorded``.  It writes in the
+    caller's thread, since a replay can wait.  The daemon's own alerts and state messages are not included.
     """
 
     failure: str | None = None
 
     def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
-        """``recorded_limits`` are drawn beside the replay's; None where they are unknown.  OSError as for a file."""
+        """``recorded_limits`` are drawn beside the replay's; None: unknown.  Raises OSError if ``path`` can't be
+        written.
+        """
         path.open("wb").close()
         self._path, self._source, self._recorded_limits = path, source, recorded_limits
         self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
@@ -82,7 +86,7 @@ class ComparedRecorder(Recorder):
         self._commands_then = list(source.commands)
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """One frame, as it is judged now; what it was judged then comes from the source."""
+        """One frame with its record now; the record of then comes from the source."""
         then, shot = self._source.record, self._source.shot
         assert then is not None, "every replayed frame has a record"
         picture: Picture | None = None
@@ -131,7 +135,7 @@ class ComparedRecorder(Recorder):
 
 
 def _name_both(send: Sender) -> None:
-    """The same colours, what was recorded wide and pale below what is replayed."""
+    """Both runs in the same colours: the recorded one wide and pale, the replayed one thin."""
     for whose, where, alpha, width in _LOOKS:
         for path, names, colours in (
             ("drift/tcp_shift_mm", ("x", "y", "z", "length"), (*Palette.AXES, Palette.WHOLE)),
@@ -144,8 +148,8 @@ def _name_both(send: Sender) -> None:
 
 
 def _layout(scene: Scene) -> rrb.Blueprint:
-    """Left the image with the replay's overlay, and what happened in both; right both drifts and both limits in one
-    plot, the states of both.
+    """Left: the image with the replay's overlay, and the events of both runs.  Right: drifts and limits of both in one
+    plot, and the states of both.
     """
 
     def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
@@ -170,12 +174,12 @@ def _layout(scene: Scene) -> rrb.Blueprint:
 def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:
     """Write a run's frame table and its correction into a file; ``about`` is kept as JSON.
 
-    It carries the recording id of the original: a viewer that is given both shows them as one, on the same timelines.
-    Shifts of the TCP are against the first corrected frame, mm, camera axes; raw and smoothed are the live ones.
-    Raises OSError where the file can't be written.
+    It has the recording id of the original, so that a viewer shows both files as one, on the same timelines.  Shifts of
+    the TCP are relative to the first corrected frame, mm, camera axes; raw and smoothed are the live estimates.
+    Raises OSError if the file can't be written.
     """
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
-    memory = stream.memory_recording()  # rerun's files don't say that the disk is full
+    memory = stream.memory_recording()  # rerun's file sink doesn't report a full disk
     send = Sender(stream)
     for name, alpha, width, what in (
         ("tcp_shift_mm", 255, 3.0, "corrected"), ("raw_shift_mm", 90, 0.7, "raw"),

@@ -1,14 +1,13 @@
-"""An ``.rrd`` file as a row of messages, of which any can be decoded by itself.
+"""An ``.rrd`` file as a sequence of messages, any of which can be decoded on its own.
 
-rerun's reader takes a file as a whole: where one message is cut off it gives none of the file, where the footer is
-missing it reads everything, and damaged bytes can end the whole process (its native code panics).  So only footers,
-which have a check sum, are left to it: their manifest says which message holds what.  Messages are taken apart here:
-a file header of 12 bytes, then for each message its kind and length (8 bytes each, little endian) and a protobuf
-message of rerun's (``rerun.log_msg.v1alpha1``), in which a batch of Arrow lies that Arrow itself reads and checks.  One
-image of an hour takes milliseconds, damage costs what is damaged, and the original is never touched.
+rerun's reader handles a file as a whole: if one message is cut off it returns nothing, without a footer it reads
+everything, and damaged bytes can end the whole process (its native code panics).  So rerun only reads footers, which
+have a checksum; their manifest says which message holds what.  Messages are parsed here: a file header of 12 bytes,
+then for each message its kind and length (8 bytes each, little endian) and one of rerun's protobuf messages
+(``rerun.log_msg.v1alpha1``), which contains an Arrow batch that Arrow itself reads and checks.  Reading one image of
+an hour takes milliseconds, damage loses only what is damaged, and the file is never written to.
 
-What gripmon uses of rerun-sdk 0.41 that rerun doesn't call public is all at the end of this file: a later version may
-lack it.
+All private parts of rerun-sdk 0.41 that gripmon uses are at the end of this file: a later version may lack them.
 """
 
 from __future__ import annotations
@@ -30,41 +29,41 @@ _FILE_HEADER_BYTES = 12
 _MESSAGE = struct.Struct("<QQ")
 _END, _STORE_INFO, _CHUNK, _BLUEPRINT = range(4)
 _FOOTER_MARK = b"RRF2FOOT"
-_FOOTER_BYTES = 64  # the mark lies within these last ones
+_FOOTER_BYTES = 64  # the mark is within this many last bytes
 BLOCK_BYTES = 1 << 20
-"""About as much is read and decoded at once."""
+"""How much is read and decoded at a time, approximately."""
 _MESSAGE_LIMIT_BYTES = 1 << 31
 _PLAIN, _LZ4 = 1, 2
 _LZ4_RATIO_LIMIT = 255
-_RECORDING = 1  # of the kinds of stores; 2 is a layout
+_RECORDING = 1  # a kind of store; 2 is a blueprint
 NO_FRAME = int(np.iinfo(np.int64).min)
-"""Stands for a frame's number where there is none."""
+"""Used as the frame number where there is none."""
 RECORD = "record"
 FRAME = "frame"
-"""The timeline of frames' numbers."""
+"""The timeline of frame numbers."""
 _RERUN_WANTED = "gripmon needs rerun-sdk>=0.41,<0.42 (pip install 'rerun-sdk>=0.41,<0.42')"
 
 
 class UnreadableFileError(ValueError):
-    """Nothing of a file can be used; the text says why, in a few words and without the file's name."""
+    """No part of a file can be used; the text gives the reason in a few words, without the file's name."""
 
 
 class Span(NamedTuple):
-    """Whole messages in a file: where they begin, and how many bytes."""
+    """Consecutive whole messages in a file: their offset and size in bytes."""
 
     offset: int
     size: int
 
 
 class Chunk(NamedTuple):
-    """Rows of one entity: ``batch`` is Arrow's, a column a timeline (unless it is static) or component."""
+    """Rows of one entity; ``batch`` is an Arrow batch with a column per timeline (none if static) and component."""
 
     entity: str
     batch: Any
 
 
 class Message(NamedTuple):
-    """What a footer says of a message; ``first`` and ``last`` are its frames' numbers."""
+    """A footer's entry about a message; ``first`` and ``last`` are frame numbers."""
 
     entity: str
     span: Span
@@ -79,14 +78,14 @@ class StoreName(NamedTuple):
 
 
 class RrdFile:
-    """A file that holds at least the introduction of a recording.
+    """A file that contains the store information of at least one recording.
 
-    ``faults`` gathers what is wrong with it as it is read, in a few words each; ``damaged`` counts messages that could
-    not be decoded.
+    ``faults`` lists what is found wrong while reading, in a few words each; ``damaged`` counts messages that could not
+    be decoded.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises :class:`UnreadableFileError`, also for what the file system refuses."""
+        """Raises :class:`UnreadableFileError`, also for errors of the file system."""
         self.path = path
         self.faults: list[str] = []
         self.damaged = 0
@@ -102,7 +101,7 @@ class RrdFile:
             raise UnreadableFileError("is cut short before its recording begins")
 
     def manifest(self, store: StoreName, content: Collection[str]) -> list[Message] | None:
-        """A store's messages of some entities by the footer, None where it is missing or doesn't fit the file."""
+        """A store's messages of the entities ``content``, from the footer; None if it is missing or inconsistent."""
         if not self.has_footer:
             return None
         from rerun.chunk import RrdReader
@@ -119,9 +118,9 @@ class RrdFile:
         return None
 
     def spans(self) -> Iterator[Span]:
-        """All whole messages in the order of the file, about a megabyte at a time.
+        """All whole messages in file order, about a megabyte at a time.
 
-        Ends at the file's end or at the first place that is not a message, which goes to ``faults``.
+        Ends at the end of the file or at the first bytes that are not a message, which is noted in ``faults``.
         """
         with self.path.open("rb") as file:
             begin = end = _FILE_HEADER_BYTES
@@ -138,13 +137,13 @@ class RrdFile:
                     end += size
 
     def record_texts(self, store: StoreName, span: Span) -> list[str]:
-        """The frames' records in some messages."""
+        """The frame records in some messages, as JSON."""
         return [text for chunk in self.decode(store, span, (RECORD,)) for text in texts_of(chunk.batch, "json")]
 
     def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]:
-        """A store's chunks in some messages, only those of entities in ``content`` (all where it is None).
+        """A store's chunks in some messages, only those of entities in ``content`` (None: all).
 
-        Messages that are damaged are left out and counted.  Raises OSError where the file can't be read any more.
+        Damaged messages are skipped and counted.  Raises OSError if the file can no longer be read.
         """
         with self.path.open("rb") as file:
             part = os.pread(file.fileno(), span.size, span.offset)
@@ -179,14 +178,14 @@ class RrdFile:
             self.faults.append(f"was written by rerun {newer}, newer than {older} here; what is understood was used")
 
     def _stores_of_footer(self) -> list[StoreName]:
-        """The recordings (not layouts) that rerun finds in a file with a footer."""
+        """The recordings (not blueprints) that rerun finds in a file with a footer."""
         if not self.has_footer:
             return []
         from rerun.chunk import RrdReader
 
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error")  # a mark without a footer: rerun would look through the whole file
+                warnings.simplefilter("error")  # a mark without a footer: rerun would scan the whole file
                 found = RrdReader(self.path).recordings()
                 return list(dict.fromkeys(StoreName(entry.application_id, entry.recording_id) for entry in found))
         except Exception as error:  # noqa: BLE001 - whatever rerun raises
@@ -215,7 +214,7 @@ def is_complete(path: Path) -> bool:
 
 
 def whole_bytes(path: Path) -> int:
-    """Up to where the file consists of whole messages; its size if nothing is wrong with it, or it isn't understood."""
+    """Length of the part that consists of whole messages; the file's size if it is complete or not understood."""
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         if file.read(len(MAGIC)) == MAGIC and not is_complete(path):
@@ -226,7 +225,7 @@ def whole_bytes(path: Path) -> int:
 
 
 def _messages(batch: Any, content: Collection[str], file_size: int) -> list[Message]:
-    """Raises ValueError where they can't be those of this file."""
+    """Raises ValueError if they can't belong to this file."""
     column = {name: batch.column(name) for name in batch.schema.names}
 
     def integers(name: str) -> list[int]:
@@ -250,9 +249,9 @@ def _messages(batch: Any, content: Collection[str], file_size: int) -> list[Mess
 
 
 def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, int]]:
-    """Kind, offset and whole size of every message, also where several files were put one behind the other.
+    """Kind, offset and total size of every message, also in a concatenation of several files.
 
-    Without an end message the last is (None, offset, 0) if the file ends too early, (None, offset, 1) if what stands
+    Without an end message the last item is (None, offset, 0) if the file ends too early, (None, offset, 1) if the bytes
     there can't be a message.
     """
     offset = _FILE_HEADER_BYTES
@@ -276,7 +275,7 @@ def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, in
 
 
 def _chunk(body: bytes, store: StoreName, content: Sequence[str] | None) -> Chunk | None:
-    """The chunk in a message, None for another store's or entity's.  Raises where anything about it is wrong."""
+    """The chunk in a message; None if it belongs to another store or entity.  Raises if anything in it is wrong."""
     import pyarrow as pa
 
     fields = _fields(body)
@@ -297,14 +296,14 @@ def _chunk(body: bytes, store: StoreName, content: Sequence[str] | None) -> Chun
 
 
 def _stores_introduced(descriptor: int, size: int) -> list[StoreName]:
-    """The recordings that messages of the file introduce."""
+    """The recordings whose store information is in the file."""
     places = [(offset, length) for kind, offset, length in _walk(descriptor, size) if kind == _STORE_INFO]
     found = [_introduced(os.pread(descriptor, length, offset)[_MESSAGE.size :]) for offset, length in places]
     return list(dict.fromkeys(name for name in found if name is not None))
 
 
 def _introduced(body: bytes) -> StoreName | None:
-    """The recording that a message introduces; None for a layout or a damaged message."""
+    """The recording that a message describes; None for a blueprint or a damaged message."""
     try:
         store = _fields(_fields(body)[2])[2]
         recording_id = _recording_id(store)
@@ -315,14 +314,14 @@ def _introduced(body: bytes) -> StoreName | None:
 
 
 def _recording_id(store: bytes) -> str | None:
-    """That in a ``StoreId``; None for a layout's."""
+    """The id in a ``StoreId``; None for a blueprint."""
     found = _fields(store)
     name: str = found[2].decode()
     return name if found.get(1) == _RECORDING else None
 
 
 def texts_of(batch: Any, component: str) -> list[str]:
-    """All texts of a component; of one that isn't there, or holds something else, none."""
+    """All texts of a component; none if it is absent or holds something else."""
     if component not in batch.schema.names:
         return []
     values = batch.column(component)
@@ -331,8 +330,8 @@ def texts_of(batch: Any, component: str) -> list[str]:
 
 
 def _fields(message: bytes) -> dict[int, Any]:
-    """As much of protobuf (developers.google.com, Encoding) as a few fields take: number -> int or bytes, of a repeated
-    field the first.  Raises ValueError for what is not a message.
+    """The part of protobuf's encoding (protobuf.dev) that is needed here: field number -> int or bytes, the first of a
+    repeated field.  Raises ValueError for bytes that are not a message.
     """
     found: dict[int, Any] = {}
     offset = 0
@@ -375,7 +374,7 @@ def _rerun_version() -> tuple[int, ...]:
 
 
 class RerunChangedError(RuntimeError):
-    """The installed rerun lacks what is needed; says what, and which version would be right."""
+    """The installed rerun lacks something that is needed; the text names it and the version that has it."""
 
 
 def _chunk_index(store: Any) -> Any:
@@ -387,7 +386,7 @@ def _chunk_index(store: Any) -> Any:
 
 
 def free_closed_streams() -> None:
-    """Let go of streams that were disconnected: rerun would keep each with its threads until the process ends."""
+    """Release disconnected streams: rerun would keep each one, with its threads, until the process ends."""
     import rerun as rr
 
     _private(getattr(rr, "bindings", None), "flush_and_cleanup_orphaned_recordings", "rerun.bindings")()

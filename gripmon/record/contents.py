@@ -1,5 +1,5 @@
-"""What one file holds of one recording: columns, events, and where its images lie; records of other versions as far as
-they are understood.
+"""What one file contains of one recording: columns, events, and the places of its images; records of other versions
+as far as they are understood.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ EDGES_USED = f"{IMAGE}/edges/used"
 EDGES_REFUSED = f"{IMAGE}/edges/refused"
 PREDICTED_CORNERS = f"{IMAGE}/corners/predicted"
 ON_DEMAND = (IMAGE, PREDICTED_EDGES, EDGES_USED, EDGES_REFUSED, PREDICTED_CORNERS, JAW_REPORTED)
-"""Entities of which only the places are kept."""
+"""Entities of which only the places are kept, to be read on demand."""
 _ABOUT, _IMAGE_MEAN = "about", "image/mean_grey"
 _EVENTS: dict[str, type[msgspec.Struct]] = {
     META: Meta,
@@ -71,7 +71,7 @@ _TITLE = re.compile(r"^# (.+?) / (.+)$", re.MULTILINE)
 _DECODING_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 _T = TypeVar("_T", bound=msgspec.Struct)
 
-# For a field that another version doesn't write: nothing is known.
+# For fields that another version doesn't write: unknown.
 _UNKNOWN: dict[type[msgspec.Struct], dict[str, Any]] = {
     FrameRecord: {
         "verdict": Verdict.UNKNOWN, "state": State.LOST, "source": Origin.HELD, "cam_T_grip": None, "covariance": None,
@@ -86,9 +86,9 @@ _UNKNOWN: dict[type[msgspec.Struct], dict[str, Any]] = {
 
 
 def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
-    """A record, and in a few words what had to be passed over (empty where all is as this version writes it).
+    """A record, and in a few words what was ignored (empty if it is as this version writes it).
 
-    Raises ValueError, in one line, for what isn't one whatever the version.
+    Raises ValueError, in one line, for text that is no such record in any version.
     """
     schema = schema_name(kind)
     try:
@@ -113,7 +113,7 @@ def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
 
 
 class Places:
-    """Where an entity's rows lie: messages with the range of their frames' numbers."""
+    """Where an entity's rows are: messages with the range of their frame numbers."""
 
     def __init__(self) -> None:
         self._spans: list[Span] = []
@@ -126,7 +126,7 @@ class Places:
         self._last.append(last)
 
     def find(self, seq: int) -> list[Span]:
-        """Those that may hold a frame, in the order of the file, none twice."""
+        """The messages that may contain a frame, in file order, each once."""
         first, last = np.frombuffer(self._first, np.int64), np.frombuffer(self._last, np.int64)
         return list(dict.fromkeys(self._spans[i] for i in np.flatnonzero((first <= seq) & (seq <= last))))
 
@@ -135,9 +135,9 @@ class Places:
 
 
 class Contents:
-    """What one file holds of one recording.  ``record_span`` says of each row of ``frames`` in which of
-    ``record_spans`` it lies; ``events`` are decoded records by entity, ``alerting`` the frames' records with alerts,
-    ``places`` those of the images, ``image_seqs`` the frames that have one.
+    """What one file contains of one recording.  ``record_span`` maps each row of ``frames`` to one of ``record_spans``;
+    ``events`` are decoded records by entity, ``alerting`` the frame records with alerts, ``places`` where the images
+    are, ``image_seqs`` the frames that have one.
     """
 
     def __init__(self, source: RrdFile | LineFile, store: StoreName) -> None:
@@ -172,7 +172,7 @@ class Contents:
 
     @property
     def recording_id(self) -> str:
-        """The run's own where it says so, else rerun's."""
+        """The run's own id if the file has it, else rerun's."""
         return (self.meta.recording_id if self.meta is not None else "") or self.store.recording_id
 
     @property
@@ -181,11 +181,11 @@ class Contents:
 
     @property
     def is_of_spots(self) -> bool:
-        """Is it a second camera's?  Its records are of another kind."""
+        """Whether it is a second camera's, whose records are of another type."""
         return self.meta is not None and self.meta.kind == "spots"
 
     def take_by_manifest(self, file: RrdFile, messages: Sequence[Message], progress: Callable[[int], None]) -> None:
-        """Only the messages of what is read at once; of the others their places."""
+        """Decode the messages that are read immediately, and note the places of the others."""
         by_entity: dict[str, list[Message]] = {}
         for message in messages:
             by_entity.setdefault(message.entity, []).append(message)
@@ -201,18 +201,18 @@ class Contents:
                     progress(file.size * number // len(found))
         images = sum(message.rows for message in by_entity.get(IMAGE, ()) if message.first >= 0)
         if images != sum(map(len, self._images)):
-            self._images.clear()  # written by another version: look at the images themselves
+            self._images.clear()  # written by another version: scan the images themselves
             for span in self.places[IMAGE].spans():
                 self._take(span, file.decode(self.store, span), look_at_images=True)
 
     def take_everything(self, file: RrdFile, progress: Callable[[int], None]) -> None:
-        """About a megabyte at a time, as the file stands."""
+        """Decode the file from beginning to end, about a megabyte at a time."""
         for span in file.spans():
             self._take(span, file.decode(self.store, span), look_at_images=True, keep_places=True)
             progress(span.offset + span.size)
 
     def finish(self) -> Contents:
-        """Decode what was gathered, and put into ``faults`` what is wrong with it."""
+        """Decode what was collected, and note in ``faults`` what is wrong with it."""
         self.frames.close()
         self.record_span = np.array(self._rows_span, np.int64)
         if self._images:
@@ -245,7 +245,7 @@ class Contents:
                 self._images.append(_seqs_with(chunk.batch, component))
 
     def take_records(self, span: Span, texts: Iterable[str | bytes]) -> None:
-        """Frames' records, in order."""
+        """Add frame records, in order."""
         if not self.record_spans or self.record_spans[-1] != span:
             self.record_spans.append(span)
         number = len(self.record_spans) - 1
@@ -262,7 +262,7 @@ class Contents:
                 self._take_whole_record(text)
 
     def _take_whole_record(self, text: str | bytes) -> None:
-        """The file's first record is compared with what this version writes; those with alerts are kept."""
+        """Compare the file's first record with what this version writes; keep records with alerts."""
         try:
             record, note = decoded(text, FrameRecord)
         except ValueError as error:
@@ -305,9 +305,9 @@ class Contents:
 
 
 def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], None]) -> Contents:
-    """Everything but the images.  ``progress`` is called with the bytes that are behind.
+    """Read everything but the images.  ``progress`` is called with the number of bytes read.
 
-    Raises OSError where the file can't be read any more.
+    Raises OSError if the file can no longer be read.
     """
     contents = Contents(file, store)
     manifest = file.manifest(store, {*_AT_ONCE, *ON_DEMAND})
@@ -319,14 +319,14 @@ def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], Non
 
 
 def frame_numbers(batch: Any) -> IntArray:
-    """(rows,) of a batch; empty where it isn't on the timeline of frames, the least number where a row isn't."""
+    """(rows,) of a batch; empty if it isn't on the frame timeline, :data:`NO_FRAME` for rows that aren't."""
     if FRAME not in batch.schema.names:
         return np.empty(0, np.int64)
     return batch.column(FRAME).cast("int64").fill_null(NO_FRAME).to_numpy(zero_copy_only=False)
 
 
 def _seqs_with(batch: Any, component: str) -> IntArray:
-    """Frames in which a component holds something."""
+    """Frames in which a component is not empty."""
     seqs = frame_numbers(batch)
     if component not in batch.schema.names or not len(seqs):
         return np.empty(0, np.int64)
@@ -335,7 +335,7 @@ def _seqs_with(batch: Any, component: str) -> IntArray:
 
 
 class LineFile:
-    """``estimates.jsonl``, a record a line, as a recording without images."""
+    """``estimates.jsonl``, one record per line, as a recording without images."""
 
     damaged = 0
 
@@ -357,12 +357,12 @@ class LineFile:
             return [line for line in file.read(span.size).split(b"\n") if line.strip()]
 
     def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]:
-        """Nothing of rerun's."""
+        """There are no chunks."""
         return []
 
 
 def read_lines(file: LineFile, progress: Callable[[int], None]) -> Contents:
-    """All records.  Raises OSError where the file can't be read, :class:`UnreadableFileError` for one without any."""
+    """Read all records.  Raises OSError if the file can't be read, :class:`UnreadableFileError` if it has none."""
     store = StoreName("gripmon", str(file.path.resolve()))
     contents = Contents(file, store)
     with file.path.open("rb") as lines:

@@ -1,9 +1,9 @@
-"""Recordings -> Parquet, for any engine: a table each of frames, alerts, states, commands and references.
+"""Recordings -> Parquet, for any engine: tables of frames, alerts, states, commands and references.
 
-``<out>/<table>/robot=…/camera=…/date=YYYY-MM-DD/<run>-<number>.parquet``: each file of a recording gives one a table
-and day (UTC), which is replaced when it is exported again.  References, which outlive a day, are not partitioned by
-it: each has a file of its own.  Units and words are in the schemas' metadata.  Of a covariance (6 x 6, symmetric) the
-upper triangle is kept, row by row: 21 numbers, ``UPPER`` of the flat 36.
+``<out>/<table>/robot=…/camera=…/date=YYYY-MM-DD/<run>-<number>.parquet``: each file of a recording gives one file per
+table and day (UTC), which is replaced when it is exported again.  References, which outlive a day, are not partitioned
+by date: each has its own file.  Units and descriptions are in the schemas' metadata.  Of a covariance (6 x 6,
+symmetric) the upper triangle is stored, row by row: 21 numbers, ``UPPER`` of the flat 36.
 """
 
 from __future__ import annotations
@@ -193,12 +193,12 @@ SCHEMAS: dict[str, pa.Schema] = {
     "commands": _schema("commands", _COMMANDS),
     "references": _schema("references", _REFERENCES),
 }
-"""What each table has; a column may be added within a major version, none renamed or dropped."""
+"""The columns of each table; within a major version columns may be added, not renamed or dropped."""
 _DATED = ("alerts", "states", "commands")
 
 
 ROWS_A_GROUP = 1 << 16
-"""Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
+"""Frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
 
 _NULL = "__HIVE_DEFAULT_PARTITION__"
 _NAME_LIMIT = 120  # characters
@@ -208,7 +208,7 @@ _FAULTS_IN_A_LINE = 5
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: rows by table, from how many files; ``faults`` is what could not be used, one line each."""
+    """What was written: rows per table, from how many files; ``faults``, one line each: what could not be used."""
 
     rows: dict[str, int]
     files: int
@@ -223,9 +223,9 @@ def export(
 ) -> Exported:
     """Write recordings (.rrd, ``estimates.jsonl``, folders of recordings) as Parquet below the folder ``out``.
 
-    Memory holds one file at a time; files that were exported before are replaced.  ``progress`` is called with bytes
-    read and bytes in all.  Raises :class:`~gripmon.model.errors.InputError` for recordings that are not there,
-    :class:`~gripmon.model.errors.NoResultError` where nothing in them can be used or ``out`` can't be written.
+    Memory holds one file at a time; files from an earlier export are replaced.  ``progress`` is called with bytes read
+    and bytes in total.  Raises :class:`~gripmon.model.errors.InputError` for missing recordings,
+    :class:`~gripmon.model.errors.NoResultError` if nothing in them can be used or ``out`` can't be written.
     """
     files = recording_files([Path(path) for path in recordings])
     exporter = Exporter(Path(out))
@@ -253,10 +253,10 @@ def export(
 
 
 class Exporter:
-    """Writes parts of recordings below ``out``, each in turn: no more than one is in memory.
+    """Writes parts of recordings below ``out``, with at most one of them in memory.
 
-    ``rows`` counts what was written by table, ``parts`` from how many files; ``faults`` says what was left out, one
-    line each.
+    ``rows`` counts the rows written per table, ``parts`` the files they came from; ``faults``, one line each: what was
+    left out.
     """
 
     def __init__(self, out: Path) -> None:
@@ -268,7 +268,7 @@ class Exporter:
         self._references: set[Path] = set()
 
     def add(self, part: Recording, path: Path) -> None:
-        """Export what the file ``path`` of a recording holds.  Raises OSError if it can't be written."""
+        """Export the file ``path`` of a recording.  Raises OSError if the result can't be written."""
         recording_id, number = part.recording_id, file_number(part.meta, path) or 0
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
         known = self._from.setdefault((part.robot, part.camera, name), path)
@@ -291,7 +291,7 @@ class Exporter:
     def _by_day(
         self, table: str, where: str, name: str, stamps_ns: NDArray[np.int64], rows: Callable[[slice], pa.Table]
     ) -> None:
-        """One file for each day; ``stamps_ns`` are sorted, and ``rows`` makes the rows of a slice."""
+        """One file per day; ``stamps_ns`` are sorted, and ``rows`` makes the rows of a slice."""
         days = stamps_ns.astype("datetime64[ns]").astype("datetime64[D]")  # UTC
         starts = np.flatnonzero(np.concatenate([[True], days[1:] != days[:-1]])) if len(days) else np.array([], int)
         for start, stop in itertools.pairwise([*starts.tolist(), len(days)]):
@@ -301,7 +301,7 @@ class Exporter:
             self.rows[table] += stop - start
 
     def _reference(self, where: str, reference: ReferenceRecord) -> None:
-        """A file for each reference: it is in force in many recordings, and would be there as often otherwise."""
+        """One file per reference, which would otherwise be repeated for every recording in which it is in force."""
         name = f"{_file_name(reference.reference_id)}-{reference.revision:04d}.parquet"
         path = self.out / "references" / where / name
         if path not in self._references:
@@ -311,7 +311,7 @@ class Exporter:
 
 
 def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
-    """A Parquet file, a row group each, in place of the one that was there; the same rows give the same bytes."""
+    """Write or replace a Parquet file, one row group per table; the same rows give the same bytes."""
     texts = [field.name for field in schema if field.type == pa.string()]
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path)
@@ -324,12 +324,12 @@ def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
 
 
 def _escaped(value: str) -> str:
-    """A value in the name of a partition, as readers of the Hive layout take it apart."""
+    """A value in a partition's name, as readers of the Hive layout parse it."""
     return quote(value, safe="") if value else _NULL
 
 
 def _file_name(value: str) -> str:
-    """A name that every file system and object store takes; others get what keeps them apart."""
+    """A name that every file system and object store accepts; a hash keeps changed names distinct."""
     if _PLAIN_NAME.fullmatch(value) and len(value) <= _NAME_LIMIT:
         return value
     plain = re.sub(r"[^A-Za-z0-9._-]", "_", value)[: _NAME_LIMIT - 9].lstrip("._-")
@@ -337,8 +337,8 @@ def _file_name(value: str) -> str:
 
 
 def frame_rows(frames: FrameTable, recording_id: str, file_number: int) -> pa.Table:
-    """The table ``frames``, a row a frame, in the given order.  NaN, and -1 where a number isn't known, become null."""
-    with np.errstate(invalid="ignore"):  # what is not a covariance has no deviation
+    """The table ``frames``, one row per frame, in the given order.  NaN and -1 (unknown) become null."""
+    with np.errstate(invalid="ignore"):  # a value that is not a covariance has no standard deviation
         sigma_m = np.sqrt(np.diagonal(frames.covariance, axis1=1, axis2=2)[:, :3])
     axes = [f"{axis}_m" for axis in _AXES]
     poses = (("cam_T_grip", frames.cam_T_grip, POSE_NAMES), ("smoothed", frames.smoothed, POSE_NAMES),

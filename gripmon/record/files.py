@@ -1,4 +1,4 @@
-"""The series of files of one recording: begins, fills, ends them, and keeps clear of a full or a dead disk."""
+"""The series of files of one recording: opens, fills and closes them, and copes with a full or dead disk."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ _LONGEST_RETRY_S = 30.0
 _FLUSH_TIMEOUT_S = 2.0
 _STALLED_FLUSH_TIMEOUT_S = 0.1
 _DESCRIPTOR_POLL_S = 0.05
-_PIN_AROUND_S = 5.0  # this much before and after an alert is pinned at least, even where no images are kept around it
+_PIN_AROUND_S = 5.0  # pinned before and after an alert at least, even if no images are kept around it
 _FILES_REMEMBERED = 64
 _PICTURES_A_CHUNK = 16
-_ALERTS_KEPT = 64  # while nothing can be written: the next file says why
-# Space must have become a little more than it has to be, or recording would start and stop at every flush.
+_ALERTS_KEPT = 64  # while nothing can be written: the next file then explains it
+# A little more space than the minimum is needed to resume, or recording would start and stop at every flush.
 _FREE_AGAIN = 1.02
 
 
 def make_writer(stream: rr.RecordingStream, scene: Scene, file_number: int) -> Writer:
-    """The one for this scene; it has written what is static."""
+    """The writer for this scene, which has written the static data."""
     kind = RowWriter if scene.laser is None else SpotWriter
     return kind(stream, scene, file_number)
 
@@ -73,7 +73,7 @@ class _File:
             self.first_ns, self.last_ns = min(stamps_ns + known_ns), max(stamps_ns + known_ns)
 
     def is_written(self) -> bool:
-        """Whether rerun still has it open: its thread that writes ends with the first write that fails."""
+        """Whether rerun still has the file open: its writing thread ends with the first write that fails."""
         opened = (entry for entry in Path("/proc/self/fd").iterdir() if entry.name != str(self.lock))
         for entry in opened:
             with contextlib.suppress(OSError):  # closed meanwhile
@@ -83,9 +83,9 @@ class _File:
 
 
 class FileSeries:
-    """``name-0001.rrd`` and on.  Frames that arrive while nothing can be written are counted as lost.
+    """``name-0001.rrd``, ``name-0002.rrd``, …  Frames that arrive while nothing can be written are counted as lost.
 
-    All files of a series carry one recording id: a viewer that is given several of them shows one recording.
+    All files of a series have one recording id, so that a viewer shows several of them as one recording.
     """
 
     def __init__(self, scene: Scene):
@@ -114,14 +114,14 @@ class FileSeries:
         self.frames_written = 0
         self.frames_lost = 0
         self.images_lost = 0  # of frames that are written
-        self.notice: str | None = None  # what was found at the start
-        self._hung: list[rr.RecordingStream] = []  # they would wait for ever when they are forgotten
+        self.notice: str | None = None  # findings at the start
+        self._hung: list[rr.RecordingStream] = []  # they would block forever when garbage collected
         self._mend()
         self._begin()
 
     @property
     def hangs(self) -> bool:
-        """Whether rerun waits for ever for a writer that has died: nothing can be cleaned up, not even the process."""
+        """Whether rerun waits forever for a writer that has died: not even the process can exit cleanly."""
         return bool(self._hung)
 
     @property
@@ -145,7 +145,7 @@ class FileSeries:
             self._newest_reference = events.references[-1]
 
     def pin(self, alert: PinnedBy, stamp_ns: int | None) -> None:
-        """Nothing deletes the files around this capture time (None: no frame yet), past, present and coming ones."""
+        """Pin the files around this capture time (None: no frame yet): past, present and future ones."""
         self._alerts.append(alert)
         if stamp_ns is not None:
             self._pinning.add(stamp_ns)
@@ -156,13 +156,13 @@ class FileSeries:
                 self._pins.pin(file.path, (alert,))
 
     def write(self) -> None:
-        """Put on disk what has been added; begin, end or change the file where that is due."""
+        """Write what has been added to disk; begin, end or change the file as needed."""
         if self._stream is None and time.monotonic() >= self._retry_at:
             self._begin()
         if self._stream is None or self._writer is None or self._file is None:
             self._lose()
             return
-        if not self._stalled:  # what rerun holds already is written when the disk answers again
+        if not self._stalled:  # what rerun holds already is written when the disk responds again
             self._unflushed += len(self._rows)
             self._file.cover(self._rows)
             self._writer.write(self._rows, self._events)
@@ -172,25 +172,25 @@ class FileSeries:
             late, self._late = self._late[:_PICTURES_A_CHUNK], self._late[_PICTURES_A_CHUNK:]
             self._writer.write_pictures(late)
             whole = self._flush(self._stream, self._file)
-            self.images_lost += len(late) * (self._file is None)  # given up, and they with it
+            self.images_lost += len(late) * (self._file is None)  # the file was abandoned, and they are lost with it
         if whole and self._file is not None:
             self._maintain(self._file)
         elif self._backlog_full():
             self._lose()
 
     def close(self) -> None:
-        """Complete the file: its footer lets readers load it without a scan."""
+        """Complete the file: its footer lets readers load it without scanning it."""
         self._end()
         self._lose()
 
     def _flush(self, stream: rr.RecordingStream, file: _File) -> bool:
-        """Whether all that was sent is on disk.  A disk that fails ends the file, one that stalls is waited for."""
+        """Whether everything sent is on disk.  A disk that fails ends the file; for one that stalls, this waits."""
         timeout_s = _STALLED_FLUSH_TIMEOUT_S if self._stalled else _FLUSH_TIMEOUT_S
         begun_s = time.monotonic()
         try:
             stream.flush(timeout_sec=timeout_s)
             file.whole_bytes = file.path.stat().st_size
-        except Exception as error:  # noqa: BLE001 - rerun raises one kind for both; what fails does so at once
+        except Exception as error:  # noqa: BLE001 - rerun raises the same type for both; a failure comes at once
             timed_out = time.monotonic() - begun_s >= 0.9 * timeout_s
             if timed_out and file.is_written():
                 self._stalled = True
@@ -209,13 +209,13 @@ class FileSeries:
         return True
 
     def _backlog_full(self) -> bool:
-        """Whether more waits for a disk that doesn't answer than memory is there for."""
+        """Whether the backlog for a disk that doesn't respond exceeds its memory limit."""
         pictures = (row.picture for row in self._rows)
         picture_bytes = sum(len(picture.blob) for picture in pictures if picture is not None)
         return len(self._rows) > self._settings.queue_frames or picture_bytes > self._settings.ring_bytes
 
     def _maintain(self, file: _File) -> None:
-        """Pin what alerts touch, and begin the next file when this one is full, old, or breaks the budget."""
+        """Pin the file if an alert touches it, and begin the next one if this is full, old, or over budget."""
         settings = self._settings
         if self._touches(file):
             self._pins.pin(file.path, tuple(self._alerts))
@@ -229,13 +229,13 @@ class FileSeries:
             self._begin()
 
     def _fits(self, file: _File) -> bool:
-        """Whether the budget has room for more in this file."""
+        """Whether this file may grow within the budget."""
         if not self._budget.exceeded_by(file.whole_bytes):
             return True
         try:
             return not self._budget.make_room(self._pins.holds, file.path)
         except OSError:
-            return True  # the next flush says what is wrong with the directory
+            return True  # the next flush reports what is wrong with the directory
 
     def _touches(self, file: _File) -> bool:
         return file.first_ns is not None and self._pinning.near(file.first_ns, file.last_ns)
@@ -248,8 +248,8 @@ class FileSeries:
         return ""
 
     def _end(self) -> None:
-        """Write the footer and end the file; not where its disk has failed, for which rerun would wait for ever.  What
-        waits stays for the next one.
+        """Write the footer and end the file, unless its disk has failed, for which rerun would wait forever.  What is
+        queued stays for the next file.
         """
         stream, file = self._stream, self._file
         if stream is not None and self._writer is not None and file is not None:
@@ -281,7 +281,7 @@ class FileSeries:
         self._stalled = False
 
     def _begin(self) -> None:
-        """Open the next file and write what every file needs: the layout, all that is static, the reference."""
+        """Open the next file and write what every file needs: the layout, static data, the reference."""
         with contextlib.suppress(OSError):  # reported below
             self._directory.mkdir(parents=True, exist_ok=True)  # it may have been removed
         missing = space_missing(self._directory, self._settings.min_free_bytes, _FREE_AGAIN)
@@ -315,7 +315,7 @@ class FileSeries:
         free_closed_streams()  # of earlier files
 
     def _why_not(self, path: Path, error: Exception) -> str:
-        """rerun only says that its thread has ended: the room there is explains the rest."""
+        """rerun only reports that its thread has ended; the free space explains the rest."""
         try:
             free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
         except OSError as missing:
@@ -329,15 +329,15 @@ class FileSeries:
             return f"{self._directory}: {error.strerror}"
 
     def _abandon(self, why: str) -> None:
-        """Leave a file that can't be written any more: without the message that was cut off, which would keep readers
-        from all the others.  One without frames is worth nothing.
+        """Give up a file that can no longer be written: cut off its incomplete last message, because of which readers
+        would reject the file.  A file without frames is deleted.
         """
         file = self._file
         self.frames_lost += self._unflushed
         self._unflushed = 0
         self._leave()
         if file is not None:
-            with contextlib.suppress(OSError):  # the same disk; a later start mends it
+            with contextlib.suppress(OSError):  # the same disk; a later start repairs it
                 if file.frames == 0:
                     file.path.unlink(missing_ok=True)
                     pin_path(file.path).unlink(missing_ok=True)
@@ -355,14 +355,14 @@ class FileSeries:
         self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
 
     def _lose(self) -> None:
-        """Frames are gone; alerts wait, so that the recording says in time what it went through."""
+        """Drop queued frames but keep alerts, so that the next file says what happened."""
         self.frames_lost += len(self._rows)
         self.images_lost += len(self._late)
         self._rows, self._late, self._events = [], [], Events(alerts=self._events.alerts[-_ALERTS_KEPT:])
 
     def _mend(self) -> None:
-        """Earlier files of this robot and camera, whose writer may have been killed, and pins without a file."""
-        with contextlib.suppress(OSError):  # what is wrong with the directory is reported when the first file begins
+        """Repair earlier files of this robot and camera whose writer was killed, and delete pins without a file."""
+        with contextlib.suppress(OSError):  # errors of the directory are reported when the first file begins
             paths = [entry.path for entry in self._budget.recordings()]
             for path in paths:
                 repair(path)
@@ -377,7 +377,7 @@ class FileSeries:
                 pin.unlink(missing_ok=True)
 
     def _next_number(self) -> int:
-        """Above all that there were: a file that was deleted leaves its number unused.  0: they can't be listed."""
+        """One above the highest so far, so that numbers of deleted files aren't reused.  0: they can't be listed."""
         numbered = re.compile(rf"{re.escape(self._scene.name)}-(\d{{4,}})\.rrd(?:{re.escape(PIN_SUFFIX)})?").fullmatch
         try:
             found = [numbered(path.name) for path in self._directory.iterdir()]

@@ -1,4 +1,4 @@
-"""What is kept: images around alerts, files that nothing deletes, the disk's budget, and files that were cut off."""
+"""What is kept: images around alerts, pinned files, the disk budget, and the repair of truncated files."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 PIN_SUFFIX = ".pinned"
 _MOMENTS_KEPT = 64
 _ALERTS_KEPT = 256
-_BUDGET_FREE_FRACTION = 0.1  # free when a file begins, or files would become ever smaller
+_BUDGET_FREE_FRACTION = 0.1  # kept free when a file begins, or files would become ever smaller
 
 
 class Moments:
-    """Capture times that matter, and what lies around them; only the newest ones count."""
+    """Capture times of interest with an interval around each; only the newest are kept."""
 
     def __init__(self, around_ns: int) -> None:
         self.around_ns = around_ns
@@ -40,16 +40,16 @@ class Moments:
         self._stamps_ns.append(stamp_ns)
 
     def near(self, first_ns: int, last_ns: int | None = None) -> bool:
-        """Whether any of the span, ends included, lies within ``around_ns`` of a moment."""
+        """Whether any part of the interval, ends included, is within ``around_ns`` of a moment."""
         last_ns = first_ns if last_ns is None else last_ns
         return any(first_ns - self.around_ns <= t <= last_ns + self.around_ns for t in self._stamps_ns)
 
 
 class Trigger:
-    """Which alerts are worth the images around them, and files that nothing deletes: warnings and errors, when they
-    are raised or become worse.
+    """Decides which alerts keep the images around them and pin files: warnings and errors, when they are raised or
+    become more severe.
 
-    Not those about the recording itself: they are not about the camera, and a full budget must not pin more.
+    Alerts about the recording itself don't: they are not about the camera, and a full budget must not pin more files.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Trigger:
 
 
 class PictureRing:
-    """Rows with pictures of the last ``span_ns`` of capture time, at most ``limit_bytes``; the oldest give way."""
+    """Rows with pictures of the last ``span_ns`` of capture time, at most ``limit_bytes``; the oldest are dropped."""
 
     def __init__(self, span_ns: int, limit_bytes: int) -> None:
         self._span_ns, self._limit_bytes = span_ns, limit_bytes
@@ -85,7 +85,7 @@ class PictureRing:
     def push(self, row: AnyRow) -> None:
         rows, stamp_ns = self._rows, row.record.stamp_ns
         if rows and stamp_ns < rows[-1].record.stamp_ns:
-            rows.clear()  # a clock that was set back: the age of the others is unknown
+            rows.clear()  # the clock was set back: the age of the others is unknown
             self.bytes = 0
         rows.append(row)
         self.bytes += _size(row)
@@ -93,7 +93,7 @@ class PictureRing:
             self.bytes -= _size(rows.popleft())
 
     def take(self, moments: Moments) -> list[AnyRow]:
-        """Remove and return what lies around the moments, in order."""
+        """Remove and return the rows near the moments, in order."""
         taken: list[AnyRow] = []
         rest: deque[AnyRow] = deque()
         for row in self._rows:
@@ -108,7 +108,7 @@ def _size(row: AnyRow) -> int:
 
 
 class PinnedBy(msgspec.Struct, frozen=True):
-    """The alert: ``stamp_ns`` its frame's capture time, or Unix time for one that belongs to no frame."""
+    """The alert that pins a file; ``stamp_ns``: its frame's capture time, or Unix time if it belongs to no frame."""
 
     alert_id: str
     kind: AlertKind
@@ -120,8 +120,8 @@ class PinnedBy(msgspec.Struct, frozen=True):
 
 
 class Pinned(msgspec.Struct, frozen=True, tag="gripmon.pinned/1"):
-    """A ``.pinned`` file, as JSON: the alerts that keep ``name-0001.rrd`` in ``name-0001.rrd.pinned``, which a person
-    deletes to unpin the recording.
+    """A ``.pinned`` file, as JSON: ``name-0001.rrd.pinned`` lists the alerts that keep ``name-0001.rrd``.  Deleting it
+    unpins the recording.
     """
 
     alerts: tuple[PinnedBy, ...]
@@ -140,7 +140,7 @@ def pinned_by(alert: Alert | AlertRecord, stamp_ns: int, seq: int) -> PinnedBy:
 
 
 class PinBoard:
-    """Pins of one process; those that could not be written yet count as well, and are tried again."""
+    """Pins of one process; those that could not be written yet are valid too, and are retried."""
 
     def __init__(self) -> None:
         self._pinned: dict[Path, tuple[PinnedBy, ...]] = {}
@@ -157,7 +157,7 @@ class PinBoard:
         return recording in self._unwritten or is_pinned(recording)
 
     def write(self) -> None:
-        """Write what is due.  OSError if that can't be; what is left is due still."""
+        """Write the pending pins.  Raises OSError if one can't be written; the rest stays pending."""
         for recording in sorted(self._unwritten):
             if recording.exists():
                 pinned = Pinned(self._pinned[recording])
@@ -165,7 +165,7 @@ class PinBoard:
             self._unwritten.discard(recording)
 
     def forget(self, recording: Path) -> None:
-        """No more alerts come to this one."""
+        """Forget a recording that gets no more alerts."""
         if recording not in self._unwritten:
             self._pinned.pop(recording, None)
 
@@ -179,10 +179,10 @@ class _Entry(NamedTuple):
 
 class DiskBudget:
     """Keeps the recordings of one robot and camera in one directory within ``budget_bytes`` (0: no limit): the oldest
-    go first, pinned ones never.
+    are deleted first, pinned ones never.
 
-    Its files are those with the default name of robot and camera, whenever they were made, and those of the series
-    ``name``.  Files that another process is writing are left alone.
+    It counts files with the default name of robot and camera, of any run, and those of the series ``name``.  Files that
+    another process is writing are never deleted.
     """
 
     def __init__(self, directory: Path, robot: str, camera: str, name: str, budget_bytes: int) -> None:
@@ -194,14 +194,14 @@ class DiskBudget:
         self._others_bytes = 0
 
     def exceeded_by(self, current_bytes: int) -> bool:
-        """Whether a file that has grown to this size breaks the budget; asks the disk for nothing."""
+        """Whether a current file of this size exceeds the budget; no disk access."""
         return 0 < self._budget_bytes < self._others_bytes + current_bytes
 
     def make_room(self, pinned: Callable[[Path], bool], current: Path | None = None) -> str:
-        """Delete what has to go, never ``current``; returns why there still is no room, empty if there is.
+        """Delete recordings as needed, never ``current``; returns why there still is no room, empty if there is.
 
-        Without ``current``, before a file begins, a tenth of the budget is made free.  OSError if the directory can't
-        be read.
+        Without ``current``, before a file begins, a tenth of the budget is freed.  Raises OSError if the directory
+        can't be read.
         """
         if self._budget_bytes == 0:
             return ""
@@ -228,7 +228,7 @@ class DiskBudget:
         )
 
     def recordings(self) -> list[_Entry]:
-        """The oldest first."""
+        """All of them, the oldest first."""
         entries = []
         for found in os.scandir(self._directory):
             if self._belongs(found.name):
@@ -240,7 +240,7 @@ class DiskBudget:
     def orphaned_pins(self) -> list[Path]:
         """Pins of earlier runs whose recordings were deleted or moved.
 
-        Those of the series ``name`` stay: they keep its numbers from being used again.
+        Pins of the series ``name`` are not included: they keep its numbers from being reused.
         """
         orphaned = []
         for pin in self._directory.glob(f"*{PIN_SUFFIX}"):
@@ -252,7 +252,7 @@ class DiskBudget:
 
 
 def space_missing(directory: Path, wanted_bytes: int, factor: float = 1.0) -> str:
-    """Why the disk has no room for more, empty if it has."""
+    """Why the disk has too little free space, empty if it has enough."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
@@ -263,7 +263,7 @@ def space_missing(directory: Path, wanted_bytes: int, factor: float = 1.0) -> st
 
 
 def claim(path: Path) -> int | None:
-    """Lock a file against other recorders, until the descriptor is closed or the process ends; None if that fails."""
+    """Lock a file against other recorders until the descriptor is closed or the process ends; None if that fails."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -277,7 +277,7 @@ def claim(path: Path) -> int | None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder that lives has claimed it."""
+    """Whether a running recorder has locked it."""
     descriptor = claim(path)
     if descriptor is None:
         return path.exists()
@@ -286,9 +286,9 @@ def is_being_written(path: Path) -> bool:
 
 
 def repair(path: Path) -> int:
-    """Cut off a message that isn't whole, because its writer was killed: readers would refuse all the file for it.
+    """Cut off an incomplete last message, left by a killed writer: readers would reject the whole file because of it.
 
-    Not of a file that is being written.  Returns the bytes cut off.  OSError.
+    Does nothing to a file that is being written.  Returns the number of bytes cut off.  Raises OSError.
     """
     lock = claim(path)
     if lock is None:
@@ -304,10 +304,10 @@ def repair(path: Path) -> int:
 
 
 def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whole: bool = True) -> None:
-    """Give a finished recording its name ``path``; what stood there before stays until then.
+    """Move a finished recording to ``path``; an earlier file there stays until then.
 
-    One that isn't ``whole``, lacks its footer, or went into several files because writing failed in between, is
-    removed: :class:`~gripmon.model.errors.NoResultError`.  ``failure`` is what the recorder reports.
+    One that isn't ``whole``, lacks its footer, or was split into several files because writing failed in between, is
+    removed, and :class:`~gripmon.model.errors.NoResultError` is raised.  ``failure`` is the recorder's own.
     """
     reason = failure
     try:
@@ -316,7 +316,7 @@ def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whol
             return
     except OSError as error:
         reason = error.strerror
-    # rerun only says that its thread has ended: the room there is explains the rest.
+    # rerun only reports that its thread has ended: the free space explains the rest.
     with contextlib.suppress(OSError):
         reason = f"{_cause(reason)}; its disk has {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free"
     for part in written:
@@ -326,5 +326,5 @@ def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whol
 
 
 def _cause(failure: str | None) -> str:
-    """The last part: before it stands a path that the user has not named."""
+    """The last part, without the path before it, which the user has not named."""
     return " ".join((failure or "it was not finished").rpartition(": ")[2].split())

@@ -1,4 +1,4 @@
-"""The recording process as the daemon holds it: start, pipe, shared images, reports, health, end."""
+"""The daemon's handle on the recording process: start, pipe, shared images, status reports, health, end."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _BOOTSTRAP = (
 )
 _HOME = str(Path(__file__).resolve().parents[2])
 _LENGTH_BYTES = 4  # of a message, before it
-_PIPE_WAIT_S = 0.01  # for a batch that is larger than the pipe
-_KILL_WAIT_S = 0.5  # a process that hangs in the disk dies when that answers, perhaps never
+_PIPE_WAIT_S = 0.01  # for a batch larger than the pipe's buffer
+_KILL_WAIT_S = 0.5  # a process blocked by the disk dies when the disk answers, perhaps never
 _EXIT_WAIT_S = 0.2  # between a process's last descriptor and its exit code
 _PIXEL_TYPES = frozenset({"|u1", "<u2", "<f4"})
 
@@ -42,12 +42,12 @@ _STOPPED = ("T", "t")  # by SIGSTOP, by a debugger
 class ImageRing:
     """Slots for images in memory that two processes share.
 
-    The memory has no name: it is gone as soon as both processes are, however they end.  Pages that were never written
-    cost nothing, so a slot has room for the widest pixels.
+    The memory has no name: it is freed when both processes have ended, however they end.  Pages that were never written
+    cost nothing, so each slot has room for the widest pixels.
     """
 
     def __init__(self, width_px: int, height_px: int, slots: int, descriptor: int | None = None):
-        """With a ``descriptor``: the ring that another process made."""
+        """``descriptor``: of the ring that another process made; None: make a new one."""
         self.slots, self.slot_bytes = slots, width_px * height_px * 3 * 4
         self.descriptor = os.memfd_create("gripmon-images") if descriptor is None else descriptor
         if descriptor is None:
@@ -61,7 +61,7 @@ class ImageRing:
         return ImageNote(slot, image.shape, image.dtype.str)
 
     def get(self, note: ImageNote) -> NDArray[np.generic]:
-        """A view, good until the slot is given back."""
+        """A view of the slot, valid until the slot is reused."""
         count = int(np.prod(note.shape))
         flat = np.frombuffer(self._map, np.dtype(note.pixel_type), count, note.slot * self.slot_bytes)
         return flat.reshape(note.shape)
@@ -83,7 +83,7 @@ def framed(payload: bytes) -> bytes:
 
 
 class Unframer:
-    """Bytes as they come from a pipe -> whole payloads."""
+    """Splits the bytes from a pipe into whole payloads."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -100,10 +100,10 @@ class Unframer:
 
 
 class WorkerProcess:
-    """One recording process.  Everything here returns at once, except :meth:`finish`.
+    """One recording process.  No method blocks, except :meth:`finish` and :meth:`reap`.
 
-    It ends by itself when its parent does, because the pipe that it reads from ends then; signals meant for the daemon
-    (Ctrl-C, a service manager's SIGTERM to the group) don't reach or don't end it, so that it can finish its file.
+    The process ends with its parent, because the pipe that it reads from ends then; signals meant for the daemon
+    (Ctrl-C, a service manager's SIGTERM to the group) don't reach it or are ignored, so that it can finish its file.
     """
 
     def __init__(self, scene: Scene, ring: ImageRing):
@@ -114,7 +114,7 @@ class WorkerProcess:
             stdout=subprocess.DEVNULL,
             pass_fds=(status_write, ring.descriptor),
             start_new_session=True,
-            # What goes wrong with files is reported; rerun's own lines about it would only repeat it on stderr.
+            # Errors with files are in the status; rerun's own lines on stderr would only repeat them.
             env={"RUST_LOG": "off", **os.environ, "RERUN": "on"},
         )
         os.close(status_write)
@@ -141,17 +141,17 @@ class WorkerProcess:
 
     @property
     def ready(self) -> bool:
-        """Whether everything that was given to :meth:`send` has left this process."""
+        """Whether everything passed to :meth:`send` has left this process."""
         return not self._unsent and not self.gone
 
     def send(self, payload: bytes) -> None:
-        """Hand over a message; only when :attr:`ready`, so that at most one waits here."""
+        """Send a message; call it only when :attr:`ready`, so that at most one is pending."""
         self._unsent = memoryview(framed(payload))
         self.pump()
         self.pump(_PIPE_WAIT_S)
 
     def pump(self, wait_s: float = 0.0) -> None:
-        """Write what the pipe takes; with ``wait_s`` give it that time to take more."""
+        """Write as much as the pipe takes, waiting up to ``wait_s`` for it to take more."""
         if self._unsent and wait_s > 0.0:
             _wait_for(self._commands, select.POLLOUT, wait_s)
         while self._unsent and self._commands is not None and not self.gone:
@@ -160,11 +160,11 @@ class WorkerProcess:
             except BlockingIOError:
                 return
             except BrokenPipeError:
-                self.read_reports()  # the last one says why it ended
+                self.read_reports()  # the last status says why it ended
                 self.gone = True
 
     def read_reports(self) -> None:
-        """Take the newest :attr:`status`; notice when the process has ended."""
+        """Update :attr:`status` to the newest report, and :attr:`gone` when the process has ended."""
         while not self.gone:
             try:
                 part = os.read(self._reports, 65536)
@@ -180,15 +180,15 @@ class WorkerProcess:
     def finish(self, deadline: float) -> str | None:
         """Let it write everything and end.
 
-        One that has everything and is only slow past the ``deadline`` (monotonic seconds) is left alone, and
-        :attr:`still_writes`: it needs no parent, and ends by itself.  Others are ended by force.  Returns why the
-        recording is incomplete, None if all went well.
+        A process that has received everything but is still writing at the ``deadline`` (monotonic seconds) is left
+        running, and :attr:`still_writes` is set: it needs no parent and ends on its own.  Any other is killed.  Returns
+        why the recording is incomplete, None if it is complete.
         """
         while self._unsent and not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
             self.pump(left_s)
         has_everything = not self._unsent
         self._close_commands()
-        # Reading on until the pipe ends keeps the process from waiting for room in it.
+        # Read until the pipe ends, so that the process is never blocked by a full pipe.
         while not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
             _wait_for(self._reports, select.POLLIN, left_s)
             self.read_reports()
@@ -200,12 +200,12 @@ class WorkerProcess:
         return self.reap(deadline - time.monotonic())
 
     def discard(self) -> None:
-        """End it, whatever it does."""
+        """Kill it."""
         self._process.kill()
         self.reap(_KILL_WAIT_S)
 
     def reap(self, timeout_s: float) -> str | None:
-        """Wait for the end, or bring it about; then release all descriptors."""
+        """Wait for the end of the process or kill it, then close all descriptors."""
         self._close_commands()
         try:
             code = self._process.wait(max(timeout_s, _EXIT_WAIT_S))
@@ -234,8 +234,8 @@ def _wait_for(descriptor: int | None, event: int, timeout_s: float) -> None:
 
 
 class Health:
-    """Whether the process answers and keeps up, from counts and times alone: one line in ``fault``, None while all is
-    well.
+    """Whether the process responds and keeps up, judged by counts and times alone; ``fault`` is one line, None while
+    all is well.
     """
 
     def __init__(self, now_s: float) -> None:
@@ -248,9 +248,9 @@ class Health:
     def look(
         self, now_s: float, heard_s: float, heard: bool, pid: int, frames: int, images: int, explained: bool = False
     ) -> None:
-        """``heard_s``: when it last reported, or was started while never ``heard``; then what was dropped so far.
-
-        ``explained``: the process itself says why it writes nothing, and what is lost meanwhile is no thinning.
+        """``heard_s``: time of its last report, or of its start if it was never ``heard``; ``frames`` and ``images``
+        count what was dropped so far.  ``explained``: the process itself says why it writes nothing, so that losses
+        don't mean that it is too slow.
         """
         if now_s - heard_s > (SILENT_AFTER_S if heard else _START_TAKES_S):
             self.fault = f"recording pauses: {_why_silent(pid)}"
@@ -264,7 +264,7 @@ class Health:
         self.fault = self._thins
 
     def _count(self, counts: bool, frames: int, images: int) -> None:
-        """A short burst is no news, losses that go on for seconds are."""
+        """A short burst of losses is not reported, losses that last for seconds are."""
         (frames_before, images_before), self._counts = self._counts, (frames, images)
         what = "frames" if frames > frames_before else "images" if images > images_before else ""
         losing = bool(what) and counts
@@ -277,8 +277,8 @@ class Health:
 
 
 def stands_still(pid: int) -> bool:
-    """Whether a process was stopped from outside, or one of its threads waits for a disk at every look in a tenth of a
-    second.
+    """Whether a process was stopped from outside, or one of its threads waits for a disk in every sample over a tenth
+    of a second.
     """
     for _ in range(_STATE_SAMPLES):
         states = [_state(thread) for thread in Path(f"/proc/{pid}/task").glob("*")]
@@ -289,7 +289,7 @@ def stands_still(pid: int) -> bool:
 
 
 def _state(process: Path) -> str:
-    """The letter that Linux has for a process or thread; empty if there is none."""
+    """The state letter that Linux gives a process or thread; empty if it doesn't exist."""
     try:
         return (process / "stat").read_text().rpartition(")")[2].split()[0]
     except (OSError, IndexError):

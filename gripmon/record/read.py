@@ -1,8 +1,8 @@
-"""Reading recordings: what monitors wrote down, as columns, records and pictures, whatever state the files are in.
+"""Reading recordings: what monitors recorded, as columns, records and pictures, whatever state the files are in.
 
-``open_recordings(paths, progress)`` takes files and folders, of several runs and robots, in any order, and gives a
-:class:`Collection`: the recordings, each one run of one monitor, and the faults, one line each, of what could not be
-used.  No file is ever changed, and images stay in the files until they are asked for.
+``open_recordings(paths, progress)`` takes files and folders of several runs and robots in any order and returns a
+:class:`Collection`: the recordings, each one run of one monitor, and the faults, one line each, about what could not be
+used.  Files are never changed, and images are read only when needed.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ Progress = Callable[[int, int], None]
 _SUFFIX, _LINES_SUFFIX = ".rrd", ".jsonl"
 
 _NEVER_AS_IMAGE = frozenset({Refusal.NOT_AN_IMAGE, Refusal.WRONG_TYPE, Refusal.NOT_FINITE})
-"""What looks like another image, or like none, once it has been encoded with 8 bits."""
+"""Refusals of images that can't be recovered from an encoding with 8 bits."""
 _MAY_BE_TOO_LARGE = frozenset({*_NEVER_AS_IMAGE, Refusal.WRONG_SIZE})
 
 
 @dataclass(frozen=True)
 class Collection:
-    """What was found, in order of time; ``faults`` are one line each, about files that could not be used at all."""
+    """The recordings found, in order of time; ``faults``, one line each: files that could not be used at all."""
 
     recordings: tuple[Recording, ...]
     faults: tuple[str, ...]
 
 
 def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
-    """Everything but the images of the given files, and of all ``.rrd`` files in the given folders and below.
+    """Read everything but the images of the given files, and of all ``.rrd`` files in the given folders and below.
 
-    Files of several runs and robots may be mixed, in any order; those with one recording id become one recording.  An
-    ``estimates.jsonl`` that is named itself is a recording without images.  Whatever the files are, this raises
-    nothing: what could not be used is in ``faults``.  ``progress`` is called with bytes behind and bytes in all.
+    Files of several runs and robots may be mixed in any order; those with the same recording id become one recording.
+    An ``estimates.jsonl`` given by name is a recording without images.  Bad files raise nothing: what could not be used
+    is in ``faults``.  ``progress`` is called with bytes read and bytes in total.
     """
     faults: list[str] = []
     files = _distinct(_files(paths, faults), faults)
@@ -64,10 +64,10 @@ def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> 
 
 
 def needed_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
-    """As :func:`open_recordings`, for those who can do nothing without one.
+    """As :func:`open_recordings`, for callers that need at least one.
 
-    Raises :class:`~gripmon.model.errors.InputError` for a file that is not there, or where none of them is a recording;
-    :class:`~gripmon.model.errors.NoResultError` where recordings can't be read: that isn't the user's mistake.
+    Raises :class:`~gripmon.model.errors.InputError` for a missing file, or if none is a recording;
+    :class:`~gripmon.model.errors.NoResultError` if recordings can't be read, which isn't the user's mistake.
     """
     for path in paths:
         if not path.exists():
@@ -81,9 +81,9 @@ def needed_recordings(paths: Sequence[Path], progress: Progress | None = None) -
 
 
 def recording_files(paths: Sequence[Path]) -> list[Path]:
-    """The files that are meant, each once; a folder stands for the recordings in it and below.
+    """The given files, each once; a folder stands for the recordings in it and below.
 
-    Raises :class:`~gripmon.model.errors.InputError` for what isn't there, and for a folder without any.
+    Raises :class:`~gripmon.model.errors.InputError` for a missing path and for a folder without recordings.
     """
     files: list[Path] = []
     for path in paths:
@@ -96,13 +96,13 @@ def recording_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_rrd(path: Path) -> bool:
-    """Whether a file begins as rerun's do.  OSError where it can't be read."""
+    """Whether a file begins like a rerun recording.  Raises OSError if it can't be read."""
     with path.open("rb") as file:
         return os.read(file.fileno(), len(MAGIC)) == MAGIC
 
 
 def rrd_files(paths: Sequence[Path]) -> list[Path]:
-    """The same where each has to be one of rerun's."""
+    """As :func:`recording_files`, where each must be a rerun recording."""
     files = recording_files(paths)
     for path in files:
         try:
@@ -115,9 +115,9 @@ def rrd_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def recordings_below(folder: Path) -> list[Path]:
-    """All ``.rrd`` files in a folder and its folders, by name; but none in hidden ones, where files are being made.
+    """All ``.rrd`` files in a folder and below, by name, except in hidden folders, which contain unfinished files.
 
-    OSError where the folder itself can't be read.
+    Raises OSError if the folder itself can't be read.
     """
     os.scandir(folder).close()
     found = []
@@ -140,7 +140,7 @@ def _files(paths: Sequence[Path], faults: list[str]) -> Iterable[Path]:
 
 
 def _distinct(paths: Iterable[Path], faults: list[str]) -> dict[Path, int]:
-    """Each file once, whatever names it was given by, with its bytes."""
+    """Each file once, by whatever names it was given, with its size in bytes."""
     known: dict[tuple[int, int], Path] = {}
     sizes = {}
     for path in paths:
@@ -158,7 +158,7 @@ def _distinct(paths: Iterable[Path], faults: list[str]) -> dict[Path, int]:
 
 
 def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Contents]:
-    """What a file holds of each recording; what it doesn't goes to ``faults``."""
+    """What a file contains of each recording; faults are added to ``faults``."""
     try:
         if path.suffix.lower() == _LINES_SUFFIX and not is_rrd(path):
             return [read_lines(LineFile(path), step)]
@@ -170,7 +170,7 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
     except OSError as error:
         faults.append(f"{path}: {error.strerror or error}; not used")
         return []
-    except Exception as error:  # noqa: BLE001 - a file from anywhere must not end the reading of the others
+    except Exception as error:  # noqa: BLE001 - one bad file must not stop the reading of the others
         faults.append(f"{path}: can't be read ({in_short(error):.200}); not used")
         return []
     ours = [contents for contents in found if contents.is_ours and not contents.is_of_spots]
@@ -184,26 +184,25 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
 
 
 class UnusableError(Exception):
-    """These files hold nothing to replay; ``str()`` is one line."""
+    """These files contain nothing to replay; ``str()`` is one line."""
 
 
 class SeveralRunsError(Exception):
-    """Frames of several runs have no order; ``str()`` is one line."""
+    """The files are of several runs, whose frames have no common order; ``str()`` is one line."""
 
 
 class RecordedFrames:
-    """A source of every frame of one run whose image is in these ``.rrd`` files of ours, in the order of ``seq``, for
-    replay through the same core: each with its stamp, its name and the jaw opening that was reported.
+    """A source for replay: every frame of one run whose image is in these ``.rrd`` files, in the order of ``seq``, each
+    with its stamp, name and reported jaw opening.
 
-    To the bit it only is what happened where every frame's image was kept without loss (``image_every: 1``,
-    ``image_format: png``); float images are recorded with 8 bits.  A recording holds fewer images by default, and as
-    JPEG: replaying it comes close.  A frame that was refused because it was no image, or none of this camera's, has no
-    image in the recording either.  It is given again as what its record says of it: without image, with the same
-    refusal in the same words.
+    A replay is bit-exact only if every frame's image was recorded losslessly (``image_every: 1``,
+    ``image_format: png``); float images are recorded with 8 bits.  By default a recording has fewer images, as JPEG,
+    and a replay comes close.  A frame that was refused because it was not an image, or not of this camera, has no image
+    in the recording.  It is replayed from its record: without image, with the same refusal in the same words.
 
-    Images are read when their turn comes.  ``faults`` says what of the files could not be used, one line each;
-    ``passed_over`` counts frames that could not be read when their turn came, ``images_damaged`` those whose pixels
-    can't be decoded.  Raises :class:`UnusableError` where there is no image at all, and :class:`SeveralRunsError`.
+    Images are read when they are needed.  ``faults``, one line each: what in the files could not be used;
+    ``passed_over`` counts frames that could no longer be read, ``images_damaged`` those whose pixels can't be decoded.
+    Raises :class:`UnusableError` if there is no image at all, and :class:`SeveralRunsError`.
     """
 
     live = False
@@ -216,7 +215,7 @@ class RecordedFrames:
         self.paths: tuple[Path, ...] = run.files
         self.configuration: RecordedConfiguration | None = run.configuration
         self.reference: ReferenceRecord | None = run.references[0] if run.references else None
-        """The one in force when the first of these files began."""
+        """The reference in force when the first of these files began."""
         self.commands: tuple[RecordedCommand, ...] = tuple(sorted(run.commands, key=attrgetter("seq", "stamp_ns")))
         if not len(run.image_seqs):
             no_images = f"{self.paths[0]}: holds no images; a recording made with image_rate_hz above 0"
@@ -224,16 +223,16 @@ class RecordedFrames:
         with_image = np.isin(run.frames.seq, run.image_seqs)
         refused = run.frames.seq[run.frames.refused & ~with_image]
         stand_ins = [record.seq for record in run.records(refused) if _stands_in(record)] if len(refused) else []
-        # An image without a record, at the end of a recording that was cut off, was never judged.
+        # An image without a record, at the end of a truncated recording, was never judged.
         self._seqs = run.frames.seq[with_image | np.isin(run.frames.seq, stand_ins)]
         self.frames_without_image = len(run.frames) - len(self._seqs)
         self.stand_ins = len(stand_ins)
         self.passed_over = self.images_damaged = 0
         self._given = self._frames()
         self.shot: Shot | None = None
-        """The image of the frame that was read last, as it was recorded."""
+        """The recorded image of the frame that was read last."""
         self.record: FrameRecord | None = None
-        """What was decided about that frame when it was recorded."""
+        """The record of that frame."""
 
     def __len__(self) -> int:
         return len(self._seqs)
@@ -272,7 +271,7 @@ class RecordedFrames:
 
 
 def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
-    """The run that all files are of, and what is wrong with them."""
+    """The run that all files belong to, and what is wrong with them."""
     found = open_recordings(paths)
     if not found.recordings:
         raise UnusableError("; ".join(found.faults) or "there is no recording; an .rrd file of gripmon's")
@@ -285,13 +284,13 @@ def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
 
 
 def _stands_in(record: FrameRecord) -> bool:
-    """Whether a frame without image can be given again from its record alone."""
+    """Whether a frame without image can be replayed from its record alone."""
     refusal = _refusal_of(record)
     return refusal is not None and refusal[0] in _MAY_BE_TOO_LARGE
 
 
 def _refusal_of(record: FrameRecord) -> tuple[Refusal, str] | None:
-    """The refusal with its words; None for a frame that was measured, or at which measuring failed."""
+    """The refusal and its text; None for a frame that was measured, or in which the measurement failed."""
     kind, colon, words = (record.reason or "").partition(": ")
     if not colon or kind not in set(Refusal):
         return None

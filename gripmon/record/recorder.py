@@ -1,8 +1,8 @@
-"""What a recording is made of, on both sides of the pipe: settings, the recorder's interface, and the messages.
+"""Recording, on both sides of the pipe: settings, the recorder's interface, and the messages.
 
-The loop's thread only appends to a bounded queue.  A thread of the daemon hands the queue over to a process of its own,
-which encodes the images, logs to rerun and looks after the files: neither JPEG, rerun nor a slow disk ever hold the
-interpreter that the loop runs in.  The daemon itself never imports rerun.
+The loop's thread only appends to a bounded queue.  Another thread of the daemon passes the queue on to a separate
+process, which encodes the images, logs to rerun and manages the files, so that neither JPEG, rerun nor a slow disk
+ever blocks the interpreter in which the loop runs.  The daemon itself never imports rerun.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How ``gripmon run --view`` serves viewers: on this machine only."""
+    """How ``gripmon run --view`` serves viewers, on this machine only."""
 
     port: Annotated[int, Meta(ge=1, le=65535, description="TCP port on 127.0.0.1 for rerun viewers (no unit)")] = 9876
     web_port: Annotated[
@@ -143,13 +143,13 @@ class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class Recorder:
-    """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.  This one
+    """The interface of a recording to the loops: it never blocks, and counts what it has to drop.  This base class
     records nothing.
 
-    A wrist camera's loop has frames to offer and references, a second camera's has spots.  ``dropped`` are frames that
-    are not in the recording, ``images_dropped`` images that others lack; ``failure`` says why nothing is being written,
-    None when all is well.  ``has_room``: nothing would be dropped now, or waiting would not help; a source that can
-    wait does until then.
+    A wrist camera's loop offers frames and references, a second camera's offers spots.  ``dropped`` counts frames that
+    are not in the recording, ``images_dropped`` images missing from recorded frames; ``failure`` says why nothing is
+    being written, None while all is well.  ``has_room``: nothing would be dropped now, or waiting would not help; a
+    source that can wait does so until then.
     """
 
     @property
@@ -169,35 +169,35 @@ class Recorder:
         return None
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
+        """Record a frame.  Before this returns, ``notes`` is called, and ``trace`` if the picture is recorded."""
 
     def spot(self, record: SpotRecord, image: Image | None) -> None:
-        """What became of a pulse, with the image in which its spot was looked for."""
+        """Record a pulse's result, with the image in which its spot was searched."""
 
     def happened(self, events: Events) -> None:
-        """What there is beside the frames."""
+        """Record events that belong to no frame."""
 
     def alert(self, alert: AlertRecord) -> None:
-        """One that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
+        """Record an alert that belongs to no frame, such as a lost camera; frame records contain the others."""
         self.happened(Events(alerts=[alert]))
 
     def reference(self, reference: ReferenceRecord) -> None:
-        """A new one; the first was given at the start."""
+        """Record a new reference; the first one is in the scene."""
         self.happened(Events(references=[reference]))
 
     def command(self, command: RecordedCommand) -> None:
-        """A command, and what became of it."""
+        """Record a command and its result."""
         self.happened(Events(commands=[command]))
 
     def state(self, state: StateRecord) -> None:
         self.happened(Events(states=[state]))
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
+        """Write what is queued, finish the file and release everything, within ``timeout_s``, then by force."""
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
-    """The first message: all that doesn't change while a recording runs.
+    """The first message: everything that doesn't change while a recording runs.
 
     A wrist camera has a gripper and a reference, a second camera a ``laser``.
     """
@@ -219,7 +219,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def tcp_m(self) -> NDArray[np.float64]:
-        """Where the reference has the TCP of a wrist camera's gripper, camera frame."""
+        """The TCP at the reference of a wrist camera, in the camera frame."""
         assert self.reference is not None, "a wrist camera's"
         return np.array(self.reference.cam_T_grip.translation_m)
 
@@ -238,7 +238,7 @@ def make_scene(
     view: ViewSettings | None = None,
     laser: LaserCalibration | None = None,
 ) -> Scene:
-    """That of a wrist camera, or with a ``laser`` alone of a second camera."""
+    """The scene of a wrist camera, or of a second camera if only ``laser`` is given."""
     seen_by = camera if laser is None else laser
     assert seen_by is not None, "a wrist camera, or a second camera's laser"
     lens = seen_by.settings if isinstance(seen_by, Camera) else seen_by.camera
@@ -269,7 +269,7 @@ class TraceNote(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrameNote(msgspec.Struct, frozen=True, array_like=True):
-    """``limits`` where they are others than those of the frame before; ``statistic_share`` as in
+    """A frame.  ``limits``: None if the same as those of the frame before; ``statistic_share``: see
     :class:`gripmon.model.records.MonitorNotes`.
     """
 
@@ -280,12 +280,12 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     jaw_reported_m: float | None
     statistic_share: float | None
     limits: Limits | None
-    due: bool  # its image is written in any case, not only around an alert
-    lost: bool  # its image had no room
+    due: bool  # its image is always written, not only around an alert
+    lost: bool  # there was no room for its image
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):
-    """What happened beside the frames: alerts that are in no frame's record, and the rest as the daemon has it."""
+    """Events beside the frames: alerts that are in no frame's record, references, commands, state messages."""
 
     alerts: list[AlertRecord] = []
     references: list[ReferenceRecord] = []
@@ -294,7 +294,7 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
 
     @staticmethod
     def at_first(reference: ReferenceRecord | None) -> Events:
-        """What a file begins with: the reference in force, if there is one."""
+        """The events that a file begins with: the reference in force, if any."""
         return Events(references=[] if reference is None else [reference])
 
     def __bool__(self) -> bool:
@@ -310,16 +310,16 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):
-    """What goes over the pipe at once."""
+    """One message over the pipe."""
 
     frames: list[FrameNote]
     events: Events
 
 
 class Status(msgspec.Struct, frozen=True):
-    """What the recording process reports; all counts are since it began.
+    """The status of the recording process; all counts are since its start.
 
-    ``failure`` says why nothing is being written at the moment, None when all is well.
+    ``failure`` says why nothing is being written, None while all is well.
     """
 
     path: str | None = None
@@ -327,9 +327,9 @@ class Status(msgspec.Struct, frozen=True):
     frames: int = 0
     frames_lost: int = 0
     images_done: int = 0
-    view_failure: str | None = None  # of the live view, which is no failure of the recording
-    notice: str | None = None  # what a person may want to do about earlier files
-    images_lost: int = 0  # around alerts, or with a disk that failed; those that were due never came here
+    view_failure: str | None = None  # of the live view; the recording itself is not affected
+    notice: str | None = None  # advice about earlier files
+    images_lost: int = 0  # around alerts, or because of a failed disk; the sender counts dropped images that were due
 
 
 def pack_trace(trace: MeasurementTrace) -> TraceNote:
@@ -350,7 +350,7 @@ def pairs(packed: bytes) -> NDArray[np.float32]:
 
 
 def to_8_bit(image: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """uint16 by its upper byte, float from 0..1; for looking only, so values beyond the range, NaN too, are clipped."""
+    """uint16 by its upper byte, float from 0..1; for display only, so values out of range and NaN are clipped."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
     if image.dtype == np.uint16:

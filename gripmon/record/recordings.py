@@ -1,5 +1,5 @@
-"""One run of one monitor, out of all its files: frames in order, nothing twice, and in words what is missing or
-contradictory.
+"""One run of one monitor, assembled from all its files: frames in order, each once, and a description of what is
+missing or contradictory.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """An image with what was measured in it; positions in the distorted image, px, the first pixel's centre 0.
+    """An image with what was measured in it; positions in the distorted image, px, first pixel's centre at 0.
 
-    ``image`` is (height, width) or (height, width, 3) BGR, uint8 or uint16.  Edge points are (n, 2): ``edges_used``
-    those that the fit believed; ``predicted_edges`` one polyline (k, 2) a visible edge; ``predicted_corners`` (c, 2)
-    those of the visible ones.  All are empty for a frame that was refused.
+    ``image`` is (height, width) or (height, width, 3) BGR, uint8 or uint16.  Edge points are (n, 2); ``edges_used``
+    are those that the fit used.  ``predicted_edges``: one polyline (k, 2) per visible edge; ``predicted_corners`` (c,
+    2): the visible corners.  All are empty for a refused frame.
     """
 
     seq: int
@@ -61,9 +61,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A recorded image as it stands in the file, and what came with the frame.
+    """A recorded image as stored in the file, with the jaw opening that came with the frame.
 
-    ``blob`` are a JPEG's or PNG's bytes; ``jaw_reported_m`` is None where no opening was reported.
+    ``blob``: bytes of a JPEG or PNG; ``jaw_reported_m``: None if no opening was reported.
     """
 
     seq: int
@@ -78,23 +78,22 @@ class _Row(NamedTuple):
     number: int
 
     def scalar(self, component: str) -> Any:
-        """Arrow's value; None where the component is missing."""
+        """The Arrow scalar; None if the component is missing."""
         return self.batch.column(component)[self.number] if component in self.batch.schema.names else None
 
     def value(self, component: str) -> Any:
-        """The same as Python's; None where the component is missing or empty in this row."""
+        """The Python value; None if the component is missing or empty in this row."""
         found = self.scalar(component)
         return None if found is None else found.as_py()
 
 
 class Recording:
-    """One run of one monitor: all given files of it, put together in the order of frame numbers.
+    """One run of one monitor: all given files of it, joined in the order of frame numbers.
 
-    ``frames`` has no number twice.  ``meta`` is None for files that are older than it; ``robot`` and ``camera`` are
-    ``unknown`` where the files don't say.  ``alerts`` are those of the frames' records and the daemon's own.
-    ``faults`` are one line each: what is wrong, in which file, and what was used; ``file_faults`` those of them that a
-    file has by itself, whether the others of its run are there or not, ``gaps`` those about frames whose numbers
-    are missing.
+    ``frames`` has each number once.  ``meta`` is None for files that are older than it; ``robot`` and ``camera`` are
+    ``unknown`` if the files don't name them.  ``alerts`` are those of the frame records and the daemon's own.
+    ``faults``, one line each: what is wrong, in which file, and what was used.  Of these, ``file_faults`` concern one
+    file regardless of the rest of its run, and ``gaps`` are about missing frame numbers.
     """
 
     def __init__(self, contents: Sequence[Contents]) -> None:
@@ -102,7 +101,7 @@ class Recording:
         self._parts = parts = tuple(sorted(contents, key=_place_in_run))
         faults = [f"{part.path}: {fault}" for part in parts for fault in part.faults]
         self.file_faults: tuple[str, ...] = tuple(faults)
-        # The last file of a run was begun and got none: nothing is lost.
+        # If the last file of a run was begun and got no frames, nothing is lost.
         empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
         faults += [f"{part.path}: holds no frames" for part in empty]
         faults += _missing_files(parts)
@@ -130,10 +129,10 @@ class Recording:
         return f"Recording({self.recording_id}: {len(self.frames)} frames, {len(self.image_seqs)} images)"
 
     def records(self, seqs: IntArray | None = None) -> Iterator[FrameRecord]:
-        """Frames' records decoded once more, in the order of their numbers; of all frames, or of ``seqs`` (rising).
+        """Frame records, decoded again, in the order of their numbers; of all frames, or of ``seqs`` (ascending).
 
-        Those of another version have what this one knows; one that can't be understood, or whose file can't be read any
-        more, is passed over.
+        Records of another version have the fields that this one knows; a record that can't be understood, or whose file
+        can no longer be read, is skipped.
         """
         rows = np.arange(len(self.frames))
         if seqs is not None:
@@ -146,7 +145,7 @@ class Recording:
             yield from (found[seq] for seq in wanted if seq in found)
 
     def picture(self, seq: int) -> Picture | None:
-        """The image of a frame with its overlay; None where there is none, it is damaged, or its file is gone."""
+        """The image of a frame with its overlay; None if there is none, it is damaged, or its file is gone."""
         shot = self.shot(seq)
         image = None if shot is None else decode_image(shot.blob)
         if shot is None or image is None:
@@ -165,7 +164,7 @@ class Recording:
         )
 
     def shot(self, seq: int) -> Shot | None:
-        """The recorded image of a frame; None where there is none, or its file is gone."""
+        """The recorded image of a frame; None if there is none, or its file is gone."""
         row = self._row(entities.IMAGE, seq)
         if row is None:
             return None
@@ -174,7 +173,7 @@ class Recording:
         return Shot(seq, stamp_ns, _blob(row), kinds[0] if kinds else "", self.jaw_reported_m(seq))
 
     def jaw_reported_m(self, seq: int) -> float | None:
-        """The opening that was reported with a frame; None where there was none."""
+        """The jaw opening that was reported with a frame, m; None if there was none."""
         row = self._row(entities.JAW_REPORTED, seq)
         openings_m = None if row is None else row.value("Scalars:scalars")
         return openings_m[0] if openings_m else None
@@ -220,7 +219,7 @@ class Recording:
         return found
 
     def _row(self, entity: str, seq: int) -> _Row | None:
-        """The row of a frame in an entity; in the first file that has it."""
+        """The row of a frame in an entity, from the first file that has it."""
         for number, contents in enumerate(self._parts):
             for span in contents.places[entity].find(seq) if entity in contents.places else ():
                 for batch in self._batches(number, span).get(entity, ()):
@@ -250,7 +249,7 @@ def _batches(parts: Sequence[Contents], part: int, span: Span) -> dict[str, list
 
 
 def decode_image(blob: bytes) -> Image | None:
-    """A recorded image's pixels, as they were recorded; None for a damaged one."""
+    """The pixels of a recorded image, unchanged; None if it is damaged."""
     import cv2
 
     if not blob:
@@ -271,7 +270,7 @@ def _blob(row: _Row) -> bytes:
 
 
 def file_number(meta: Meta | None, path: Path) -> int | None:
-    """Of a file in its run; older ones have it in their names alone."""
+    """The number of a file in its run; older files have it only in their names."""
     if meta is not None:
         return meta.file_number
     found = _NUMBERED.search(path.stem)
@@ -283,7 +282,7 @@ def _place_in_run(part: Contents) -> tuple[int, int, str]:
 
 
 def _missing_files(parts: Sequence[Contents]) -> list[str]:
-    """Numbers that are missing, where frames are missing there, too: files may have been put together."""
+    """Missing file numbers, where frames are missing there, too: files may have been merged."""
     numbered = [
         (number, part)
         for part in parts
@@ -300,7 +299,7 @@ def _missing_files(parts: Sequence[Contents]) -> list[str]:
 
 
 def _events(parts: Sequence[Contents], entity: str, order: str) -> tuple[Any, ...]:
-    """Each once."""
+    """The events of an entity, each once, in the given order."""
     found = dict.fromkeys(event for part in parts for event in part.events.get(entity, ()))
     return tuple(sorted(found, key=attrgetter(order)))
 
@@ -315,7 +314,7 @@ def _names(parts: Sequence[Contents], meta: Meta | None, states: Sequence[StateR
 
 
 def _alerts(parts: Sequence[Contents], robot: str, camera: str) -> tuple[AlertRecord, ...]:
-    """Those of the frames' records and the daemon's own, by the frames they belong to."""
+    """Alerts of the frame records and the daemon's own, in frame order."""
     records: dict[int, FrameRecord] = {}
     for part in parts:
         for record in part.alerting:
@@ -339,8 +338,8 @@ def _alerts(parts: Sequence[Contents], robot: str, camera: str) -> tuple[AlertRe
 
 
 def _frames(parts: Sequence[Contents]) -> tuple[FrameTable, IntArray, list[str]]:
-    """All parts' frames in the order of their numbers, each once; the first file's where several have it.  With the
-    span of all parts' that each lies in, and what was left out.
+    """The frames of all parts in the order of their numbers, each once (from the first file that has it); the index of
+    each one's span, counted over all parts; and a description of repeated frames.
     """
     counts = [len(part.record_spans) for part in parts]
     begins = np.cumsum([0, *counts[:-1]])
@@ -358,7 +357,7 @@ def _frames(parts: Sequence[Contents]) -> tuple[FrameTable, IntArray, list[str]]
 def _repeated(
     parts: Sequence[Contents], table: FrameTable, order: IntArray, again: NDArray[np.bool_], rows_part: IntArray
 ) -> list[str]:
-    """``again`` (n,) marks those of the rows in ``order`` whose number the row before has, too."""
+    """``again`` (n,) marks the rows in ``order`` that have the same number as the row before."""
     twice = np.flatnonzero(again)
     first = order[np.maximum.accumulate(np.where(again, 0, np.arange(len(order))))][twice]
     second = order[twice]

@@ -1,34 +1,34 @@
 """Frames -> columns of a rerun recording: which entity holds what.
 
-Timelines: ``capture_time`` (the frame's ``stamp_ns``) and ``frame`` (its ``seq``).  A whole batch of frames becomes one
-chunk an entity, which costs a tenth of logging frame by frame.
+Timelines: ``capture_time`` (the frame's ``stamp_ns``) and ``frame`` (its ``seq``).  A batch of frames becomes one chunk
+per entity, which costs a tenth of logging frame by frame.
 
 ==================================  ================================================================================
 ``rig``                             camera axes (x right, y down, z forward), metres
 ``rig/camera``                      pinhole without lens distortion;  ``image`` and its overlay in distorted pixels
-``rig/gripper``                     ``cam_T_grip`` of the frame, below it the fingers at the frame's jaw opening
+``rig/gripper``                     ``cam_T_grip`` of the frame, and below it the fingers at its jaw opening
 ``rig/reference``, ``smoothed``     ``cam_T_grip`` of the reference; the smoothed transform
 ``status/state``, ``verdict``       as state changes;  ``events`` alerts and changes as text
 ``record``                          the frame's whole record, one JSON line as ``replay`` writes it, to the last digit
-``meta``, ``configuration``         what this file is and what the monitor ran with, static, JSON as all that follows
-``reference``                       the one in force at the file's beginning, and each new one
-``alert``                           alerts that are in no frame's record: the daemon's own
+``meta``, ``configuration``         about this file, and the monitor's configuration; static, JSON like all below
+``reference``                       the reference in force when the file begins, and each new one
+``alert``                           alerts that are in no frame's record, from the daemon
 ``command``, ``state``              commands that were carried out or refused; state messages
 ``drift/tcp_shift_mm``              against the reference: camera axes, and its length;  ``…_sigma_mm`` the band of one
                                     standard deviation, ``…_smoothed_mm`` that of the smoothed transform
 ``drift/d_mm``, ``delta_deg``       ``d`` and ``delta`` of equation (14)
-``drift/limits_mm``, ``_deg``       of that length and turn: for a warning, for an error and a new reference (of ``d``)
-``drift/noticed_mm``, ``_deg``      between which two a constant shift along an axis passes unnoticed: x, y, z; x, y, z
-``drift/truth_mm``, ``error_mm``    where a simulator gives the truth
-``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised, noted or another
+``drift/limits_mm``, ``_deg``       limits of that shift and turn: warning; error and new reference (of ``d``)
+``drift/noticed_mm``, ``_deg``      the interval within which a constant shift goes undetected: x, y, z; x, y, z
+``drift/truth_mm``, ``error_mm``    where a simulator provides the truth
+``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised, noted or changes kind
 ``protection/level_mm``, ``_deg``   bounds on the errors of the TCP's position and of the rotation
-``protection/limit_mm``, ``_deg``   the alert limits that they are compared with
+``protection/limit_mm``, ``_deg``   the alert limits that the bounds are compared with
 ``test/share``                      the drift test's largest statistic over its threshold;  ``test/alarm`` is 1
 ``transform``                       translation (m) and quaternion x, y, z, w, raw and smoothed
-``sigma/…``                         standard deviations, raw and smoothed;  ``noise/…`` what was learnt of the stream's
-``residual/rms_px``                 of corners and of used edge points, from where the transform has them
+``sigma/…``                         standard deviations, raw and smoothed;  ``noise/…`` as learned from the stream
+``residual/rms_px``                 of corners and of used edge points, relative to their predicted positions
 ``residual/corners_px``             each corner's distance;  ``residual/edge_points`` each point's of the overlay
-``quality``, ``timing``, ``jaw``    counts of points and corners, latency, the opening that came with the frame
+``quality``, ``timing``, ``jaw``    counts of points and corners, latency, the opening reported with the frame
 ``image/…``                         statistics of the recorded images
 ==================================  ================================================================================
 """
@@ -77,9 +77,9 @@ class RowWriter(Writer):
         self._references: list[ReferenceRecord] = []
 
     def write(self, rows: Sequence[Row], events: Events) -> None:
-        """Send everything that was gathered since the last call.
+        """Send everything since the last call.
 
-        References wait for a frame: their own stamp may lie long before the recording, or be no time at all.
+        References wait for a frame: their own stamp may be long before the recording, or unset.
         """
         for r in events.references:
             self._curves.add_reference(r)
@@ -114,7 +114,7 @@ class RowWriter(Writer):
 
 
 def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
-    """The first frame that names the reference; else the first of all."""
+    """The first frame that names the reference; else the first frame."""
     key = (reference.reference_id, reference.revision)
     records = [row.record for row in rows]
     return next((r for r in records if (r.reference_id, r.revision) == key), records[0])
@@ -123,25 +123,25 @@ def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
 def _about(lens: LensSettings, gripper: str) -> str:
     return (
         f"gripper `{gripper}`, {lens.width_px} x {lens.height_px} px\n\nLens: `{to_json(lens).decode()}`\n\n"
-        "Image: predicted edges blue, edge points green where the fit believed them and red where not, measured "
+        "Image: predicted edges blue, edge points green where the fit used them and red where not, measured "
         "corners yellow.  Plot: motion of the TCP in the camera frame against the reference; thin lines are one "
         "standard deviation, wide pale ones the truth where there is one."
     )
 
 
 class CurveWriter:
-    """Writes everything that is a number over time, with the limits that it is judged by, in people's units."""
+    """Writes all numbers over time, with the limits that they are compared with, in mm and degrees."""
 
     def __init__(self, send: Sender, corner_ids: tuple[str, ...]):
         self._send = send
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
-        self._open: dict[str, tuple[AlertKind, Severity]] = {}  # of the alerts that are open
+        self._open: dict[str, tuple[AlertKind, Severity]] = {}  # the open alerts
         self._newest: Row | None = None
         self._drawn_ns: int | None = None
         _log_styles(send, corner_ids)
 
     def add_reference(self, reference: ReferenceRecord) -> None:
-        """What drifts are measured from."""
+        """A reference that drifts are measured from."""
         self._reference_tcp_m[reference.reference_id, reference.revision] = reference.cam_T_grip.translation_m
 
     def write(self, rows: Sequence[Row]) -> None:
@@ -153,7 +153,7 @@ class CurveWriter:
         self.write_pictures([row for row in rows if row.picture is not None])
 
     def write_pictures(self, shown: Sequence[Row]) -> None:
-        """What belongs to pictures, which may come later than the rest of their frames."""
+        """What belongs to pictures, which may be written later than the rest of their frames."""
         send, pictures = self._send, [r.picture for r in shown if r.picture is not None]
         if pictures:
             send.curve("image/mean_grey", shown, [p.mean_grey for p in pictures])
@@ -165,7 +165,7 @@ class CurveWriter:
         columns: list[rr.ComponentColumn] = []
         for i, name in enumerate(("used_px", "refused_px")):
             each = [side[i] for side in sides]
-            if any(len(residuals) for residuals in each):  # rerun makes no column of nothing
+            if any(len(residuals) for residuals in each):  # rerun makes no column from nothing
                 columns += rr.AnyValues.columns(True, **{name: np.concatenate(each)}).partition(
                     [len(one) for one in each]
                 )
@@ -192,20 +192,20 @@ class CurveWriter:
         for severity in Severity:
             marked = [i for i, some in enumerate(news) if severity in some]
             if marked:
-                # Without a drift to mark it stands on the axis.
+                # Without a drift the mark is on the axis.
                 heights_mm = [with_length_mm[i][3] if with_length_mm[i] else 0.0 for i in marked]
                 send.curve(f"drift/alerts/{severity}", [rows[i] for i in marked], heights_mm)
 
     def _protection(self, rows: Sequence[Row]) -> None:
         bounds = [r.record.protection for r in rows]
-        if all(b is None for b in bounds):  # of a version that had none; or nothing is measured
+        if all(b is None for b in bounds):  # from a version without them; or nothing was measured
             return
         self._send.curve("protection/level_mm", rows, [None if b is None else 1e3 * b.position_m for b in bounds])
         degrees = [None if b is None else math.degrees(b.rotation_rad) for b in bounds]
         self._send.curve("protection/level_deg", rows, degrees)
 
     def _news(self, record: FrameRecord) -> set[Severity]:
-        """Of alerts that are raised or noted, or have become another kind or severity: a creep that ends in a step."""
+        """Severities of alerts that are raised, noted, or change kind or severity (a creep that ends in a step)."""
         news = set()
         for alert in record.alerts:
             if alert.event is AlertEvent.CLEARED:
@@ -218,7 +218,7 @@ class CurveWriter:
         return news
 
     def _shift_mm(self, row: Row, tcp_m: tuple[float, float, float] | None) -> list[float]:
-        """A TCP against the one of the reference that the frame names; empty where either is unknown."""
+        """A TCP relative to that of the reference that the frame names; empty if either is unknown."""
         reference_tcp_m = self._reference_tcp_m.get((row.record.reference_id, row.record.revision))
         if tcp_m is None or reference_tcp_m is None:
             return []
@@ -243,12 +243,12 @@ class CurveWriter:
         if not judged:
             return
         self._newest = judged[-1]
-        # What changes slowly needs few points, and every chunk costs two kilobytes.
+        # Slow changes need few points, and every chunk costs two kilobytes.
         if self._drawn_ns is None or not 0 <= judged[-1].record.stamp_ns - self._drawn_ns < _LIMITS_PERIOD_NS:
             self._draw_limits(judged[:1] + judged[-1:] if len(judged) > 1 else judged)
 
     def finish(self) -> None:
-        """The end of the file: lines reach to its last frame."""
+        """At the end of the file: extend the limit lines to its last frame."""
         if self._newest is not None and self._newest.record.stamp_ns != self._drawn_ns:
             self._draw_limits([self._newest])
 
@@ -325,7 +325,7 @@ def _log_styles(send: Sender, corner_ids: tuple[str, ...]) -> None:
 
 
 def _both(size: int, raw: list[float], other: list[float]) -> list[float]:
-    """Two series of ``size`` numbers side by side; NaN, which leaves a gap, for one that is unknown alone."""
+    """Two series of ``size`` numbers side by side; NaN, shown as a gap, if only one of them is unknown."""
     gap = [math.nan] * size
     return [*(raw or gap), *(other or gap)] if raw or other else []
 
@@ -344,7 +344,7 @@ def _band_mm(record: FrameRecord) -> list[float]:
 
 
 def _noticed(limits: Limits, axes: slice, scale: float) -> list[float]:
-    """The ends of what passes unnoticed, lower ones first; empty while that isn't known."""
+    """Bounds of the undetected shift, the lower ones first; empty while they are unknown."""
     if limits.noticed is None or limits.offset is None:
         return []
     middle, size = np.array(limits.offset[axes]), np.array(limits.noticed[axes])
@@ -352,7 +352,7 @@ def _noticed(limits: Limits, axes: slice, scale: float) -> list[float]:
 
 
 def _corner_residuals_px(record: FrameRecord, trace: TraceNote) -> list[float]:
-    """Distance of each corner from where the transform has it; NaN, which leaves a gap, where it was not measured."""
+    """Distance of each corner from its predicted position; NaN, shown as a gap, where it was not measured."""
     predicted = pairs(trace.predicted_corners_uv_px)
     measured = [(math.nan, math.nan) if corner.uv_px is None else corner.uv_px for corner in record.corners]
     if len(measured) != len(predicted) or not measured:
@@ -361,7 +361,7 @@ def _corner_residuals_px(record: FrameRecord, trace: TraceNote) -> list[float]:
 
 
 def _edge_residuals_px(trace: TraceNote) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Of the points that the fit believed, and of the others, in the order in which the overlay shows them."""
+    """Of the edge points that the fit used, and of the others, in the overlay's order."""
     used = np.frombuffer(trace.edge_used, np.uint8) == 1
     distances = np.frombuffer(trace.edge_residual_px, np.float32)
     return distances[used], distances[~used]

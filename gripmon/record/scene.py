@@ -1,4 +1,4 @@
-"""What a viewer shows of a wrist camera: the image with its overlay, camera and gripper in space, the layout."""
+"""A wrist camera in the viewer: the image with its overlay, camera and gripper in space, the layout."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _AXIS_M, _LINE_M = 0.012, 0.0004
 _CURVE_POINTS = 33
 """Points of a curved edge in the 3D view."""
 
-_JAW_STEP_M = 2e-5  # the fingers are drawn again
-_EYE = (0.66, -0.36, -0.03)  # beside and above, so that camera and gripper are both in sight
+_JAW_STEP_M = 2e-5  # beyond it the fingers are drawn again
+_EYE = (0.66, -0.36, -0.03)  # beside and above, so that camera and gripper are both visible
 _LOOK_AT_FRACTION = 0.64  # of the way from camera to TCP
 _CLOSE_UP_MM = (-0.3, 0.3)
-_STATISTIC_SHOWN = (0.0, 2.0)  # a collision is hundreds of times the threshold; what matters is where it crosses 1
+_STATISTIC_SHOWN = (0.0, 2.0)  # a collision gives hundreds of times the threshold; the crossing of 1 matters
 _Pixels = NDArray[np.float32]
 _NOT_TRACED = TraceNote(b"", b"", b"", b"", [], b"")
 _NO_POINTS = np.empty((0, 3))
@@ -74,7 +74,7 @@ class OverlayWriter:
             static(f"{IMAGE}/{name}", rr.Points2D.from_fields(colors=colour, radii=radius_px))
 
     def write(self, rows: Sequence[Row]) -> None:
-        # A refused frame has no picture to lie on, but must take the overlay of the one before away.
+        # A refused frame has no picture, but must remove the overlay of the frame before.
         rows = [row for row in rows if row.picture is not None or not row.record.measured]
         if not rows:
             return
@@ -82,7 +82,7 @@ class OverlayWriter:
         self._draw(rows)
 
     def write_late(self, rows: Sequence[Row]) -> None:
-        """Images of frames that were written before without; a refused frame's overlay is there already."""
+        """Images of frames that were written earlier without them; overlays of refused frames are written already."""
         self._send.images(IMAGE, rows)
         rows = [row for row in rows if row.record.measured]
         if rows:
@@ -116,7 +116,7 @@ class OverlayWriter:
         self._send.frames(f"{IMAGE}/{name}", rows, columns)
 
     def _corners(self, record: FrameRecord, trace: TraceNote) -> list[_Corner]:
-        """Corners with their labels; one that was not measured is shown where it was predicted, with the reason."""
+        """Corners with labels; a corner that was not measured is shown at its prediction, with the reason."""
         predicted = pairs(trace.predicted_corners_uv_px)
         where = {name: (float(u), float(v)) for name, (u, v) in zip(self._corner_ids, predicted, strict=False)}
         found = [(corner, corner.uv_px or where.get(corner.id)) for corner in record.corners]
@@ -131,7 +131,7 @@ class OverlayWriter:
 
 
 def _label_places(corners_px: Sequence[tuple[float, float]], step_px: float) -> list[tuple[float, float]]:
-    """Above the upper corners and below the lower ones, off the edges that meet there; neighbours on two levels."""
+    """Labels above the upper corners and below the lower ones, clear of the edges; neighbours on two levels."""
     middle_px = float(np.mean([v for _, v in corners_px])) if corners_px else 0.0
     places = list(corners_px)
     for below in (False, True):
@@ -201,11 +201,11 @@ class RigWriter:
             self._write_shift(pictured)
 
     def write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> None:
-        """Where the gripper was calibrated to be, from frame ``first`` on."""
+        """The reference pose of the gripper, from frame ``first`` on."""
         self._send.columns("rig/reference", [first.stamp_ns], [first.seq], pose_columns([reference.cam_T_grip]))
 
     def _looks_different(self, row: Row) -> bool:
-        """Whether the jaws moved or the verdict changed since the fingers were drawn last."""
+        """Whether the jaws moved or the verdict changed since the fingers were last drawn."""
         opening_m, verdict = self._look(row.record)
         if self._drawn is not None:
             same_opening = abs(opening_m - self._drawn[0]) < _JAW_STEP_M
@@ -219,7 +219,7 @@ class RigWriter:
         return opening_m, record.verdict if record.cam_T_grip is not None else Verdict.UNKNOWN
 
     def _write_fingers(self, rows: Sequence[Row]) -> None:
-        """The fingers as they are and, white, at the reference; without estimate there is only that."""
+        """The fingers at the estimate and, in white, at the reference; only the latter without an estimate."""
         looks = [self._look(row.record) for row in rows]
         points_m = [self._points_at(opening_m) for opening_m, _ in looks]
         outlines = [self._outlines(some) for some in points_m]
@@ -246,7 +246,7 @@ class RigWriter:
             self._send.frames("rig/gripper/faces", rows, mesh.partition([len(each) for each in solids]))
 
     def _write_shift(self, rows: Sequence[Row]) -> None:
-        """An arrow from the reference's TCP to the estimated one, true to scale."""
+        """An arrow from the reference's TCP to the estimated TCP, to scale."""
         arrows = [_arrow(row.record) for row in rows]
         known = [arrow for arrow in arrows if arrow is not None]
         columns = rr.Arrows3D.columns(
@@ -266,7 +266,7 @@ class RigWriter:
         return outlines
 
     def _points_at(self, opening_m: float) -> Array:
-        """(p, 3) in the gripper frame; a picture, so an opening outside the jaw's range shows the end of it."""
+        """(p, 3) in the gripper frame; for display, an opening outside the jaw's range is clipped to it."""
         gripper = self._gripper
         return gripper.points_grip_m(min(max(opening_m, gripper.jaw_min_m), gripper.jaw_max_m))
 
@@ -298,9 +298,9 @@ def _face_normals(vertices: Array, triangles: np.ndarray) -> Array:
 
 
 def layout_file(scene: Scene) -> bytes:
-    """The layout as rerun's own file of it, for :meth:`rerun.RecordingStream.log_file_from_contents`.
+    """The layout as a rerun blueprint file, for :meth:`rerun.RecordingStream.log_file_from_contents`.
 
-    Sending a blueprint leaves two threads and more than a MiB behind each time, for good; logging this leaves nothing.
+    Each ``send_blueprint`` leaks two threads and more than a MiB; logging this file leaks nothing.
     """
     descriptor = os.memfd_create("gripmon-layout")
     try:
@@ -311,13 +311,13 @@ def layout_file(scene: Scene) -> bytes:
 
 
 def make_blueprint(scene: Scene) -> rrb.Blueprint:
-    """What opens with a recording of either kind of camera."""
+    """The default layout for a recording of either kind of camera."""
     return _wrist_blueprint(scene) if scene.laser is None else spot_blueprint(scene)
 
 
 def _wrist_blueprint(scene: Scene) -> rrb.Blueprint:
-    """Left the image with its overlay and the events; right the rig in space, then what is judged: the TCP's drift
-    against its limits, the drift test's statistic against its threshold, and what followed, the states.
+    """Left: the image with its overlay, and the events.  Right: the rig in space, the TCP's drift with its limits, the
+    drift test's statistic over its threshold, and the resulting states.
     """
     truth = ["drift/truth_mm"] if scene.has_truth else []
     truth_named = "; wide, pale: truth" if scene.has_truth else ""

@@ -1,14 +1,14 @@
-"""A second camera's laser pulses -> columns of a rerun recording: which entity holds what; and a laser calibration
-as a scene.
+"""A second camera's laser pulses -> columns of a rerun recording: which entity contains what; and a laser calibration
+as a 3D scene.
 
 Timelines: ``capture_time`` (the pulse's ``stamp_ns``) and ``frame`` (``seq`` of its last frame).
 
 ==============================  ====================================================================================
 ``base``                        the robot's base, metres;  ``plane``, ``camera`` and its ``image`` as calibrated
-``base/camera/image/spot``      where the spot was seen;  ``foreseen`` where predicted, ``off`` from that to this
-``base/ee``, ``base/beam``      the end-effector, and the beam from its laser to where the calibration has the spot
-``off/px``, ``off/sigma_px``    the spot less the prediction (u, v), and the band of one standard deviation
-``gaps/mm``, ``sigma_mm``       how far the three ways to the spot disagree, one curve a pair
+``base/camera/image/spot``      where the spot was detected;  ``foreseen`` where predicted, ``off`` from there to it
+``base/ee``, ``base/beam``      the end-effector, and the beam from its laser to the calibrated spot
+``off/px``, ``off/sigma_px``    spot minus prediction (u, v), and the band of one standard deviation
+``gaps/mm``, ``sigma_mm``       disagreement of the three residual tests, one curve per pair
 ``test/square``                 normalised square of ``off``;  ``moved``: probability that anything has moved
 ``shift/mm``, ``mrad``          of the camera, base axes
 ``timing/judged_ms``            from a pulse's frames to its judgement
@@ -93,7 +93,7 @@ class SpotWriter(Writer):
         self._gaps(rows)
 
     def _gaps(self, rows: Sequence[SpotRow]) -> None:
-        """One curve a pair, named as in the first pulse that has them."""
+        """One curve per pair, named as in the first pulse that has them."""
         for row in rows:
             names = tuple(" / ".join(gap.ways) for gap in row.record.gaps)
             if names and names != self._gap_names:
@@ -128,7 +128,7 @@ class SpotWriter(Writer):
         self._send.frames(f"{IMAGE}/{name}", rows, columns)
 
     def _beam(self, record: SpotRecord) -> Array | None:
-        """From the laser to the spot as calibrated, (2, 3) base frame; None where the beam misses the plane."""
+        """From the laser to the calibrated spot, (2, 3) base frame; None if the beam misses the plane."""
         pose = record.base_T_ee
         base_T_ee = make_transform(rotation_from_xyzw(pose.rotation_xyzw), np.array(pose.translation_m))
         ends = np.concatenate(
@@ -140,7 +140,7 @@ class SpotWriter(Writer):
 
 
 def _band_px(record: SpotRecord) -> list[float]:
-    """Of one standard deviation about zero, u and v."""
+    """The band of one standard deviation about zero, u and v."""
     if record.off_covariance_px2 is None:
         return []
     u, v = np.sqrt(record.off_covariance_px2[0]), np.sqrt(record.off_covariance_px2[3])
@@ -159,7 +159,7 @@ def _log_cell(send: Sender, scene: Scene, calibration: LaserCalibration) -> None
 
 
 def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> tuple[Array, Array]:
-    """Where it is in the base, rotation (3, 3) and position (3,), and its image."""
+    """Log the camera and its image; returns its rotation (3, 3) and position (3,) in the base frame."""
     base_T_cam = invert(setup.cam_T_base)
     turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
     send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
@@ -193,7 +193,7 @@ def _about(lens: LensSettings) -> str:
 
 
 def spot_blueprint(scene: Scene) -> rrb.Blueprint:
-    """Left the pulse's image with the spot, and the events; right the cell in space, then what is judged."""
+    """Left: the pulse's image with the spot, and the events.  Right: the cell in space, then the tests."""
     cell = rrb.Spatial3DView(origin="base", contents=["base/**"], name="Base, camera, plane and beam", line_grid=False)
     judged = rrb.Vertical(
         cell,
@@ -215,7 +215,7 @@ def spot_blueprint(scene: Scene) -> rrb.Blueprint:
 
 
 def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
-    """Everything in the base frame, the residuals in the camera's image.  OSError if the file can't be written."""
+    """Write a calibration: everything in the base frame, residuals in the camera's image.  Raises OSError."""
     path.open("wb").close()
     recording = rr.RecordingStream("gripmon_laser")
     recording.save(path)
@@ -242,7 +242,7 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
 
 
 def _plane_corners(normal: Array, middle: Array, side: float) -> Array:
-    """Corners (4, 3) of a square on a plane, ``side`` is half of its own, m."""
+    """Corners (4, 3) of a square on a plane; ``side``: half of its side, m."""
     first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)

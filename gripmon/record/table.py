@@ -1,6 +1,6 @@
-"""The frames of a recording as columns: what a report, a correction and an export use.
+"""The frames of a recording as columns, for the report, the correction and the export.
 
-NumPy and msgspec only; JSON lines are decoded with just what the columns take.
+Needs only NumPy and msgspec; of JSON lines only the fields of the columns are decoded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
 OTHER = "other"
-"""Stands for a state or origin that a newer version may have."""
+"""Replaces a state or origin that only a newer version knows."""
 _BLOCK_ROWS = 4096
 _Integer = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 _Square = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
@@ -32,7 +32,7 @@ class _Corner(msgspec.Struct, frozen=True, gc=False):
 
 
 class Line(msgspec.Struct, frozen=True, gc=False):
-    """What the columns take of a :class:`FrameRecord`; what an older or newer version leaves out is unknown."""
+    """The fields of a :class:`FrameRecord` that the columns need; those that another version omits are unknown."""
 
     seq: _Integer
     stamp_ns: _Integer
@@ -57,11 +57,11 @@ class Line(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """One row a frame; NaN where a number is null, -1 where an integer is unknown.
+    """One row per frame; NaN where a number is null, -1 where an integer is unknown.
 
     Codes index the tuples of names: ``VERDICTS[verdict]``, ``STATES[state]``, ``ORIGINS[source]``,
-    ``reference_ids[reference]``.  A state or origin that this version doesn't know is ``other``; a verdict it doesn't
-    know counts as unknown, which nothing may rely on.
+    ``reference_ids[reference]``.  A state or origin that this version doesn't know is ``other``; an unknown
+    verdict counts as ``unknown``, on which nothing may rely.
     """
 
     VERDICTS: ClassVar[tuple[str, ...]] = tuple(v.value for v in Verdict)
@@ -87,9 +87,9 @@ class FrameTable:
     protection_rad: FloatArray
     """(n,) bound on the angle of the rotation error."""
     integrity_risk: FloatArray
-    """(n,) probability a frame that the error exceeds a bound."""
+    """(n,) probability per frame that the error exceeds a bound."""
     d_m: FloatArray
-    """(n,) length of the camera's displacement against the reference."""
+    """(n,) length of the camera's displacement from the reference."""
     delta_rad: FloatArray
     """(n,) its turn."""
     tcp_shift_m: FloatArray
@@ -103,7 +103,7 @@ class FrameTable:
     corners_used: NDArray[np.int32]
     corners_total: NDArray[np.int32]
     refused: NDArray[np.bool_]
-    """(n,) nothing was measured in this frame: its transform, if there is one, is held."""
+    """(n,) nothing was measured in this frame; its transform, if any, is held."""
     reference_ids: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -111,7 +111,7 @@ class FrameTable:
 
     @staticmethod
     def from_records(records: Iterable[FrameRecord | Line]) -> FrameTable:
-        """A row a record, in their order."""
+        """One row per record, in order."""
         builder = TableBuilder()
         for record in records:
             builder.add(record)
@@ -146,7 +146,7 @@ _NAN_3, _NAN_7, _NAN_36 = (np.nan,) * 3, (np.nan,) * 7, (np.nan,) * 36
 
 
 class _Column(NamedTuple):
-    """``of`` gives a record's value, of this ``type`` and ``shape``."""
+    """``of`` returns a record's value, of this ``type`` and ``shape``."""
 
     of: Callable[[Any], Any]
     type: type[np.generic] = np.float64
@@ -186,9 +186,9 @@ _REFERENCE = _Column(lambda r: r.reference_id, np.int32)
 
 
 class TableBuilder:
-    """Gathers records into columns block by block, so that no long list of objects ever stands in memory.
+    """Collects records into columns block by block, so that memory never holds a long list of objects.
 
-    ``unknown_names`` gathers verdicts, states and origins that this version doesn't know.
+    ``unknown_names``: verdicts, states and origins that this version doesn't know.
     """
 
     def __init__(self) -> None:
@@ -212,14 +212,14 @@ class TableBuilder:
             self._close_block()
 
     def close(self) -> None:
-        """There are no more rows for the time being: all names are known."""
+        """Convert the rows so far, so that ``unknown_names`` is complete."""
         if self._rows:
             self._close_block()
 
     @staticmethod
     def join(builders: Sequence[TableBuilder]) -> FrameTable:
-        """All rows of all, one builder's after the other's.  A builder gives its columns away one by one, so that what
-        is joined doesn't stand in memory twice; afterwards it is good for nothing.
+        """All rows of all builders, one after another.  Columns are moved out of the builders one by one, so that
+        memory doesn't hold them twice; the builders can't be used afterwards.
         """
         places: dict[str, int] = {}
         for builder in builders:

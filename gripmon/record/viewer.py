@@ -1,5 +1,5 @@
-"""rerun's viewer as a process of its own, that ends with the one that started it unless it is a window; and finished
-recordings on its web page, each served as it is on the disk.
+"""rerun's viewer as a separate process, which ends with its parent unless it is a window; and finished recordings on
+its web page, served unchanged from disk.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gripmon.record.recorder import LOOPBACK
 
 _START_S = 20.0
 _STOP_S = 5.0
-# The kernel ends the viewer with its parent, however that ends; parent gone before: not even started.
+# The kernel kills the viewer when its parent ends, however that ends; if the parent is gone already, it isn't started.
 _TIED = (
     "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
     "os.getppid() == int(sys.argv[1]) or sys.exit(1); os.execv(sys.argv[2], sys.argv[2:])"
@@ -31,7 +31,7 @@ _TIED = (
 
 
 class ViewerError(RuntimeError):
-    """No viewer can be started; the text says why, and what would help."""
+    """No viewer can be started; the text says why and what to do."""
 
 
 def has_display() -> bool:
@@ -40,7 +40,7 @@ def has_display() -> bool:
 
 
 def is_free(port: int) -> bool:
-    """Whether a program may listen there, on loopback."""
+    """Whether a program can listen on this loopback port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -51,7 +51,7 @@ def is_free(port: int) -> bool:
 
 
 def free_port(preferred: int) -> int:
-    """The preferred port of loopback, or any other if a program has that one."""
+    """The preferred loopback port, or any free one if that is in use."""
     if is_free(preferred):
         return preferred
     with socket.socket() as probe:
@@ -68,7 +68,7 @@ class WebPage:
             raise ViewerError(f"port {web_port} of {LOOPBACK} is in use; another one")
         wanted = "&".join(f"url={urllib.parse.quote(source, safe='')}" for source in sources)
         self.url = f"http://{LOOPBACK}:{web_port}/?{wanted}"
-        # With a source to show, it serves the page alone and no data.
+        # With a source to show, it serves the page only, no data.
         command = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), sources[0]]
         self._process = _start(command, tied=True)
         end_s = time.monotonic() + _START_S
@@ -89,7 +89,7 @@ class NativeViewer:
     """rerun's window, on files or on a stream."""
 
     def __init__(self, sources: Sequence[str], *, tied: bool) -> None:
-        """``tied``: it ends with this process; else it stays open until it is closed.  Raises :class:`ViewerError`."""
+        """``tied``: the window ends with this process; else it stays until it is closed.  Raises :class:`ViewerError`."""
         if not has_display():
             raise ViewerError("there is no display for a window; the web viewer needs none")
         self._process = _start(["--bind", LOOPBACK, "--port", "auto", *sources], tied=tied)
@@ -104,7 +104,7 @@ class NativeViewer:
 
 
 def _start(arguments: Sequence[str], *, tied: bool) -> subprocess.Popen[bytes]:
-    # Not the command `rerun`: that one leaves a child behind when it is ended.
+    # Not the command `rerun`, which leaves a child process behind when it is killed.
     found = importlib.util.find_spec("rerun_cli")
     executable = None if found is None or found.origin is None else Path(found.origin).parent / "rerun"
     if executable is None or not executable.is_file():
@@ -117,7 +117,7 @@ def _start(arguments: Sequence[str], *, tied: bool) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # a Ctrl-C is for us, who end it
+        start_new_session=True,  # Ctrl-C is handled here, which ends it
         env={**os.environ, "BROWSER": "true"},
     )
 
@@ -133,10 +133,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def serve_files(files: Sequence[Path], web_port: int) -> Iterator[WebPage]:
-    """The page and, from this process, the files that it shows; all of it on loopback, until the context ends.
+    """Serve the page and, from this process, the files that it shows, on loopback until the context ends.
 
-    By the standard library's server: the page needs GET and HEAD of a few named files, and nothing else is served.
-    Raises :class:`ViewerError`.
+    The standard library's server is enough: the page needs GET and HEAD of a few named files, and only these are
+    served.  Raises :class:`ViewerError`.
     """
     named = {f"/{number}/{urllib.parse.quote(path.name)}": path for number, path in enumerate(files)}
     handler = functools.partial(_Files, named, f"http://{LOOPBACK}:{web_port}")
@@ -155,23 +155,23 @@ def serve_files(files: Sequence[Path], web_port: int) -> Iterator[WebPage]:
 
 
 class _Files(http.server.SimpleHTTPRequestHandler):
-    """These files and nothing else, to the page that was opened for them."""
+    """Serves these files, and no others, to the page that was opened for them."""
 
     def __init__(self, named: dict[str, Path], origin: str, *details: Any) -> None:
         self._named, self._origin = named, origin
         super().__init__(*details)
 
     def translate_path(self, path: str) -> str:
-        """The file; empty, which is not found, for any other path."""
+        """The file; for any other path an empty string, which is not found."""
         return str(self._named.get(path, ""))
 
     def end_headers(self) -> None:
-        """With the leave to be read by the page."""
+        """Add the header that lets the page read the file."""
         self.send_header("Access-Control-Allow-Origin", self._origin)
         super().end_headers()
 
     def copyfile(self, source: Any, outputfile: Any) -> None:
-        """Until the page is closed, perhaps."""
+        """Stop quietly if the page is closed."""
         with suppress(BrokenPipeError, ConnectionResetError):
             super().copyfile(source, outputfile)
 

@@ -1,6 +1,6 @@
-"""The recording process: reads batches from the daemon, encodes images, writes files; ends when its input does.
+"""The recording process: reads batches from the daemon, encodes images, writes files; ends when its input ends.
 
-With the live view on, the rows also go to rerun viewers that connect: next to the files, never in their way.
+With the live view on, the rows are also sent to rerun viewers that connect, without ever delaying the files.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from gripmon.record.recorder import (
 )
 from gripmon.record.scene import make_blueprint
 
-_NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
+_NICENESS = 5  # the loop has priority on a shared core; at 10 this process waited for seconds on a busy machine
 _STDIN = 0
 _READ_BYTES = 1 << 20
 _FRAMES_A_WRITE = 128
 _STAMPS_KEPT = 4096
-_REPORT_PERIOD_S = 1.0  # the daemon must hear something
+_REPORT_PERIOD_S = 1.0  # a sign of life for the daemon
 
 _FLUSH_TIMEOUT_S = 1.0
-_REPEAT_S = 60.0  # what is only sent when it changes is sent again, for viewers that join when it has been dropped
+_REPEAT_S = 60.0  # what is sent on change only is sent again, for viewers that join after it was dropped
 _RETRY_S = 10.0
 _ROWS_WAITING = 512
-_WAITING_MEMORY_FRACTION = 0.25  # of the view's memory limit, for the pictures of the rows that wait
+_WAITING_MEMORY_FRACTION = 0.25  # of the view's memory limit, for the pictures of queued rows
 _CLOSE_S = 2.0
 
 
 def main(status_descriptor: int, memory_descriptor: int) -> None:
-    """Entry of the process; standard input carries the messages."""
-    # The end of the input is the one sign to end: a Ctrl-C is meant for the daemon, which then closes its end.
+    """Entry point of the process; messages arrive on standard input."""
+    # Only the end of the input ends this process: Ctrl-C is meant for the daemon, which then closes the pipe.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
@@ -72,16 +72,16 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
         scene = msgspec.msgpack.decode(payloads[0], type=Scene)
         loop = RecordingLoop(scene, status_descriptor, memory_descriptor)
         loop.run(unframer, payloads[1:])
-    except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
+    except Exception as error:  # noqa: BLE001 - reported in one line; the daemon starts another process
         sys.stderr.write(f"recording process: {in_short(error)}\n")
         code = 1
     if loop is None or not loop.hangs:
-        del loop  # a stream that is let go waits until its file is whole, or for ever if its writer has died
-    os._exit(code)  # all is written, or can't be
+        del loop  # a released stream waits until its file is complete, or forever if its writer has died
+    os._exit(code)  # everything is written, or can't be
 
 
 class RecordingLoop:
-    """Takes batches and gives their rows to the files and the live view."""
+    """Reads batches and passes their rows to the files and the live view."""
 
     def __init__(self, scene: Scene, status_descriptor: int, memory_descriptor: int):
         self._settings = settings = scene.settings
@@ -90,7 +90,7 @@ class RecordingLoop:
         self._around_ns = round(1e9 * settings.around_alert_s)
         self._moments = Moments(self._around_ns)
         self._before = PictureRing(self._around_ns, settings.ring_bytes)
-        self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images that had no room
+        self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images for which there was no room
         self._images_lost = self._images_done = 0
         self._limits: Limits | None = None
         self._trigger = Trigger()
@@ -103,18 +103,18 @@ class RecordingLoop:
 
     @property
     def hangs(self) -> bool:
-        """Whether rerun waits for ever for a writer that has died."""
+        """Whether rerun waits forever for a writer that has died."""
         return self._files.hangs
 
     def run(self, unframer: Unframer, payloads: list[bytes]) -> None:
-        """Until the input ends; ``payloads`` came with the scene."""
+        """Run until the input ends; ``payloads`` arrived together with the scene."""
         next_flush = next_report = time.monotonic()
         ended = False
         while not ended and not self.hangs:
             for payload in payloads:
                 self._take(payload)
                 if self._files.frames_waiting >= _FRAMES_A_WRITE:
-                    # A process that gathers more than it can write in time falls silent and grows.
+                    # A process that queues more than it can write sends no status and grows in memory.
                     self._files.write()
                     self._report()
             payloads = []
@@ -148,11 +148,11 @@ class RecordingLoop:
         for note in batch.frames:
             self._take_frame(note)
         for alert in batch.events.alerts:
-            # Its own stamp may be of another clock than the frames'.
+            # Its own stamp may be from another clock than that of the frames.
             self._on_alert(alert, alert.seq, alert.stamp_ns, self._newest_ns)
 
     def _take_frame(self, note: FrameNote) -> None:
-        """Around an alert every picture is written; of the others those that are due, the rest waits for an alert."""
+        """Around an alert every picture is written; otherwise those that are due, and the rest is kept for an alert."""
         record, picture = note.record, None
         self._newest_ns = record.stamp_ns
         for alert in record.alerts:
@@ -179,7 +179,7 @@ class RecordingLoop:
             receiver.add_frames([row])
 
     def _count_lost(self) -> None:
-        """Images around an alert that never came here."""
+        """Count images around an alert that never arrived here."""
         missed = [stamp_ns for stamp_ns in self._without if self._is_near(stamp_ns)]
         self._images_lost += len(missed)
         for stamp_ns in missed:
@@ -189,7 +189,7 @@ class RecordingLoop:
         return self._around_ns > 0 and self._moments.near(stamp_ns)
 
     def _on_alert(self, alert: Alert | AlertRecord, seq: int, stamp_ns: int, near_ns: int | None) -> None:
-        """If the alert is worth it, pin the files around it and write the pictures before it."""
+        """If the alert triggers it, pin the files around it and write the pictures before it."""
         if not self._trigger.by(alert):
             return
         self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
@@ -220,7 +220,7 @@ class RecordingLoop:
 
 
 class NoFiles:
-    """In the place of the files where recording is switched off and only the live view is wanted."""
+    """Replaces the files when recording is off and only the live view is wanted."""
 
     path = failure = notice = None
     frames_lost = frames_waiting = images_lost = 0
@@ -240,11 +240,11 @@ class NoFiles:
 
 
 class LiveStream:
-    """Serves the rows that it is given.  What can't be served is given up; ``failure`` says why, else it is None.
+    """Serves rows to viewers.  What can't be served is dropped; ``failure`` says why, None while all is well.
 
-    The server keeps what it has sent up to a limit, and drops the oldest.  A viewer that stands still blocks the
-    server: so a thread of its own waits for it, and what comes meanwhile is not shown.  The stream is not that of the
-    files, which begin and end without a viewer's notice.
+    The server keeps what it has sent up to a limit and drops the oldest data.  A stalled viewer blocks the server, so
+    a separate thread waits for it, and rows that arrive meanwhile are not shown.  The stream is separate from that of
+    the files, which may begin and end without viewers noticing.
     """
 
     def __init__(self, scene: Scene, settings: ViewSettings):
@@ -278,20 +278,20 @@ class LiveStream:
             self._events += events
 
     def write(self) -> None:
-        """Let the thread send what has been added; returns at once."""
+        """Let the thread send what has been added; returns immediately."""
         with self._lock:
             self._due = True
             self._lock.notify()
 
     def close(self) -> None:
-        """Send the rest and end the server, unless a viewer still holds it up after some seconds."""
+        """Send the rest and end the server, unless a viewer still blocks it after some seconds."""
         with self._lock:
             self._due = self._ending = True
             self._lock.notify()
         self._thread.join(_CLOSE_S)
 
     def _bounded(self, rows: list[AnyRow]) -> list[AnyRow]:
-        """The newest of them, as many as may wait."""
+        """The newest rows, as many as the limits allow."""
         left_bytes, kept = _WAITING_MEMORY_FRACTION * self._settings.memory_limit_bytes, 0
         for row in reversed(rows[-_ROWS_WAITING:]):
             left_bytes -= 0 if row.picture is None else len(row.picture.blob)
@@ -316,7 +316,7 @@ class LiveStream:
         self._stream = self._writer = None
 
     def _send(self, rows: list[AnyRow], late: list[AnyRow], events: Events) -> None:
-        """Begin, or begin again, where that is due; nothing more goes to a server that a viewer holds up."""
+        """Start or restart the stream if due, and send; a server that a viewer blocks gets nothing more."""
         now_s = time.monotonic()
         if self._writer is None and now_s < self._retry_at:
             return
@@ -332,14 +332,14 @@ class LiveStream:
                 writer.write_pictures(late)
             self._flush(stream)
             self.failure = None
-        except Exception as error:  # noqa: BLE001 - rerun raises its own kinds; none of them may touch the files
+        except Exception as error:  # noqa: BLE001 - rerun raises its own types; none may affect the files
             self._stream = self._writer = None
             self._stalled = False
             self._retry_at = now_s + _RETRY_S
             self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({one_line(error)})"
 
     def _flush(self, stream: rr.RecordingStream) -> None:
-        """Wait until it has been sent; a server that is gone fails at once, one that is held up in time."""
+        """Wait until everything is sent; a server that is gone fails at once, a blocked one after a timeout."""
         begun_s, was_stalled = time.monotonic(), self._stalled
         try:
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
@@ -364,7 +364,7 @@ class LiveStream:
 
 
 def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> Picture:
-    """Compress an image and measure what tells of its quality (on 8-bit grey values)."""
+    """Compress an image and compute its quality statistics (on 8-bit grey values)."""
     shown = to_8_bit(image)
     if settings.image_format == "png":
         exact = image.astype(np.uint16, copy=False) if image.dtype == np.uint16 else shown
@@ -375,7 +375,7 @@ def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> P
 
 
 def measured_picture(blob: bytes, media_type: str, image: NDArray[np.generic]) -> Picture:
-    """An encoded image with what tells of the quality of its pixels."""
+    """An encoded image with the quality statistics of its pixels."""
     shown = to_8_bit(image)
     grey = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY)
     mean, deviation = cv2.meanStdDev(grey)

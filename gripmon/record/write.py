@@ -1,4 +1,4 @@
-"""The daemon's side of a recording: frames are taken without blocking and handed over to the recording process."""
+"""The daemon's side of a recording: accepts frames without blocking and passes them to the recording process."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ _log = logging.getLogger(__name__)
 HANDOVER_PERIOD_S = 0.05
 LONGEST_RESTART_PAUSE_S = 30.0
 _BATCH_FRAMES = 16
-_FRAMES_A_TURN = 4  # before the interpreter lock is let go
+_FRAMES_A_TURN = 4  # before the interpreter lock is released
 ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
-_LOSSES_PERIOD_S = 60.0  # between two lines about them
-_EVENTS_KEPT = 4096  # while the process is away
+_LOSSES_PERIOD_S = 60.0  # between two log lines about losses
+_EVENTS_KEPT = 4096  # while there is no process
 
 Truth = Callable[[int], tuple[float, float, float] | None]
 
 
 class _Waiting(NamedTuple):
-    """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert;
-    ``lost`` its image, for want of room.
+    """A frame in the queue.  ``counted``: its image is among those queued; ``due``: its image is always written, not
+    only around an alert; ``lost``: there was no room for its image.
     """
 
     record: FrameRecord | SpotRecord
@@ -75,19 +75,19 @@ class _Waiting(NamedTuple):
 
 
 class ProcessRecorder(Recorder):
-    """Records through a process of its own.
+    """Records through a separate process.
 
     ``offer`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
-    afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread moves images into shared memory and
-    everything else, a batch at a time, into a pipe.  When the recording process can't follow, first images and then
-    frames are dropped and counted.  When it dies, it is started again and begins a new file.
+    afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread copies images into shared memory and
+    writes everything else, in batches, to a pipe.  If the recording process can't keep up, first images and then frames
+    are dropped and counted.  If it dies, it is started again and begins a new file.
     """
 
     def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
         self._scene, self._truth_tcp_m, self._patience_s = scene, truth_tcp_m, patience_s
         self._settings = settings = scene.settings
         self._keeps_before = settings.around_alert_s > 0.0
-        # Images that may only be wanted later leave room for those that are.
+        # Images kept in case of an alert leave room for those that are due.
         self._images_before = max(1, settings.queue_images - settings.queue_images // 4)
         self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
         # Written by the loop's thread only.
@@ -103,7 +103,7 @@ class ProcessRecorder(Recorder):
         self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
         self._slot_waited_from: float | None = None
         self._lost_earlier = self._written_earlier = 0
-        self._left_writing = 0  # frames that a process still writes when this object is closed
+        self._left_writing = 0  # frames that the process is still writing when this object is closed
         self._newest_reference = scene.reference
         self._own_failure: str | None = None
         self._stopped: str | None = None
@@ -120,18 +120,18 @@ class ProcessRecorder(Recorder):
 
     @property
     def dropped(self) -> int:
-        """Frames that are not in the recording: the queue was full, the process died, or nothing could be written."""
+        """Frames missing from the recording: the queue was full, the process died, or nothing could be written."""
         return self._not_queued + self._lost_earlier + self._status.frames_lost
 
     @property
     def images_dropped(self) -> int:
-        """Images that were due, or around an alert, but had no room: their frames are recorded without."""
+        """Images that were due, or around an alert, for which there was no room; their frames are recorded."""
         earlier = self._images_not_queued + self._images_without_slot + self._images_lost_earlier
         return earlier + self._status.images_lost
 
     @property
     def has_room(self) -> bool:
-        """Whether the next frame and its image would be taken; also true of a recording that fails."""
+        """Whether the next frame and its image would be accepted; also true while recording fails."""
         images = self._images_before if self._keeps_before else self._settings.queue_images
         waiting = self._images_offered - self._images_taken
         return self.failure is not None or (len(self._frames) < self._settings.queue_frames and waiting < images)
@@ -160,7 +160,7 @@ class ProcessRecorder(Recorder):
         self.offer(Frame(record.seq, record.stamp_ns, image), record, lambda: None)
 
     def offer(self, frame: Frame, record: FrameRecord | SpotRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
+        """Record a frame, from the loop's thread; its image and trace only as configured, and at events."""
         if self._patience_s > 0.0:
             self._wait_for_room()
         if len(self._frames) >= self._settings.queue_frames:
@@ -177,7 +177,7 @@ class ProcessRecorder(Recorder):
             self._image_stamp_ns = record.stamp_ns
             item = _Waiting(record, True, frame.image, trace(), frame.jaw_opening_m, noted, due)
         elif self._keeps_before and not due and waiting < self._images_before:
-            # Kept in case of an alert.  Its trace would cost the loop more than all the rest of this.
+            # Kept in case of an alert.  Its trace would cost the loop more than everything else here.
             self._images_offered += 1
             item = _Waiting(record, True, frame.image, None, frame.jaw_opening_m, noted, due)
         else:
@@ -211,7 +211,7 @@ class ProcessRecorder(Recorder):
             return True
         if self._image_interval_ns is None:
             return False
-        # A capture time that jumps backwards starts a new count.
+        # A capture time that jumps backwards starts a new interval.
         return self._image_stamp_ns is None or not 0 <= stamp_ns - self._image_stamp_ns < self._image_interval_ns
 
     def _run(self) -> None:
@@ -222,7 +222,7 @@ class ProcessRecorder(Recorder):
             while self._frames and self._worker is not None and time.monotonic() < self._close_before:
                 time.sleep(ROOM_POLL_S)
                 self._hand_over()
-        except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
+        except Exception as error:  # noqa: BLE001 - a failing recording must not end the monitor
             _log.exception("recording stopped")
             self._stopped = f"internal error: {error!r}"
             self._close_before = time.monotonic() + _STOPPED_TIMEOUT_S
@@ -255,7 +255,7 @@ class ProcessRecorder(Recorder):
             self._log_losses(now_s)
 
     def _log_losses(self, now_s: float = math.inf) -> None:
-        """One line when something more is missing than was logged last."""
+        """Log one line if losses have grown since the last one."""
         losses = (self.dropped, self.images_dropped)
         if losses != self._losses_logged:
             self._losses_logged, self._losses_logged_s = losses, now_s
@@ -272,7 +272,7 @@ class ProcessRecorder(Recorder):
         return self._worker
 
     def _count_dead(self, worker: WorkerProcess, failure: str) -> None:
-        """Count what a dead process took with it and plan the next one."""
+        """Count what was lost with a dead process and schedule the next one."""
         self._lost_earlier += worker.frames_sent - worker.status.frames
         self._written_earlier += worker.status.frames
         self._images_lost_earlier += worker.status.images_lost
@@ -293,13 +293,13 @@ class ProcessRecorder(Recorder):
         return events
 
     def _next_frames(self, worker: WorkerProcess) -> list[msgspec.Raw]:
-        """Those of the next batch, each encoded on its own."""
+        """The frames of the next batch, each encoded separately."""
         frames: list[msgspec.Raw] = []
         while self._frames and len(frames) < _BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0]):
             record, counted, image, trace, jaw_reported_m, noted, due, lost = self._frames.popleft()
             self._images_taken += counted
             note = None
-            if image is not None and self._ring.takes(image):  # else a refused frame: its record says why
+            if image is not None and self._ring.takes(image):  # otherwise a refused frame, whose record says why
                 note = self._share(worker, image, due)
                 lost = note is None
             packed = None if trace is None else pack_trace(trace)
@@ -310,12 +310,12 @@ class ProcessRecorder(Recorder):
             whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
             frames.append(msgspec.Raw(self._encode(whole)))
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
-                time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
+                time.sleep(0)  # releases the interpreter lock: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
         return frames
 
     def _wait_for_slot(self, worker: WorkerProcess, head: _Waiting) -> bool:
-        """Whether the next frame stays in the queue because its image has no room yet and patience is left."""
+        """Whether the next frame stays queued because there is no slot for its image yet and patience is left."""
         if self._patience_s == 0.0 or head.image is None or self._slot_free(worker, head.due):
             self._slot_waited_from = None
             return False
@@ -340,7 +340,7 @@ class ProcessRecorder(Recorder):
     def _finish(self) -> None:
         worker, self._worker = self._worker, None
         if worker is not None and self._queued == 0 and not worker.heard:
-            worker.discard()  # it hasn't even begun, and there is nothing that it could record
+            worker.discard()  # it hasn't started yet, and there is nothing to record
         elif worker is not None:
             self._own_failure = failure = worker.finish(self._close_before)
             self._status = worker.status
@@ -370,16 +370,15 @@ def open_recorder(
     configuration: RecordedConfiguration | None = None,
     view: ViewSettings | None = None,
 ) -> Recorder:
-    """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
+    """A recorder as configured; files are ``directory/name-0001.rrd`` and so on, and are never overwritten.
 
-    A wrist camera has a ``camera``, a ``gripper`` and a ``reference``; a second camera a ``laser``, and every image of
-    it is recorded.  ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.
-    ``truth_tcp_m``, which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame;
-    its shift against the reference is drawn beside the estimated one.  It is called by another thread than the loop's.
-    ``patience_s`` is for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a
-    frame.  A camera can't wait: 0.  ``configuration`` is written into every file.  With ``view`` viewers may connect
-    and see what is recorded as it comes, also where nothing is recorded.  Raises OSError when the directory can't be
-    made.
+    A wrist camera has a ``camera``, a ``gripper`` and a ``reference``; a second camera has a ``laser``, and all its
+    images are recorded.  ``directory`` replaces that of the settings, ``name`` the default, made of robot, camera and
+    time of day.  ``truth_tcp_m``, from a simulator, maps a frame's ``seq`` to the TCP's true position in the camera
+    frame, whose shift from the reference is drawn beside the estimate; it is called in another thread than the loop's.
+    ``patience_s``: how long ``offer`` may wait for room before it drops a frame, for input that can wait, such as a
+    folder; 0 for a camera.  ``configuration`` is written into every file.  ``view``: viewers may connect and see frames
+    as they are recorded, also if recording itself is off.  Raises OSError if the directory can't be made.
     """
     if not settings.enabled and view is None:
         return Recorder()
