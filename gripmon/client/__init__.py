@@ -3,15 +3,15 @@
     from gripmon.client import TransformClient
 
     with TransformClient("arm1", "wrist") as monitor:
-        reading = monitor.latest()  # at once, whatever the network does
+        reading = monitor.latest()  # returns immediately, whatever the network does
         if reading.usable:
             move_by(reading.transform)
         else:
             stop(reading.reason)
 
-:class:`TransformClient` gives the newest transform and whether it may be used.  :class:`Client` reads every message as
-it is, and sends commands.  :class:`Fleet` knows how all monitors on the network are.  Nothing here waits for a monitor
-to start, and nothing needs help when a monitor or a router ends and comes again.  Neither NumPy nor OpenCV is loaded.
+:class:`TransformClient` returns the newest transform and whether it may be used.  :class:`Client` reads every message
+unchanged, and sends commands.  :class:`Fleet` shows the state of all monitors on the network.  A client may start
+before the monitor, and reconnects by itself when a monitor or a router restarts.  Neither NumPy nor OpenCV is loaded.
 """
 
 from __future__ import annotations

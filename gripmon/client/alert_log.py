@@ -1,4 +1,4 @@
-"""Every alert of every monitor, and who came and vanished: each once, in one file of JSON lines."""
+"""All alerts of all monitors, and monitors that appear or vanish: each once, in one file of JSON lines."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gripmon.client.fleet import MonitorStatus
 from gripmon.client.network import MonitorName
 from gripmon.model.records import AlertRecord
 
-_WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost
+_WAITING_MOST = 100_000  # lines kept while the file or pipe can't be written; beyond it the oldest are lost
 _LOOK_BACK_BYTES = 16 << 20
 
 
 class Event(NamedTuple):
-    """``line``: as it stands in the file, JSON; ``alert`` None: the monitor came or vanished, ``what`` says which."""
+    """``line``: JSON as in the file; ``alert`` None: the monitor appeared or vanished, as ``what`` says."""
 
     line: bytes
     name: MonitorName
@@ -30,30 +30,30 @@ class Event(NamedTuple):
 
 
 class AlertLog:
-    """Takes events in any thread (:class:`gripmon.client.Fleet` calls back); :meth:`write`, in one, puts them to the
-    end of the file.
+    """Accepts events in any thread (callbacks of :class:`gripmon.client.Fleet`); :meth:`write`, called in one thread,
+    appends them to the file.
 
-    The file is opened for every write, so that it may be moved away and a disk may be full for a while.  What stands
-    in its last 16 MiB already is not written again: a monitor repeats its last alerts to whoever comes later.
+    The file is opened for every write, so that it may be moved away and the disk may be full temporarily.  Lines that
+    are in its last 16 MiB already are not written again: a monitor repeats its last alerts to late subscribers.
     """
 
     def __init__(self, path: Path | None) -> None:
         """Raises OSError if the file is there and can't be read."""
         self._path = path
-        self._lock = threading.Lock()  # guards the next one against the threads that bring events
+        self._lock = threading.Lock()  # guards the next attribute against the callbacks' threads
         self._new: deque[Event] = deque(maxlen=_WAITING_MOST)
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MOST)
         self._failure = ""
         self._written = set() if path is None or not path.is_file() else set(_last_lines(path))
 
     def alert(self, name: MonitorName, record: AlertRecord, payload: bytes) -> None:
-        """An alert came, in this payload, JSON."""
+        """An alert arrived, with its JSON payload."""
         line = msgspec.json.format(payload, indent=-1)
         what = f"{record.kind} {record.event}" if record.alert_id else str(record.kind)
         self._add(Event(line, name, record.stamp_ns, what, record))
 
     def presence(self, status: MonitorStatus) -> None:
-        """A monitor has come or vanished, of which it can't tell itself."""
+        """A monitor has appeared or vanished, which it can't report itself."""
         stamp_ns = status.gone_since_ns or time.time_ns()
         what = "appeared" if status.gone_since_ns is None else "vanished"
         (robot, camera), schema = status.name, "gripmon.presence/1"
@@ -61,8 +61,8 @@ class AlertLog:
         self._add(Event(msgspec.json.encode(values), status.name, stamp_ns, what, None))
 
     def write(self) -> tuple[list[Event], str]:
-        """Append all that has come since; those events, and why the file can't be written: tried again the next time,
-        and empty if it can or if that was said before.
+        """Append all new events; returns them, and why the file can't be written (empty if it can, or if the reason was
+        returned before).  What could not be written is retried the next time.
         """
         with self._lock:
             new, self._new = list(self._new), deque(maxlen=_WAITING_MOST)
@@ -86,12 +86,12 @@ class AlertLog:
 
 
 def _append(path: Path, data: bytes) -> None:
-    """All of it or nothing, on lines of its own."""
+    """Append all of the data or nothing, starting on a new line."""
     with path.open("a+b", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         if size:
             file.seek(-1, os.SEEK_END)
-            data = data if file.read(1) == b"\n" else b"\n" + data  # whoever wrote last was stopped in a line
+            data = data if file.read(1) == b"\n" else b"\n" + data  # the last writer was stopped within a line
         try:
             written = 0
             while written < len(data):

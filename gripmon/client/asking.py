@@ -1,4 +1,4 @@
-"""Commands to a monitor, and the one answer that counts: for a client of one monitor, and for one of all."""
+"""Commands to a monitor and the selection of its reply, for :class:`Client` and :class:`Fleet`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from gripmon.model.records import (
 
 
 class NotCarriedOut(Exception):
-    """A command got no answer of the monitor itself: none is there, or it had no time for it; ``fault`` says which.
+    """A command got no reply from the monitor: it isn't there, or it had no time; ``fault`` says which.
 
-    A refusal is not an exception but an answer: ``CommandReply.done`` is false.  Sent again with the same
-    ``request_id`` it is not carried out twice.
+    A refusal is not an exception but a reply with ``CommandReply.done`` false.  A command that is sent again with the
+    same ``request_id`` is not carried out twice.
     """
 
     def __init__(self, text: str, fault: CommandFault | None = None, request_id: str = "") -> None:
@@ -34,7 +34,7 @@ class NotCarriedOut(Exception):
 
 
 class Ambiguous(LookupError):
-    """More than one monitor could be meant; ``argument`` is the one that would say which."""
+    """Several monitors match; ``argument`` is the parameter that would select one."""
 
     def __init__(self, text: str, argument: str) -> None:
         super().__init__(text)
@@ -42,23 +42,23 @@ class Ambiguous(LookupError):
 
 
 class Asker:
-    """Asks on a session that someone else opens and closes.  Any thread may."""
+    """Sends commands on a session that the caller opens and closes.  Thread-safe."""
 
     def __init__(self, session: zenoh.Session, where: str) -> None:
-        """``where``: whom the session connects to, for a person."""
+        """``where``: the endpoints of the session, for messages."""
         self._session, self._where = session, where
 
     def ask(
         self, keys: Keys, request: CommandRequest, name: CommandName, timeout_s: float
     ) -> tuple[CommandReply, bytes | None]:
-        """The answer of the one monitor that is meant, and what is attached to it.
+        """The reply of the one matching monitor, and its attachment.
 
-        Raises :class:`NotCarriedOut`, :class:`Ambiguous`, and ValueError for a request that can't be one.
+        Raises :class:`NotCarriedOut`, :class:`Ambiguous`, and ValueError for an invalid request.
         """
-        from_json(to_json(request), CommandRequest)  # what the monitor would refuse
+        from_json(to_json(request), CommandRequest)  # raises for what the monitor would refuse
         monitor = self._only_one(keys, timeout_s)
         start = self._only_start(monitor, request.monitor_id)
-        # From now on this start alone is meant, also where another one appears.
+        # From now on only this start is addressed, even if another one appears.
         payload = to_json(msgspec.structs.replace(request, monitor_id=start.monitor_id))
         another: zenoh.Reply | None = None
         for reply in self._session.get(
@@ -69,7 +69,7 @@ class Asker:
             another = reply
         if another is not None:
             return _answer(another, monitor, request.id)
-        # A router's access rules drop without a word what they don't allow.
+        # A router's access rules silently drop what they don't allow.
         raise NotCarriedOut(
             f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
             "may not let you send any",
@@ -78,11 +78,11 @@ class Asker:
         )
 
     def alive(self, keys: Keys, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
-        """The monitors of these names that run now, in order."""
+        """The running monitors of these names, sorted."""
         return tuple(sorted(map(monitor_name, self._tokens(keys["alive"], timeout_s))))
 
     def _only_one(self, keys: Keys, timeout_s: float) -> MonitorName:
-        """The one monitor that is meant, as soon as it is seen."""
+        """The one matching monitor, as soon as it is seen."""
         end_s = time.monotonic() + timeout_s
         while not (alive := self.alive(keys)):
             if time.monotonic() >= end_s:
@@ -94,7 +94,7 @@ class Asker:
         return alive[0]
 
     def _only_start(self, monitor: MonitorName, monitor_id: str) -> Start:
-        """The one start of it that is meant; one without an id where none shows any."""
+        """Its one matching start; one without an id if no start shows any."""
         starts = sorted(map(start_of, self._tokens(Keys(*monitor)["alive/*"])))
         names = ", ".join(start.monitor_id for start in starts)
         if monitor_id:
@@ -108,20 +108,20 @@ class Asker:
         return starts[0] if starts else Start(monitor, "")
 
     def _in_its_place(self) -> str:
-        """Who is there instead of the monitor that is meant."""
+        """Which monitors are there instead, in words."""
         if not any(True for _ in self._session.info.links()):
             return f"there is no connection to {self._where}"
         names = sorted(str(monitor_name(key)) for key in self._tokens(Keys("*", "*")["alive"]))
         return f"there are {', '.join(names)}" if names else f"none at all at {self._where}"
 
     def _tokens(self, key: str, timeout_s: float = 1.0) -> set[str]:
-        """The liveliness tokens that are there."""
+        """The liveliness tokens that exist."""
         replies = self._session.liveliness().get(key, timeout=timeout_s)
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
 
 def _is_of_another(reply: zenoh.Reply) -> bool:
-    """Is it a monitor's word that it isn't the one that is meant?"""
+    """Whether a monitor replied that it isn't the one addressed."""
     if reply.err is None or reply.err.encoding != zenoh.Encoding.APPLICATION_JSON:
         return False
     try:
@@ -131,14 +131,14 @@ def _is_of_another(reply: zenoh.Reply) -> bool:
 
 
 def _answer(reply: zenoh.Reply, who: MonitorName, request_id: str) -> tuple[CommandReply, bytes | None]:
-    """What a monitor replied, and what is attached to it.  Raises :class:`NotCarriedOut` for anything else."""
+    """A monitor's reply and its attachment.  Raises :class:`NotCarriedOut` for anything else."""
     try:
         if reply.ok is not None:
             attached = reply.ok.attachment
             answer = from_json(reply.ok.payload.to_bytes(), CommandReply)
             return answer, None if attached is None else attached.to_bytes()
         assert reply.err is not None
-        if reply.err.encoding != zenoh.Encoding.APPLICATION_JSON:  # Zenoh's own word
+        if reply.err.encoding != zenoh.Encoding.APPLICATION_JSON:  # from Zenoh itself
             raise NotCarriedOut(f"{who} has not answered in time; it may still do it", CommandFault.TIMEOUT, request_id)
         error = from_json(reply.err.payload.to_bytes(), CommandError)
     except MessageRefused as refused:

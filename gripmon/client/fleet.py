@@ -1,4 +1,4 @@
-"""All monitors on the network at once: what is known of each, and how bad that is."""
+"""All monitors on the network: what is known about each, and its condition."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 _log = logging.getLogger(__name__)
 
 SILENT_AFTER_S = 5.0
-"""A monitor sends its state once a second; one that hasn't for so long, though its session stands, hangs."""
+"""A monitor sends its state once a second; one that hasn't for this time, though its session is alive, hangs."""
 MONITORS_KEPT = 50_000
-"""More names than this are not kept, so that no writer on the network can fill the memory."""
-_STARTS_KEPT = 16  # of one name: two are too many already
-_RATE_TRANSFORMS = 64  # over which the rate is measured
-_ALERTS_KEPT = 64  # of each monitor: twice what its publisher repeats to subscribers that come late
+"""At most this many names are kept, so that no sender on the network can fill the memory."""
+_STARTS_KEPT = 16  # per name: two are too many already
+_RATE_TRANSFORMS = 64  # transforms over which the rate is measured
+_ALERTS_KEPT = 64  # per monitor: twice what its publisher repeats to late subscribers
 _RANK = {Severity.ERROR: 0, Severity.WARNING: 1, Severity.INFO: 2}
 
 
 class Condition(enum.StrEnum):
-    """How a monitor is, the worst first."""
+    """The condition of a monitor, the worst first."""
 
     GONE = "gone"
     STOPPED = "stopped"
@@ -67,14 +67,14 @@ class Condition(enum.StrEnum):
 
 
 class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One monitor as it stood when it was asked for.
+    """One monitor at the time of the call.
 
-    ``state`` is its last state message, None before the first; ``state_age_s`` the time since that arrived, or since
-    the monitor was first seen.  ``gone_since_ns``: when its liveliness token vanished, by our clock; None while it is
-    there.  ``monitor_id`` is that of its start, empty before it is known; ``several``: another start of the same
-    name is there, too, so that neither may be used.  ``transforms_per_s`` and ``transform_age_s`` (since the last one
-    arrived, however long it was on its way: to move by it ask a TransformClient) are None unless transforms are
-    listened to and came.
+    ``state``: its last state message, None before the first; ``state_age_s``: time since that arrived, or since the
+    monitor was first seen.  ``gone_since_ns``: when its liveliness token vanished, by our clock; None while it is
+    present.  ``monitor_id``: of its start, empty while unknown; ``several``: another start with the same name is
+    present, so that neither may be used.  ``transforms_per_s`` and ``transform_age_s`` are None unless transforms are
+    subscribed and arrive; the age counts from the arrival, without the delay (to move by a transform use a
+    :class:`TransformClient`).
     """
 
     name: MonitorName
@@ -88,9 +88,9 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def condition(self) -> Condition:
-        """By its token, its silence, and the verdict on its last transform; starting before its first state message."""
+        """From its token, its silence and its last verdict; ``starting`` before its first state message."""
         if self.gone_since_ns is not None:
-            # What else was wrong may follow.
+            # Other faults may follow.
             stopped = self.state is not None and self.state.message.partition(";")[0] == "stopped"
             return Condition.STOPPED if stopped else Condition.GONE
         if self.state_age_s > SILENT_AFTER_S:
@@ -103,30 +103,30 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def drift_m(self) -> float | None:
-        """How far the TCP is from where the reference has it, m; None if that isn't known."""
+        """Distance of the TCP from its reference position, m; None if unknown."""
         if self.state is None or self.state.tcp_shift_m is None:
             return None
         return math.hypot(*self.state.tcp_shift_m)
 
     @property
     def alerts(self) -> tuple[StandingAlert, ...]:
-        """Those that are open: the worst first, of these what is not acknowledged, then the newest."""
+        """Open alerts: the most severe first, then those not acknowledged, then the newest."""
         alerts = () if self.state is None else self.state.open_alerts
         return tuple(sorted(alerts, key=lambda a: (_RANK[a.severity], a.acknowledged, -(a.since_ns or 0))))
 
 
 def trouble(status: MonitorStatus) -> tuple[object, ...]:
-    """Sorts the worst first: by condition, then the severest alert that is open, then the drift, then the name."""
+    """Sort key, the worst first: condition, then the most severe open alert, then drift, then name."""
     severest = min((_RANK[alert.severity] for alert in status.alerts), default=len(_RANK))
     return list(Condition).index(status.condition), severest, -(status.drift_m or 0.0), status.name
 
 
 @dataclass(slots=True)
 class _Known:
-    """What is known of one monitor; times by the monotonic clock unless they end with ``_ns``.
+    """What is known about one monitor; times by the monotonic clock unless they end with ``_ns``.
 
-    ``starts``: by the id of each that is there, its last state message and when that was heard; more than one are
-    several monitors of one name.
+    ``starts``: by id, the last state message of each start that is present, and when it arrived; more than one means
+    several monitors with one name.
     """
 
     heard_s: float
@@ -140,10 +140,10 @@ class _Known:
 
 
 class Fleet(Listener):
-    """Listens to every monitor's state and liveliness token, and to more if asked to.  Any thread may ask.
+    """Subscribes to every monitor's state and liveliness token, and optionally to more.  Thread-safe.
 
-    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  The
-    last message of a monitor that vanished is kept.
+    State messages come once a second regardless of the cameras' rates, so this works for thousands of robots.  The last
+    message of a vanished monitor is kept.
     """
 
     def __init__(
@@ -155,28 +155,28 @@ class Fleet(Listener):
         on_alert: Callable[[MonitorName, AlertRecord, bytes], None] | None = None,
         on_presence: Callable[[MonitorStatus], None] | None = None,
     ) -> None:
-        """``transforms``: listen to them, too, for their rate and age: every frame of every camera.
+        """``transforms``: also subscribe to transforms, for their rate and age; that is every frame of every camera.
 
-        ``on_alert`` gets every alert with the payload that it came in, also the last ones from before, each once;
-        ``on_presence`` a monitor that has come (``gone_since_ns`` is None) or vanished.  Both are called in Zenoh's
-        threads: they must return soon and not raise.  Raises :class:`gripmon.io.wire.PublishError`.
+        ``on_alert`` gets every alert with its payload, including the last ones from before, each once; ``on_presence``
+        gets a monitor that has appeared (``gone_since_ns`` is None) or vanished.  Both are called in Zenoh's threads:
+        they must return quickly and not raise.  Raises :class:`gripmon.io.wire.PublishError`.
         """
         super().__init__()
         self.unreadable = 0
         self._transforms, self._on_alert, self._on_presence = transforms, on_alert, on_presence
         self._known: dict[MonitorName, _Known] = {}
-        self._lock = threading.Lock()  # guards what is above against Zenoh's threads
+        self._lock = threading.Lock()  # guards the attributes above against Zenoh's threads
         self._keys = Keys("*", "*")
-        self._declared: list[object] = []  # Zenoh undeclares what is referred to no more
+        self._declared: list[object] = []  # Zenoh undeclares what is no longer referenced
         settings = reader_settings(connect, zenoh_config_file)
         self._where = where_of(settings)
-        self._asker: Asker | None = None  # before there is a session
+        self._asker: Asker | None = None  # None before there is a session
         with named_as_arguments():
             self._link = Link(settings)
         self._link.attach(self._declare)
 
     def monitors(self) -> list[MonitorStatus]:
-        """Everyone seen since the start, in no order; of several that have one name each that is there."""
+        """All monitors seen since the start, unordered; each of several present under one name."""
         now_s = time.monotonic()
         with self._lock:
             return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
@@ -190,8 +190,8 @@ class Fleet(Listener):
         *,
         monitor_id: str = "",
     ) -> tuple[CommandReply, bytes | None]:
-        """Tell one of them something, as :meth:`gripmon.client.Client.send` does; with the reply what is attached to
-        it, a snapshot's image.  Raises as that does.
+        """Send one of them a command, as :meth:`gripmon.client.Client.send` does; returns the reply and its attachment,
+        a snapshot's image.  Raises as that does.
         """
         if self._asker is None:
             raise NotCarriedOut(f"there is no connection to {self._where}")
@@ -244,7 +244,7 @@ class Fleet(Listener):
                 return
             if token.kind == zenoh.SampleKind.DELETE:
                 known.starts.pop(start.monitor_id, None)
-                if known.starts:  # of several, the ones left sent something else
+                if known.starts:  # the last state was from the start that left
                     known.state, known.heard_s = next(reversed(known.starts.values()))
             elif len(known.starts) < _STARTS_KEPT:
                 state = known.state if known.state and known.state.monitor_id == start.monitor_id else None
@@ -259,7 +259,7 @@ class Fleet(Listener):
             known.present = not known.present
             known.gone_since_ns = None if known.present else time.time_ns()
             if known.present:
-                known.state, known.heard_s = None, now_s  # a message from before its end says nothing of now
+                known.state, known.heard_s = None, now_s  # a message from before it ended is outdated
                 known.transforms_s.clear()
             status = _status(name, known, now_s)
         if self._on_presence is not None:
@@ -279,13 +279,13 @@ class Fleet(Listener):
         payload = sample.payload.to_bytes()
         with self._lock:
             known = self._about(name)
-            if known is None or hash(payload) in known.alerts:  # repeated after the way to it was cut
+            if known is None or hash(payload) in known.alerts:  # repeated after a lost connection
                 return
             known.alerts.append(hash(payload))
         self._on_alert(name, record, payload)
 
     def _read(self, name: MonitorName, sample: zenoh.Sample, kind: type[_T]) -> _T | None:
-        """The message, or None if it is none: that is counted, and logged once for each monitor and reason."""
+        """The message; None if it is invalid, which is counted, and logged once per monitor and reason."""
         try:
             return from_json(sample.payload.to_bytes(), kind)
         except MessageRefused as error:
@@ -300,7 +300,7 @@ class Fleet(Listener):
         return None
 
     def _about(self, name: MonitorName) -> _Known | None:
-        """What is known of it, a new entry if it is new; None if there are too many.  With the lock held."""
+        """The entry of a monitor, new if needed; None if there are too many.  The lock must be held."""
         known = self._known.get(name)
         if known is None and len(self._known) < MONITORS_KEPT:
             known = self._known[name] = _Known(time.monotonic())

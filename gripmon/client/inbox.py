@@ -1,11 +1,11 @@
-"""What came from the network: Zenoh's threads write, any number of others read without waiting.
+"""Messages received from the network: Zenoh's threads write, any number of other threads read without waiting.
 
-How long a transform was on its way is known without clocks that show the same time.  A message says what the monitor's
-steady clock showed when it was sent.  That alone tells nothing: one that waited for ten seconds looks like one of a
-clock that is ten seconds behind, and the fastest message ever seen may have waited, too.  A question and its answer do
-tell: what the answer says was read after the question was asked, so the monitor's clock is ahead of ours by no more
-than the difference of the two readings, however long either was on its way.  From then on that bound grows with the
-drift of the two clocks, and every further answer may only lower it.
+The delay of a transform is bounded without synchronised clocks.  A message contains the reading of the monitor's
+steady clock when it was sent.  This alone is not enough: a message delayed by ten seconds looks like one from a clock
+that is ten seconds behind, and even the fastest message so far may have been delayed.  A query and its reply give a
+bound: the clock in the reply was read after the query was sent, so the monitor's clock is ahead of ours by at most the
+difference of the two readings, however long either was on its way.  From then on the bound grows with the drift of the
+two clocks, and every further reply can only lower it.
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from gripmon.model.records import (
 _log = logging.getLogger(__name__)
 
 _CLOCKS_KEPT = 16
-"""Each start of a monitor has one, and a stranger may make up any number."""
+"""Each start of a monitor has one clock, and a malicious sender may invent any number."""
 PRESENT_KEPT = 16
-"""Monitors whose names are kept: two are too many already, and a stranger may make up any number."""
+"""Monitors whose names are kept: two are too many already, and a malicious sender may invent any number."""
 HELD_BACK_S = 1.0
-"""A transform whose age isn't known waits for that long before it is handed on.  The monitor is asked meanwhile; an
-answer takes milliseconds."""
+"""A transform of unknown age waits this long before it is passed on; meanwhile the monitor's clock is queried, and a
+reply takes milliseconds."""
 SENDS_S = 1.0
-"""Who sent a transform within that time is there, also where a router's rules let no token of its start through."""
+"""A monitor that sent a transform within this time is present, even if a router's rules block its liveliness token."""
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length
 
 
 class Sent(NamedTuple):
-    """What the monitor's clock showed when a message was sent, and ours (steady, ns) when it arrived."""
+    """The monitor's clock when a message was sent, and our steady clock (ns) when it arrived."""
 
     reading: ClockReading
     arrived_ns: int
 
 
 class Lead(NamedTuple):
-    """At ``at_ns`` by our steady clock, a monitor's was ahead of it by at most ``most_ns``; both may be negative."""
+    """At ``at_ns`` of our steady clock, a monitor's clock led it by at most ``most_ns``; both may be negative."""
 
     most_ns: int
     at_ns: int
 
     def most_at_ns(self, when_ns: int) -> int:
-        """The same at another time, ns; the clocks have drifted since."""
+        """The bound at another time, ns, with the clocks' drift since."""
         return self.most_ns + math.ceil(MOST_DRIFT * abs(when_ns - self.at_ns))
 
 
 Leads = Mapping[str, Lead]
-"""By the clock's name."""
+"""Leads by the clock's name."""
 
 NO_LEADS: Leads = MappingProxyType({})
 
 
 def with_answer(leads: Leads, answer: ClockReading, asked_ns: int, answered_ns: int) -> Leads:
-    """What is known after an answer.  What contradicts it was true before a clock jumped, and is forgotten."""
+    """The leads after a reply; a bound that contradicts it is from before a clock jumped, and is dropped."""
     round_trip_ns = answered_ns - asked_ns
     lead = Lead(answer.now_ns - asked_ns + math.ceil(MOST_DRIFT * round_trip_ns), asked_ns)
     before = leads.get(answer.clock)
@@ -78,7 +78,7 @@ def with_answer(leads: Leads, answer: ClockReading, asked_ns: int, answered_ns: 
 
 
 def without_contradicted(leads: Leads, sent: Sent) -> Leads:
-    """What is known after a message: nothing of its clock, if it would have arrived before it was sent."""
+    """The leads after a message; its clock is dropped if the message would have arrived before it was sent."""
     waited_ns = _waited_ns(leads, sent)
     if waited_ns is None or waited_ns >= 0:
         return leads
@@ -86,7 +86,7 @@ def without_contradicted(leads: Leads, sent: Sent) -> Leads:
 
 
 def waited_s(leads: Leads, sent: Sent | None) -> float | None:
-    """How long the message was on its way at most, s; None if that isn't known."""
+    """Upper bound of the message's delay, s; None if unknown."""
     waited_ns = None if sent is None else _waited_ns(leads, sent)
     return None if waited_ns is None else 1e-9 * waited_ns
 
@@ -97,9 +97,9 @@ def _waited_ns(leads: Leads, sent: Sent) -> int | None:
 
 
 def transform_message(payload: bytes) -> FrameRecord:
-    """Checked before anything moves by it; that all numbers are finite JSON ensures.
+    """Decode and check a transform message; JSON ensures that all numbers are finite.
 
-    Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose.
+    Raises :class:`~gripmon.model.records.MessageRefused` for anything that is not a valid message or pose.
     """
     record = from_json(payload, FrameRecord)
     smoothed, bounds = record.smoothed, record.protection
@@ -120,7 +120,7 @@ def transform_message(payload: bytes) -> FrameRecord:
 
 
 class Entry(NamedTuple):
-    """A record, who sent it, and when it arrived by the monotonic clock; ``sent`` None: the monitor doesn't say."""
+    """A record, its sender, and its arrival by the monotonic clock; ``sent`` None: the monitor sends no clock."""
 
     record: FrameRecord
     monitor: MonitorName
@@ -133,12 +133,12 @@ class Entry(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """What readings are made from; replaced as a whole, so that reading it needs no lock.
+    """The state from which readings are made; replaced as a whole, so that reading it needs no lock.
 
-    ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
-    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read; ``leads``: what is
-    known of the monitors' clocks.  ``starts``: by their tokens, which processes these monitors are; ``senders``: when
-    each that sends was heard last; ``elsewhere``: other monitors on the network, where they were looked for.
+    ``present``: monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry`` has
+    vanished since; ``unreadable``: what was wrong with the last message, if it was unreadable; ``leads``: bounds of the
+    monitors' clocks.  ``starts``: the processes of these monitors, by their tokens; ``senders``: when each was last
+    heard; ``elsewhere``: other monitors found on the network.
     """
 
     entry: Entry | None = None
@@ -153,22 +153,22 @@ class Heard(NamedTuple):
 
 
 class Waiter(Protocol):
-    """An iterator that waits for news; neither method may wait itself."""
+    """An iterator that waits for messages; neither method may block."""
 
     def put(self, entry: Entry) -> None: ...
     def wake(self) -> None: ...
 
 
 class Inbox:
-    """The newest message, who is there, and which iterators wait for the next one."""
+    """The newest message, the monitors present, and the iterators that wait for the next message."""
 
     def __init__(self) -> None:
         self.heard = Heard()
         self.unreadable = 0
-        self._lock = threading.Lock()  # for those who write
+        self._lock = threading.Lock()  # for writers
         self._held: Entry | None = None
         self._held_since_s: float | None = None
-        self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # an iterator that is let go gets no more
+        self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # a released iterator gets no more messages
 
     def take(self, monitor: MonitorName, payload: bytes, arrival_s: float, sent: Sent | None = None) -> None:
         """A message arrived."""
@@ -184,7 +184,7 @@ class Inbox:
             self._hand_over(entry)
 
     def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
-        """A monitor answered what its clock shows; both times by our steady clock."""
+        """A monitor replied with its clock's reading; both times are of our steady clock."""
         with self._lock:
             self._set(leads=with_answer(self.heard.leads, answer, asked_ns, answered_ns))
             held, self._held = self._held, None
@@ -193,7 +193,7 @@ class Inbox:
 
     @property
     def age_known(self) -> bool:
-        """Is it known how old the newest transform is?"""
+        """Whether the age of the newest transform is known."""
         heard = self.heard
         return heard.entry is not None and waited_s(heard.leads, heard.entry.sent) is not None
 
@@ -204,41 +204,41 @@ class Inbox:
             self._wake()
 
     def vanished(self, monitor: MonitorName) -> None:
-        """Its liveliness token is gone: it ended, was killed, or the way to it is cut."""
+        """Its liveliness token is gone: it ended, was killed, or the connection to it was lost."""
         with self._lock:
             self._cut_off(lambda start: start.monitor == monitor, present=self.heard.present - {monitor})
 
     def started(self, start: Start) -> None:
-        """The token of this start is there."""
+        """The token of this start has appeared."""
         with self._lock:
             if len(self.heard.starts) < PRESENT_KEPT:
                 self._set(starts=self.heard.starts | {start})
             self._wake()
 
     def ended(self, start: Start) -> None:
-        """It is gone; another process may speak under the same name."""
+        """The token of this start is gone; another process may use the same name."""
         with self._lock:
             self._cut_off(lambda one: one == start, starts=self.heard.starts - {start})
 
     def found(self, monitor: MonitorName) -> None:
-        """It is on the network, whether it is the one that is meant or not."""
+        """A monitor was found on the network, whether it is the wanted one or not."""
         with self._lock:
             if len(self.heard.elsewhere) < PRESENT_KEPT:
                 self._set(elsewhere=self.heard.elsewhere | {monitor})
 
     def close(self) -> None:
-        """No more will come."""
+        """Stop: no more messages will come."""
         with self._lock:
             self._set(closed=True)
             self._wake()
 
     def join(self, waiter: Waiter) -> None:
-        """Give it every message from now on, as long as it is referred to elsewhere."""
+        """Pass every message from now on to ``waiter``, as long as it is referenced elsewhere."""
         with self._lock:
             self._waiters.add(waiter)
 
     def _hand_over(self, entry: Entry) -> None:
-        """Give it to those who wait; one of which it isn't known how old it is only when that takes too long."""
+        """Pass a message to the waiters; one of unknown age is held back for :data:`HELD_BACK_S` at most."""
         if entry.sent is not None and waited_s(self.heard.leads, entry.sent) is None:
             if self._held_since_s is None:
                 self._held_since_s = entry.arrival_s
@@ -254,7 +254,7 @@ class Inbox:
     def _refuse(self, monitor: MonitorName, text: str) -> None:
         with self._lock:
             self.unreadable += 1
-            if self.heard.unreadable != text:  # logged once, and again when it is something else or was over
+            if self.heard.unreadable != text:  # logged once, and again when the fault changes or recurs
                 _log.warning("%s: a transform message can't be read: %s", monitor, text)
                 self._set(unreadable=text)
 
@@ -269,7 +269,7 @@ class Inbox:
             _log.error("%s", several(self.heard, 0.0))
 
     def _cut_off(self, gone: Callable[[Start], bool], **changes: object) -> None:
-        """These starts are gone, with what else that changes."""
+        """Remove the starts for which ``gone`` is true, and apply ``changes``."""
         entry = self.heard.entry
         cut = self.heard.cut or (entry is not None and gone(entry.start))
         senders = tuple(sender for sender in self.heard.senders if not gone(sender[0]))
@@ -282,8 +282,8 @@ class Inbox:
 
 
 def several(heard: Heard, now_s: float) -> str:
-    """The text where more than one monitor is there at ``now_s``; empty if there is one at most."""
-    if len(heard.present) > 1:  # the camera isn't named
+    """A message if more than one monitor is present at ``now_s``; empty otherwise."""
+    if len(heard.present) > 1:  # the camera was not named
         names = ", ".join(map(str, sorted(heard.present)))
         return f"more than one monitor is there: {names}; name the camera"
     starts = heard.starts.union(start for start, sent_s in heard.senders if now_s - sent_s < SENDS_S)
@@ -293,7 +293,7 @@ def several(heard: Heard, now_s: float) -> str:
 
 
 def _with_sender(senders: tuple[tuple[Start, float], ...], entry: Entry) -> tuple[tuple[Start, float], ...]:
-    """With who sent just now, and without those that are silent."""
+    """With the sender of ``entry``, and without silent ones."""
     start, now_s = entry.start, entry.arrival_s
     others = tuple(sender for sender in senders if sender[0] != start and now_s - sender[1] < SENDS_S)
     return (*others[1 - PRESENT_KEPT :], (start, now_s))

@@ -1,9 +1,9 @@
-"""For LeRobot (the package ``lerobot``, 0.4): extrinsics and a flag as observations while recording, and no evaluation
-by a camera that has moved since.
+"""For LeRobot (the package ``lerobot``, 0.4): extrinsics and a validity flag as observations while recording, and a
+check before an evaluation that the camera has not moved since.
 
-A process of LeRobot hears a monitor over Zenoh, and may send it the images of a camera that LeRobot itself has open.
-The monitor runs in an environment of its own: the two packages need different versions of others.  Beside LeRobot this
-needs ``eclipse-zenoh`` and ``msgspec`` only.
+A LeRobot process receives a monitor's transforms over Zenoh, and may send it the images of a camera that LeRobot itself
+has open.  The monitor runs in its own environment, as the two packages need different versions of others.  Besides
+LeRobot, this module needs only ``eclipse-zenoh`` and ``msgspec``.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class JawOpening:
 @ProcessorStepRegistry.register(name="gripmon_extrinsics")
 @dataclass
 class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
-    """Adds to each observation what the monitor of ``robot`` and ``camera`` says: the numbers of
-    ``observation.extrinsics.<camera>`` (``cam_T_grip``: m, quaternion x, y, z, w; all 0 where it isn't known) and of
-    ``observation.extrinsics_valid.<camera>`` (1 where it may be used).
+    """Adds the transform of the monitor of ``robot`` and ``camera`` to each observation: the numbers of
+    ``observation.extrinsics.<camera>`` (``cam_T_grip``: m, quaternion x, y, z, w; all 0 if unknown) and of
+    ``observation.extrinsics_valid.<camera>`` (1 if it may be used).
 
     Put it into the ``robot_observation_processor``, and ``dataset_features`` among the features with which the dataset
-    is made.  ``feed``: the image ``observation[camera]`` (H x W x 3, RGB, uint8) is sent to the monitor, whose source
-    is then ``kind: zenoh``; the transform is that of this very image, waited for at most ``wait_s``, and without an
-    answer by then the flag is 0.  Else the monitor has the camera, and its newest transform counts.  ``opening`` tells
-    the monitor of each fed image how far the jaws are open.  :meth:`close` leaves the network.
+    is created.  ``feed``: the image ``observation[camera]`` (H x W x 3, RGB, uint8) is sent to the monitor, whose
+    source is then ``kind: zenoh``; the transform is that of the same image, waited for at most ``wait_s``; without an
+    answer by then the flag is 0.  Otherwise the monitor has the camera open, and its newest transform is used.
+    ``opening`` computes the jaw opening that is sent with each image.  :meth:`close` leaves the network.
 
-    KeyError for an observation without the image or the joint.
+    Raises KeyError for an observation without the image or the joint.
     """
 
     robot: str
@@ -69,7 +69,7 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
     wait_s: float = 0.05
 
     def __post_init__(self) -> None:
-        # As a pipeline that was kept as JSON has it.
+        # A pipeline that was saved as JSON has a dict here.
         self._opening = JawOpening(**self.opening) if isinstance(self.opening, dict) else self.opening
         self._names = [name for one in self.dataset_features.values() for name in one["names"]]
         self._monitor = TransformClient(self.robot, self.camera, connect=self.connect)
@@ -81,11 +81,11 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
 
     @property
     def dataset_features(self) -> dict[str, dict[str, Any]]:
-        """Of the two columns, as LeRobot describes features."""
+        """The two columns, as LeRobot describes features."""
         return {name: one | {"shape": tuple(one["shape"])} for name, one in extrinsics_features(self.camera).items()}
 
     def read(self, observation: dict[str, Any]) -> Reading:
-        """What the monitor says of an observation, and whether it may be used."""
+        """The monitor's transform for an observation, and whether it may be used."""
         if not self.feed:
             return self._monitor.latest()
         stamp_ns = self._send(observation)
@@ -102,10 +102,10 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
     def require_same_camera(
         self, robot: Any, trained: Any, *, limit_mm: float, limit_deg: float, wait_s: float = 10.0
     ) -> Comparison:
-        """Before an evaluation: nothing where the camera is within both limits of where it was in a frame of
-        ``trained`` (:func:`trained_poses`).  ``robot``: LeRobot's, connected; its observations are fed where they are.
+        """Before an evaluation: returns if the camera is within both limits of its pose in a frame of ``trained``
+        (:func:`trained_poses`).  ``robot``: LeRobot's, connected; with ``feed`` its observations are sent.
 
-        Raises :class:`CameraMoved` where it isn't, or where no valid transform comes within ``wait_s``.
+        Raises :class:`CameraMoved` if it isn't, or if no valid transform comes within ``wait_s``.
         """
         limits = {"limit_m": 1e-3 * limit_mm, "limit_rad": float(np.radians(limit_deg)), "wait_s": wait_s}
 
@@ -126,14 +126,14 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
         return {name: getattr(self, name) for name in names} | {"opening": opening}
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
-        """As they are: LeRobot would put numbers into ``observation.state``, which policies learn from."""
+        """Unchanged: LeRobot would put numbers into ``observation.state``, from which policies learn."""
         return features
 
     def _declare(self, session: zenoh.Session) -> None:
         self._publisher = session.declare_publisher(Keys(self.robot, self.camera)["image"])
 
     def _send(self, observation: dict[str, Any]) -> int:
-        """The image's stamp (Unix ns)."""
+        """Send the image; returns its stamp (Unix ns)."""
         image = np.ascontiguousarray(observation[self.camera])
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"observation[{self.camera!r}] is {image.dtype} {image.shape}; H x W x 3, RGB, uint8")
@@ -144,7 +144,7 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
             encoding="rgb8",
         )  # fmt: skip
         if self._publisher is not None:
-            with contextlib.suppress(zenoh.ZError):  # the session is being made anew
+            with contextlib.suppress(zenoh.ZError):  # the session is being opened again
                 self._publisher.put(image.tobytes(), attachment=to_json(note))
         assert note.stamp_ns is not None
         return note.stamp_ns
@@ -160,7 +160,7 @@ def _late(reading: Reading, wait_s: float) -> Reading:
 def trained_poses(dataset: Any, camera: str = "wrist") -> Any:
     """The transforms (n, 7) of a ``LeRobotDataset`` that may be used, for :meth:`ExtrinsicsStep.require_same_camera`.
 
-    ValueError for a dataset without the two columns, or in which no transform is valid.
+    Raises ValueError for a dataset without the two columns, or without any valid transform.
     """
     pose, flag = extrinsics_features(camera)
     return usable_poses(*columns_of(dataset, (pose, flag)))

@@ -1,4 +1,4 @@
-"""How those who listen join the network, and whose messages they hear."""
+"""How clients join the network, and the names in keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MonitorName(NamedTuple):
 
 
 class Start(NamedTuple):
-    """One start of a monitor: the process that speaks under its name; without an id from a version before ids."""
+    """One start of a monitor, which is one process; versions before ids have an empty one."""
 
     monitor: MonitorName
     monitor_id: str
@@ -34,32 +34,32 @@ class Start(NamedTuple):
 
 
 def start_of(key: object) -> Start:
-    """Which start shows the liveliness token ``gripmon/<robot>/<camera>/alive/<id>``."""
+    """The start that owns the liveliness token ``gripmon/<robot>/<camera>/alive/<id>``."""
     return Start(monitor_name(key), str(key).rpartition("/")[2])
 
 
 def monitor_name(key: object) -> MonitorName:
-    """Who a message on this key, ``gripmon/<robot>/<camera>/…``, is from."""
+    """The sender of a message on the key ``gripmon/<robot>/<camera>/…``."""
     _, robot, camera, *_ = str(key).split("/")
     return MonitorName(robot, camera)
 
 
 def reader_settings(connect: str | Sequence[str], zenoh_config_file: str | None) -> PublishSettings:
-    """Connects to these endpoints, a text being one of them, and listens nowhere; or as a file of Zenoh's says."""
+    """Connect to these endpoints (a text is a single one) without listening; or as a Zenoh file says."""
     if zenoh_config_file is not None:
         return PublishSettings(zenoh_config=zenoh_config_file)
     return PublishSettings(listen=(), connect=(connect,) if isinstance(connect, str) else tuple(connect))
 
 
 def where_of(settings: PublishSettings) -> str:
-    """Whom a reader connects to, for a person."""
+    """The endpoints that a reader connects to, for messages."""
     file = settings.zenoh_config
     return " or ".join(settings.connect) if file is None else f"what {file} names"
 
 
 @contextmanager
 def named_as_arguments() -> Iterator[None]:
-    """A :class:`PublishError` names the argument of a client, not the key of the daemon's configuration."""
+    """Make a :class:`PublishError` name a client's argument instead of the daemon's configuration key."""
     try:
         yield
     except PublishError as error:
@@ -67,7 +67,7 @@ def named_as_arguments() -> Iterator[None]:
 
 
 class Listener:
-    """What every client has: it is closed at the end of a ``with`` statement, and calls back in threads of its own."""
+    """Base of all clients: a context manager that closes itself, with callbacks in separate threads."""
 
     def __init__(self) -> None:
         self._threads: list[threading.Thread] = []
@@ -79,8 +79,8 @@ class Listener:
         self.close()
 
     def close(self) -> None:
-        """Wait for callbacks that are at work, unless this is called in one."""
-        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
+        """Wait for running callbacks, unless this is called from one."""
+        if threading.current_thread() not in self._threads:  # two callbacks that both close would wait for each other
             for thread in self._threads:
                 thread.join()
 

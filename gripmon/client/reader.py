@@ -1,4 +1,4 @@
-"""A reader of everything that one monitor sends, which also sends it commands."""
+"""A reader of everything that one monitor sends, which can also send it commands."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 
 
 class Client(Listener):
-    """Reads one monitor's messages.  Not for several threads at once, except for :meth:`close`.
+    """Reads one monitor's messages.  Not thread-safe, except for :meth:`close`.
 
-    A slow reader never holds up the monitor: the newest ``depth`` records wait for it, older ones are dropped.
+    A slow reader never delays the monitor: the newest ``depth`` records are queued for it, older ones are dropped.
     """
 
     def __init__(
@@ -40,9 +40,9 @@ class Client(Listener):
         zenoh_config_file: str | None = None,
         depth: int = 16,
     ) -> None:
-        """``camera`` may be left out while the robot has one; messages of a second one then raise LookupError.
+        """``camera`` may be omitted while the robot has only one; messages of a second one then raise LookupError.
 
-        ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
+        ``connect``: endpoints of the monitor or a router; ``zenoh_config_file``: a Zenoh configuration file instead.
         Raises ValueError for a name that can't be part of a key, and :class:`gripmon.io.wire.PublishError` for a bad
         configuration.
         """
@@ -58,9 +58,9 @@ class Client(Listener):
         self._samples = self._subscribe()
 
     def latest(self) -> FrameRecord | None:
-        """The newest record, at once; the same one again while no newer one came; None before the first.
+        """The newest record, without waiting; the same one again until a newer one arrives; None before the first.
 
-        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises
+        It may be old: compare ``stamp_ns``, or call :meth:`alive`.  Raises
         :class:`gripmon.model.records.MessageRefused` for a message that is not a record or of an unknown version.
         """
         newest: zenoh.Sample | None = None
@@ -75,7 +75,7 @@ class Client(Listener):
         return self._records(self._samples)
 
     def on_transform(self, callback: Callable[[FrameRecord], None]) -> None:
-        """Call back with every record, in a thread of its own, until the client is closed.
+        """Call back with every record, in a separate thread, until the client is closed.
 
         An exception in the callback ends its thread and goes to ``threading.excepthook``.
         """
@@ -86,11 +86,11 @@ class Client(Listener):
         return self._get("state", StateRecord, timeout_s)
 
     def reference(self, timeout_s: float = 1.0) -> ReferenceRecord | None:
-        """The calibration that drift is measured against now; None if no monitor answers in time."""
+        """The reference from which drift is measured now; None if no monitor answers in time."""
         return self._get("reference", ReferenceRecord, timeout_s)
 
     def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
-        """The monitors of this name that run now, in order; all on the network for ``Client("*")``."""
+        """The running monitors of this name, sorted; all on the network for ``Client("*")``."""
         return self._asker.alive(self.keys, timeout_s)
 
     def send(
@@ -102,28 +102,27 @@ class Client(Listener):
         request_id: str | None = None,
         monitor_id: str = "",
     ) -> CommandReply:
-        """Tell the monitor something (:class:`gripmon.model.records.Command`) and wait for its answer.
+        """Send the monitor a command (:class:`gripmon.model.records.Command`) and wait for its reply.
 
-        A refused command has changed nothing.  ``request_id`` (64 characters at most; by default a new one) is that of
-        an earlier attempt: if it was carried out then, its answer comes again.  Raises
-        :class:`gripmon.client.NotCarriedOut`; :class:`gripmon.client.Ambiguous` if the name is that of more than one
-        monitor; ValueError for a request that can't be one.
-        ``monitor_id`` names the start of the monitor that is meant; without it there must be one.
+        A refused command changes nothing.  ``request_id`` (at most 64 characters; by default a new one): that of an
+        earlier attempt; if that was carried out, its reply is returned again.  ``monitor_id`` names one start of the
+        monitor; without it only one may be running.  Raises :class:`gripmon.client.NotCarriedOut`;
+        :class:`gripmon.client.Ambiguous` if several monitors have the name; ValueError for an invalid request.
         """
         new_id = uuid.uuid4().hex if request_id is None else request_id
         return self._asker.ask(self.keys, CommandRequest(argument, new_id, monitor_id), name, timeout_s)[0]
 
     def snapshot(self, timeout_s: float = 5.0, *, monitor_id: str = "") -> tuple[CommandReply, bytes | None]:
-        """The monitor's state and newest frame, and a file of its image, as ``reply.snapshot.image`` says; None if it
-        has none.  Raises as :meth:`send`.
+        """The monitor's state and newest frame, and its image as a file of the type ``reply.snapshot.image`` (None if
+        there is none).  Raises as :meth:`send`.
         """
         request = CommandRequest("", uuid.uuid4().hex, monitor_id)
         return self._asker.ask(self.keys, request, CommandName.SNAPSHOT, timeout_s)
 
     def close(self) -> None:
-        """Leave the network; iterations and callbacks end.
+        """Leave the network; iterators and callbacks end.
 
-        It waits for a callback that is at work, unless it is called in one.
+        It waits for a running callback, unless it is called from one.
         """
         self._session.close()
         super().close()

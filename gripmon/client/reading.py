@@ -1,4 +1,4 @@
-"""What a controller gets: a transform, its age, and whether it may be used by its own policy."""
+"""What a controller gets: a transform, its age, and whether the controller's policy allows it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from gripmon.model.records import Array
 
 CLOCK_AHEAD_LIMIT_S = 0.1
-"""A stamp further ahead than this is of a clock that doesn't agree: those that NTP keeps, on whatever network, are
-within some tens of milliseconds."""
+"""A stamp further in the future than this is from a clock that disagrees: with NTP, clocks agree within some tens of
+milliseconds on any network."""
 
 
 class Unusable(enum.StrEnum):
@@ -41,7 +41,7 @@ class Unusable(enum.StrEnum):
 
 
 class NotUsable(Exception):
-    """There is no transform that the policy allows; ``reading`` is what there is instead."""
+    """There is no transform that the policy allows; ``reading`` says why."""
 
     def __init__(self, reading: Reading) -> None:
         super().__init__(reading.reason)
@@ -51,14 +51,14 @@ class NotUsable(Exception):
 class Policy(msgspec.Struct, frozen=True, kw_only=True):
     """What a controller may use.
 
-    ``max_age_s``: an older transform is refused.  The camera may have been knocked since, so give it the time that the
-    controller may move on without knowing; it must span a few frames of the camera, or every late frame is a stop.
-    ``accept_suspect``: allow what is held, uncertain or not confirmed, too; ``max_sigma_m``: allow a transform only
-    while the standard deviation of the TCP along each camera axis is at most that; ``max_protection_m``: only while its
-    protection level, the bound on the TCP's position error, is known and at most that (None: the verdict decides by the
-    monitor's own alert limit).  ``clocks_agree``: the clocks of monitor and controller show the same time (the same
-    machine, PTP): the age then counts from the capture by their stamps if that is more, and a stamp of the future is
-    refused.
+    ``max_age_s``: an older transform is refused.  The camera may have been knocked since, so set it to the time for
+    which the controller may continue without knowing; it must span a few frames of the camera, or every late frame
+    causes a stop.  ``accept_suspect``: also allow held, uncertain or unconfirmed transforms.  ``max_sigma_m``: allow a
+    transform only while the standard deviation of the TCP along each camera axis is at most this.
+    ``max_protection_m``: only while its protection level, the bound on the TCP's position error, is known and at most
+    this (None: the verdict decides, by the monitor's own alert limit).  ``clocks_agree``: the clocks of monitor and
+    controller are synchronised (same machine, PTP): the age then counts from the capture stamp if that is more, and a
+    stamp in the future is refused.
     """
 
     max_age_s: float = 0.2
@@ -75,18 +75,18 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Reading(msgspec.Struct, frozen=True, kw_only=True):
-    """The newest transform as it stood when it was asked for; frozen, may be passed on and kept.
+    """The newest transform at the time of the call; immutable, may be passed on and kept.
 
     ``transform`` (``cam_T_grip``), ``covariance`` (36 numbers, 6 x 6 row by row: m, rad, camera axes), ``protection``
     (bounds on the error of ``transform`` at a stated risk; None from an older monitor, too) and ``smoothed`` are
-    None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` where the monitor can't
-    be asked any more: it is gone, its last transform too old, or there is none.
+    None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` if the monitor is gone,
+    its last transform is too old, or there is none.
 
-    ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` bounds
-    the time since the monitor was handed the frame: what it needed for it, how long the message was on its way at most
-    (:mod:`gripmon.client.inbox`), and the time since it arrived; the way of the image into the monitor is not in it.
-    Infinite if no transform came yet, or nothing tells how long it was on its way.  ``stamp_ns`` is the capture time by
-    the monitor's clock, ``monitor_id`` the start of the monitor that it is from.
+    ``usable``: the policy allows it; otherwise ``why`` gives the reason in a word and ``reason`` in a line.  ``age_s``
+    bounds the time since the monitor received the frame: its processing time, the largest possible delay of the message
+    (:mod:`gripmon.client.inbox`), and the time since it arrived; the transfer of the image to the monitor is not
+    included.  It is infinite if no transform came yet, or if the delay is unknown.  ``stamp_ns``: capture time by the
+    monitor's clock; ``monitor_id``: the start of the monitor that sent it.
     """
 
     monitor: MonitorName | None
@@ -108,20 +108,20 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     monitor_id: str = ""
 
     def same_revision_as(self, other: Reading) -> bool:
-        """Do both rest on the same reference of one start of the monitor?  Only then may one be subtracted from the
-        other.  False without one.
+        """Whether both refer to the same reference of the same start of the monitor; only then may they be subtracted.
+        False without a reference.
         """
         names = ("monitor", "monitor_id", "reference_id", "revision")
         return self.revision >= 0 and all(getattr(self, name) == getattr(other, name) for name in names)
 
     def sigma_m(self) -> float:
-        """Standard deviation of the TCP's position, m: the largest along a camera axis; infinite without one."""
+        """Largest standard deviation of the TCP's position along a camera axis, m; infinite if unknown."""
         return _largest_sigma_m(self.covariance)
 
     def matrix(self, *, smoothed: bool = False) -> Array:
         """``cam_T_grip`` as a NumPy array (4, 4), m; raises :class:`NotUsable` without a transform.  Loads NumPy.
 
-        ``smoothed``: averaged over time, where there is an average; else this frame's.
+        ``smoothed``: the transform averaged over time, if there is one; else this frame's.
         """
         pose = self.smoothed if smoothed and self.smoothed is not None else self.transform
         if pose is None:
@@ -144,7 +144,7 @@ def judge(
 ) -> Reading:
     """The reading of ``entry`` at ``now_s`` by the monotonic clock, ``wall_ns`` by the wall clock.
 
-    ``heard`` says who is there; ``fault`` is asked only where there is no entry: whom there is no connection to.
+    ``heard`` says which monitors are present; ``fault``, called only if there is no entry, names a missing connection.
     """
     if entry is None:
         why, reason = _cut_off(heard, None, now_s) or _silence(heard, fault)
@@ -175,7 +175,7 @@ def judge(
 
 
 def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
-    """It is not older, s; infinite if nothing tells how long it was on its way."""
+    """Upper bound of the age, s; infinite if the message's delay is unknown."""
     age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.record.latency_ns
     on_its_way_s = waited_s(heard.leads, entry.sent)
     if policy.clocks_agree:
@@ -184,7 +184,7 @@ def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: in
 
 
 def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None:
-    """Is it unclear whether the monitor, and which one, still stands by its last message?"""
+    """Refuses if the client is closed, the monitor is gone, or several monitors have the name."""
     if heard.closed:
         return Unusable.CLOSED, "the client is closed"
     if text := several(heard, now_s):
@@ -197,7 +197,7 @@ def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None
 
 
 def _is_back(heard: Heard, entry: Entry) -> bool:
-    """Is the monitor that vanished there again?  Of its two tokens either may be the last to go."""
+    """Whether the vanished monitor is present again; either of its two tokens may be the last to go."""
     if entry.monitor not in heard.present:
         return False
     return not entry.record.monitor_id or any(start.monitor == entry.monitor for start in heard.starts)
@@ -215,13 +215,13 @@ def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
 
 
 def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, wall_ns: int) -> _Refusal | None:
-    """Is the transform unknown, too old, or of unknown age?"""
+    """Refuses a transform that is unknown, too old, or of unknown age."""
     record = entry.record
     if record.verdict is Verdict.UNKNOWN:
         return Unusable.UNKNOWN, f"the monitor has no transform: {record.reason or record.state}"
     ahead_s = 1e-9 * (record.stamp_ns - wall_ns)
     if policy.clocks_agree and ahead_s > CLOCK_AHEAD_LIMIT_S:
-        # With clocks that agree there is no such thing: one of them is wrong, and they give no age.
+        # Impossible if the clocks agree: one of them is wrong, and they give no age.
         text = f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
         return Unusable.CLOCKS, text
     if age_s == math.inf:
@@ -236,7 +236,7 @@ def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, w
 
 
 def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
-    """Its verdict, deviation and, since what the monitor doesn't promise is not to be relied on, its bound."""
+    """Refuses by verdict, standard deviation and protection level."""
     if record.verdict is Verdict.SUSPECT and not policy.accept_suspect:
         return Unusable.SUSPECT, f"the transform is suspect: {record.reason or record.state}"
     allowed_m = policy.max_sigma_m

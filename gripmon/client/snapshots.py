@@ -1,4 +1,4 @@
-"""Snapshots as files that the other commands read: numbered, with a table of stamps and jaw openings beside them."""
+"""Snapshots as numbered files that other commands read, with a table of stamps and jaw openings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import CommandReply, to_json
 
-_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}  # a name from outside makes no path
+_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}  # names received from the network must not become paths
 _NUMBERED = re.compile(r"snapshot-([0-9]{1,9})\.(json|png|jpg)")
 
 
@@ -33,8 +33,8 @@ def check_table(out: Path) -> None:
 
 def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     """``snapshot-<n>.png``, ``snapshot-<n>.json`` and a row in ``timestamps.csv``, as a source of kind ``folder`` and
-    ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.  Raises
-    :class:`InputError` where one can't be written.
+    ``gripmon teach`` read them; n continues the numbers in the folder.  Each file is written whole or not at all.
+    Raises :class:`InputError` if one can't be written.
     """
     number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)
     files = {out / f"snapshot-{number}.json": to_json(reply) + b"\n"}
@@ -44,7 +44,7 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
         if image is not None and snapshot is not None and suffix is not None:
             path, table = out / f"snapshot-{number}{suffix}", out / TIMESTAMPS_NAME
             files = {path: image} | files
-            # Last of all: it names the image.
+            # Written last, since it names the image.
             files[table] = _with_row(table, path.name, snapshot.record.stamp_ns, snapshot.jaw_reported_m)
         for path, data in files.items():
             write_atomically(path, data)
@@ -57,6 +57,6 @@ def _with_row(table: Path, name: str, stamp_ns: int, jaw_m: float | None) -> byt
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")
     before = table.read_text(encoding="utf-8-sig") if table.exists() else ",".join(COLUMNS)
-    # An opening below zero is a closed jaw whose report is a little off: none that a table can have.
+    # An opening below zero is a closed jaw with a small error, which a table can't have.
     lines.writerow((name, max(stamp_ns, 0), repr(jaw_m) if jaw_m is not None and 0.0 <= jaw_m <= 1.0 else ""))
     return f"{before.rstrip()}\n{text.getvalue()}".encode()

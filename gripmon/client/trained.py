@@ -1,4 +1,4 @@
-"""Is the camera where it was when the data was recorded that a policy has learnt from?"""
+"""Check that the camera is where it was when a policy's training data were recorded."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 class CameraMoved(RuntimeError):
-    """The evaluation must not start: the camera isn't where it was in training, or no one knows where it is."""
+    """The evaluation must not start: the camera isn't where it was in training, or its pose is unknown."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of the camera now and the nearest that it was in training: shift of the TCP (m), turn (rad), and the bound on the
-    error of the shift now (m; None: the monitor states none).
+    """The camera now relative to its nearest pose in training: shift of the TCP (m), turn (rad), and the bound on the
+    present position error (m; None: the monitor states none).
     """
 
     shift_m: float
@@ -30,8 +30,8 @@ class Comparison:
 
 
 def usable_poses(poses: Array, flags: Array) -> Array:
-    """Of the columns ``observation.extrinsics.<camera>`` (n, 7) and ``observation.extrinsics_valid.<camera>`` (n,) or
-    (n, 1): the transforms that may be used (m, 7).  ValueError where there is none.
+    """The usable transforms (m, 7) in the columns ``observation.extrinsics.<camera>`` (n, 7) and
+    ``observation.extrinsics_valid.<camera>`` (n,) or (n, 1).  Raises ValueError if there is none.
     """
     import numpy as np
 
@@ -43,8 +43,8 @@ def usable_poses(poses: Array, flags: Array) -> Array:
 
 
 def compared(reading: Reading, trained: Array) -> Comparison:
-    """With the transforms of :func:`usable_poses`: the nearest is that with the smallest shift.  ValueError for a
-    reading without a transform.
+    """Compare with the transforms of :func:`usable_poses`, of which the nearest has the smallest shift.  Raises
+    ValueError for a reading without a transform.
     """
     import numpy as np
 
@@ -53,7 +53,7 @@ def compared(reading: Reading, trained: Array) -> Comparison:
     shifts_m = np.linalg.norm(trained[:, :3] - np.array(reading.transform.translation_m), axis=1)
     nearest = int(np.argmin(shifts_m))
     now, then = np.array(reading.transform.rotation_xyzw), trained[nearest, 3:] / np.linalg.norm(trained[nearest, 3:])
-    # Half the angle between unit quaternions, of which each rotation has two; of small turns, too.
+    # Half the angle between unit quaternions (q and -q are the same rotation); exact for small turns, too.
     chord = min(float(np.linalg.norm(now - then)), float(np.linalg.norm(now + then)))
     half_rad = 2.0 * math.asin(min(chord / 2.0, 1.0))
     bound = None if reading.protection is None else reading.protection.position_m
@@ -63,11 +63,11 @@ def compared(reading: Reading, trained: Array) -> Comparison:
 def require_same_camera(
     read: Callable[[], Reading], trained: Array, *, limit_m: float, limit_rad: float, wait_s: float = 10.0
 ) -> Comparison:
-    """Return once a usable reading shows the camera within both limits of where it was in training, at least in one of
-    its frames.  ``read`` is called again and again until it gives a usable one.
+    """Return once a usable reading shows the camera within both limits of its pose in at least one training frame.
+    ``read`` is called repeatedly until its reading is usable.
 
-    Raises :class:`CameraMoved` where it is farther, and where no usable reading came within ``wait_s``; ValueError for
-    limits that are no positive numbers.
+    Raises :class:`CameraMoved` if the camera is farther away, or if no usable reading came within ``wait_s``;
+    ValueError for limits that are not positive numbers.
     """
     for name, value in (("limit_m", limit_m), ("limit_rad", limit_rad)):
         if not (math.isfinite(value) and value > 0.0):
@@ -91,7 +91,7 @@ def require_same_camera(
 
 
 def columns(poses: Sequence[float] | None, *, usable: bool) -> list[float]:
-    """Eight numbers of an observation: the transform, all 0 where there is none, and the flag."""
+    """Eight numbers of an observation: the transform (all 0 if there is none) and the flag."""
     return [*(poses or [0.0] * 7), float(usable and poses is not None)]
 
 
@@ -103,13 +103,13 @@ def transform_of(reading: Reading) -> list[float] | None:
 
 
 def columns_of(dataset: Any, names: tuple[str, str]) -> tuple[Array, Array]:
-    """Both columns of a ``lerobot`` dataset, whole.  ValueError where it hasn't got them."""
+    """Both columns of a ``lerobot`` dataset, whole.  Raises ValueError if one is missing."""
     import numpy as np
 
     absent = [name for name in names if name not in dataset.meta.features]
     if absent:
         right = "one recorded with gripmon's step, or the copy that gripmon dataset --annotate makes"
         raise ValueError(f"{dataset.repo_id} has no column {absent[0]}; {right}")
-    # The plain table: the dataset's own access would decode the videos, too.
+    # Read the plain table: the dataset's own access would also decode the videos.
     table = dataset.hf_dataset.with_format("numpy").select_columns(list(names))[:]
     return np.stack(table[names[0]]), np.asarray(table[names[1]])

@@ -1,4 +1,4 @@
-"""The newest transform of one monitor, for programs that move by it, at once or one after another."""
+"""The transforms of one monitor for programs that move by them: the newest at once, or each as it comes."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from gripmon.model.records import ClockReading, MessageRefused, Verdict, from_js
 
 ASK_EVERY_S = 1.0
 """The bound on a message's age grows by 1 ms meanwhile (:data:`gripmon.io.wire.MOST_DRIFT`); 200 bytes each way."""
-_ASK_AGAIN_S = 0.1  # while nothing is known: a question may be lost
-_ANSWER_WITHIN_S = 10.0  # a late answer is as true as a quick one, and says less
+_ASK_AGAIN_S = 0.1  # while nothing is known: a query may be lost
+_ANSWER_WITHIN_S = 10.0  # a late reply is still valid, but gives a weaker bound
 FIRST_WITHIN_S = 2.0
-"""A monitor that is there has sent a transform by then; else a reading says that none comes, and who is there."""
-_LOOK_AROUND_S = 0.5  # of these, for the answers to who is there
-_LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds
-_LATE_S = 1e-3  # to be past the end of a time and not just before it
+"""A running monitor has sent a transform by then; otherwise a reading says that none comes, and which monitors exist.
+"""
+_LOOK_AROUND_S = 0.5  # of that time, for replies about which monitors exist
+_LOOK_WITHIN_S = 1.0  # running monitors answer in milliseconds
+_LATE_S = 1e-3  # to wake just after a deadline and not just before it
 
 
 class TransformClient(Listener):
-    """Hears one monitor.  Any thread may call any method.
+    """Receives the transforms of one monitor.  Thread-safe.
 
-    It may start before the monitor and the router, and needs no help when they end and come again.  With a ``with``
-    statement or :meth:`close` it leaves the network.
+    It may start before the monitor and the router, and reconnects by itself when they restart.  It leaves the network
+    at the end of a ``with`` statement or by :meth:`close`.
     """
 
     def __init__(
@@ -46,12 +47,13 @@ class TransformClient(Listener):
         policy: Policy | None = None,
         depth: int = 1,
     ) -> None:
-        """``camera`` may be left out while the robot has one; with a second one no reading is usable, and says so.
+        """``camera`` may be omitted while the robot has only one; with two, no reading is usable, and the reason says
+        so.
 
-        ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
-        ``depth`` is how many readings wait for each iterator or callback that is slower than the camera: 1 gives it
-        always the newest.  Raises ValueError for a name that can't be part of a key or a ``depth`` below 1, and
-        :class:`gripmon.io.wire.PublishError` for a bad configuration; to get no answer is not an error.
+        ``connect``: endpoints of the monitor or a router; ``zenoh_config_file``: a Zenoh configuration file instead.
+        ``depth``: how many readings are queued for an iterator or callback that is slower than the camera; with 1 it
+        always gets the newest.  Raises ValueError for a name that can't be part of a key or a ``depth`` below 1, and
+        :class:`gripmon.io.wire.PublishError` for a bad configuration; a monitor that doesn't answer is not an error.
         """
         if depth < 1:
             raise ValueError(f"depth is {depth}; give 1 or more")
@@ -62,16 +64,16 @@ class TransformClient(Listener):
         self._inbox = Inbox()
         self._session: zenoh.Session | None = None
         self._next_question_s = 0.0
-        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what is referred to no more
+        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what is no longer referenced
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
         self._link.attach(self._declare)
 
     def latest(self, policy: Policy | None = None) -> Reading:
-        """The newest transform and whether it may be used now, at once; by the client's policy or another one.
+        """The newest transform and whether it may be used now, by the client's policy or the given one.
 
-        It takes no lock, makes no system call and raises nothing.  (Before the first transform it looks at the session,
-        too, to say whom there is no connection to.)
+        Returns immediately: it takes no lock, makes no system call and raises nothing.  (Before the first transform it
+        also looks at the session, to name the endpoint to which there is no connection.)
         """
         heard = self._inbox.heard
         return judge(heard, heard.entry, policy or self.policy, time.monotonic(), time.time_ns(), self._fault)
@@ -84,22 +86,23 @@ class TransformClient(Listener):
         return reading
 
     def __iter__(self) -> Readings:
-        """Each reading as it comes, and one that refuses the last as soon as it holds no longer; ends with the client.
+        """Each reading as it comes, and an unusable one as soon as the last one expires; ends when the client is
+        closed.
 
-        Every iterator has a queue of its own.
+        Every iterator has its own queue.
         """
         readings = Readings(self, self._depth)
         self._inbox.join(readings)
         return readings
 
     def __aiter__(self) -> AsyncReadings:
-        """The same for asyncio; to be called while its loop runs."""
+        """The same for asyncio; to be called while its event loop runs."""
         readings = AsyncReadings(self, self._depth)
         self._inbox.join(readings)
         return readings
 
     def on_transform(self, callback: Callable[[Reading], None]) -> None:
-        """Call back with every reading that an iterator would give, in a thread of its own, until the client is closed.
+        """Call back with every reading that an iterator would return, in a separate thread, until the client is closed.
 
         An exception in the callback ends its thread and goes to ``threading.excepthook``.
         """
@@ -107,7 +110,7 @@ class TransformClient(Listener):
 
     @property
     def unreadable(self) -> int:
-        """How many messages could not be read; what was wrong with them is in the log, once."""
+        """How many messages could not be read; the log says once what was wrong with them."""
         return self._inbox.unreadable
 
     @property
@@ -115,9 +118,9 @@ class TransformClient(Listener):
         return self._inbox.heard.closed
 
     def close(self) -> None:
-        """Leave the network: iterations and callbacks end, nothing is usable.  Calling it twice does nothing more.
+        """Leave the network: iterators and callbacks end, nothing is usable any more.  May be called twice.
 
-        It waits for a callback that is at work, unless it is called in one.
+        It waits for a running callback, unless it is called from one.
         """
         self._inbox.close()
         self._link.close()
@@ -128,21 +131,21 @@ class TransformClient(Listener):
         return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
 
     def look_around(self) -> None:
-        """Ask, without waiting, which monitors are on the network; what was heard then stands in the ``reason``."""
+        """Query, without waiting, which monitors are on the network; ``reason`` then names them."""
 
         def find(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 self._inbox.found(monitor_name(reply.ok.key_expr))
 
         if self._session is not None:
-            with contextlib.suppress(zenoh.ZError):  # another thread closes it just now
+            with contextlib.suppress(zenoh.ZError):  # another thread is closing it
                 everyone, found = Keys("*", "*")["alive"], in_zenohs_thread(find)
                 self._session.liveliness().get(everyone, found, timeout=_LOOK_WITHIN_S)
 
     def _fault(self) -> str:
         try:
             return self._link.fault()
-        except zenoh.ZError:  # another thread closes the session just now
+        except zenoh.ZError:  # another thread is closing the session
             return "the client is being closed"
 
     def _declare(self, session: zenoh.Session) -> None:
@@ -167,14 +170,14 @@ class TransformClient(Listener):
         seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
         seen(monitor_name(token.key_expr))
         if token.kind == zenoh.SampleKind.PUT:
-            self._ask_for_clock(known=False)  # so that its first transform is usable
+            self._ask_for_clock(known=False)  # so that already its first transform is usable
 
     def _see_start(self, token: zenoh.Sample) -> None:
         seen = self._inbox.started if token.kind == zenoh.SampleKind.PUT else self._inbox.ended
         seen(start_of(token.key_expr))
 
     def _ask_for_clock(self, *, known: bool) -> None:
-        """Ask what the monitor's clock shows if it is time; sooner if nothing is ``known`` yet.  In Zenoh's threads."""
+        """Query the monitor's clock if due, sooner if nothing is ``known`` yet.  Called in Zenoh's threads."""
         session, now_s = self._session, time.monotonic()
         if session is None or now_s < self._next_question_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
             return
@@ -184,7 +187,7 @@ class TransformClient(Listener):
         def take(reply: zenoh.Reply) -> None:
             answered_ns = steady_ns()
             reading = None if reply.ok is None else _clock_reading(reply.ok.payload)
-            if reading is not None:  # a monitor of a version that doesn't tell answers with its last transform
+            if reading is not None:  # a monitor of an older version replies with its last transform
                 self._inbox.answered(reading, asked_ns, answered_ns)
 
         with contextlib.suppress(zenoh.ZError):  # the session is being closed
@@ -195,7 +198,7 @@ class TransformClient(Listener):
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_WITHIN_S,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.REAL_TIME,  # the answer's, too: not behind what is less urgent
+                priority=zenoh.Priority.REAL_TIME,  # also of the reply, which must not queue behind less urgent data
                 express=True,
             )
 
@@ -208,11 +211,11 @@ def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
 
 
 class _Queue:
-    """What one reader has not had yet: the newest ``depth`` messages, older ones are dropped.
+    """The queue of one reader: the newest ``depth`` messages; older ones are dropped.
 
-    Besides, once, a reading of verdict ``unknown`` when the last one given holds no longer: the monitor vanished, or
-    nothing newer came in time; and, once, one that says why when no first message comes.  So a loop that only
-    waits for the next reading stops in time, too.
+    In addition it returns, once, a reading of verdict ``unknown`` when the last one expires, because the monitor
+    vanished or nothing newer came in time; and, once, one that says why if no first message comes.  So a loop that only
+    waits for the next reading also stops in time.
     """
 
     def __init__(self, client: TransformClient, depth: int) -> None:
@@ -242,7 +245,7 @@ class _Queue:
         return self._silence(time.monotonic())
 
     def _silence(self, now_s: float) -> Reading | None:
-        """What there is in place of a first message, when it is time to say so."""
+        """A reading that says why there is no first message, when it is due."""
         if self._look_s is not None and now_s >= self._look_s:
             self._look_s, self._say_s = None, now_s + _LOOK_AROUND_S
             self._client.look_around()
@@ -253,7 +256,7 @@ class _Queue:
         return None
 
     def _patience_s(self) -> float | None:
-        """When to look again though nothing came; None: not at all."""
+        """Time until the next check if nothing arrives, s; None: no check."""
         next_s = self._look_s if self._look_s is not None else self._say_s
         if next_s is not None:
             return max(0.0, next_s - time.monotonic()) + _LATE_S
@@ -277,7 +280,7 @@ class Readings(_Queue):
 
     def __next__(self) -> Reading:
         while not self._client.closed:
-            self._news.clear()  # before looking: what comes after that is not missed
+            self._news.clear()  # before checking, so that what arrives afterwards is not missed
             if (reading := self._take()) is not None:
                 return reading
             if not self._client.closed:
@@ -288,7 +291,7 @@ class Readings(_Queue):
 class AsyncReadings(_Queue):
     """Asynchronous iterator for one task of asyncio; ends when the client is closed.
 
-    A cancelled wait loses nothing: the next ``anext`` goes on.
+    A cancelled wait loses nothing: the next ``anext`` continues.
     """
 
     def __init__(self, client: TransformClient, depth: int) -> None:
@@ -297,7 +300,7 @@ class AsyncReadings(_Queue):
         self._news = asyncio.Event()
 
     def wake(self) -> None:
-        with contextlib.suppress(RuntimeError):  # its loop has ended, and with it the wait
+        with contextlib.suppress(RuntimeError):  # its event loop has ended, and with it the wait
             self._loop.call_soon_threadsafe(self._news.set)
 
     def __aiter__(self) -> Self:
@@ -309,7 +312,7 @@ class AsyncReadings(_Queue):
             if (reading := self._take()) is not None:
                 return reading
             if not self._client.closed:
-                with contextlib.suppress(TimeoutError):  # then it is time to look again
+                with contextlib.suppress(TimeoutError):  # then the next check is due
                     async with asyncio.timeout(self._patience_s()):
                         await self._news.wait()
         raise StopAsyncIteration

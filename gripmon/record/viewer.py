@@ -89,7 +89,7 @@ class NativeViewer:
     """rerun's window, on files or on a stream."""
 
     def __init__(self, sources: Sequence[str], *, tied: bool) -> None:
-        """``tied``: the window ends with this process; else it stays until it is closed.  Raises :class:`ViewerError`."""
+        """``tied``: the window ends with this process, else when it is closed.  Raises :class:`ViewerError`."""
         if not has_display():
             raise ViewerError("there is no display for a window; the web viewer needs none")
         self._process = _start(["--bind", LOOPBACK, "--port", "auto", *sources], tied=tied)
