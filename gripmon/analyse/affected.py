@@ -1,5 +1,5 @@
-"""When something should not be relied on; the limits for it, from the recorded configuration; and how large errors may
-have been beside them.
+"""Times in which something should not be relied on; the limits for this, from the recorded configuration; and how
+large errors may have been, compared with them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from gripmon.model.records import Array
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
-_MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
-_RELIEF = 0.8  # of the limit, below which it is over
+_MEDIAN_FRAMES = 9  # against the noise of single frames
+_RELIEF = 0.8  # fraction of the limit below which a range ends
 _SHORTEST_NS = SECOND_NS // 10
 _MEANING = {
     "old_calibration": "Grasps and data that used the calibration from the beginning are off by up to this much. "
@@ -38,9 +38,9 @@ _MEANING = {
 def motion_ranges(
     track: Track, keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
 ) -> list[AffectedRange]:
-    """Where a calibration didn't hold: the one from the beginning, and, if that was replaced, the one in force.
+    """When a calibration didn't hold: the one from the beginning and, if that was replaced, the one in force.
 
-    ``keys``: id and revision of the references, as ``track.reference`` counts them.
+    ``keys``: id and revision of the references, as indexed by ``track.reference``.
     """
     if not track.measured.any():
         return []
@@ -54,7 +54,7 @@ def motion_ranges(
         before_ns = 0
         for run in _past(track, vectors, limits, reference, moved):
             each = _motion_range(what, track, vectors, run, keys[int(reference[run[0]])], events)
-            # Of two runs past the limit by one motion only the first counts from its beginning.
+            # If one motion causes two ranges, only the first begins with the motion.
             if each.start_ns < before_ns and each.limit_ns is not None:
                 each = msgspec.structs.replace(each, start_ns=each.limit_ns)
             out.append(each)
@@ -65,7 +65,7 @@ def motion_ranges(
 def verdict_ranges(
     track: Track, names: Sequence[str], verdict: NDArray[np.int8], keys: Sequence[tuple[str, int]]
 ) -> list[AffectedRange]:
-    """Where transforms were suspect or there were none, for a tenth of a second or more."""
+    """When transforms were suspect or missing, for a tenth of a second or more."""
     out = []
     for name in ("suspect", "unknown"):
         for part in runs_of_equal(verdict == names.index(name)):
@@ -95,13 +95,13 @@ def verdict_ranges(
 def _past(
     track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64], moved: NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
-    """First and last frame of each time past the limits, in one group each; it is over only when a frame was measured
-    that is clearly within.  Before anything has ``moved`` (n,) it begins only where it is more than a frame's transform
-    is uncertain by: where that is as much as the limit, being past it means nothing.
+    """First and last frame of each period beyond the limits, within one group each; it ends only with a frame that is
+    clearly within them.  Before anything has ``moved`` (n,), it begins only where the excess is significant: if the
+    uncertainty of a frame is as large as the limit, exceeding it means nothing.
     """
     frames = np.flatnonzero(track.measured)
     smooth = np.empty((len(frames), 6))
-    for part in runs_of_equal(group[frames]):  # a median over a change of reference would mix two
+    for part in runs_of_equal(group[frames]):  # a median must not mix two references
         smooth[part] = median_filter(vectors[frames[part]], size=(_MEDIAN_FRAMES, 1), mode="nearest")
     size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
     turn = np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad
@@ -123,9 +123,9 @@ def _past(
 
 
 def _significant(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
-    """(n,) which vectors (n, 3) are longer than what a ± of their deviations (n, 3) stands for along them."""
+    """(n,) which vectors (n, 3) are longer than :data:`COVERAGE` standard deviations (n, 3) along them."""
     along = np.linalg.norm(vectors * sigma, axis=1)
-    return np.asarray(~(np.square(vectors).sum(axis=1) <= COVERAGE * along))  # also where there is no deviation
+    return np.asarray(~(np.square(vectors).sum(axis=1) <= COVERAGE * along))  # also true where there is no deviation
 
 
 def runs_of_equal(values: NDArray[np.int64] | NDArray[np.bool_]) -> list[slice]:
@@ -162,7 +162,7 @@ def _motion_range(
 
 
 def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacement:
-    """The farthest of the medians over a few frames: a single wild frame is none."""
+    """The largest of the medians over a few frames each, robust against single outliers."""
     frames = first + np.flatnonzero(track.measured[first : last + 1])
     blocks = [frames[i : i + _MEDIAN_FRAMES] for i in range(0, len(frames), _MEDIAN_FRAMES)]
     if len(blocks) > 1 and len(blocks[-1]) < _MEDIAN_FRAMES // 2:
@@ -173,9 +173,9 @@ def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacemen
 
 
 def limits_of(source: Recording, affected_m: float | None, affected_rad: float | None) -> Limits:
-    """From the recorded configuration; defaults where it names none, or is none.
+    """Limits from the recorded configuration; defaults if it names none or is missing.
 
-    ``affected_m`` and ``affected_rad`` are a person's own; None: what is worth a warning.
+    ``affected_m`` and ``affected_rad``: given by the user; None: the limits for a warning.
     """
     policy, origin = _policy(source)
     if affected_m is not None or affected_rad is not None:
@@ -194,7 +194,7 @@ def limits_of(source: Recording, affected_m: float | None, affected_rad: float |
 
 
 def excess(size_m: float, turn_rad: float, limits: Limits) -> float:
-    """How many times as large as what counts as affected; NaN counts as nothing."""
+    """Size over the limit for affected, the larger of shift and turn; NaN counts as zero."""
     parts = (size_m / limits.affected_m, turn_rad / limits.affected_rad)
     return max((part for part in parts if math.isfinite(part)), default=0.0)
 
@@ -214,7 +214,7 @@ def _policy(source: Recording) -> tuple[PolicySettings, str]:
 
 
 def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:
-    """Of one recording; None where no frame has bounds."""
+    """The error bounds of one recording; None if no frame has any."""
     known = np.isfinite(table.protection_m) & np.isfinite(table.protection_rad)
     if not known.any() or limits.alert_limit_m is None or limits.alert_limit_rad is None:
         return None

@@ -1,5 +1,5 @@
-"""What programs call after the fact: :func:`correct` and :func:`report`; ``gripmon correct`` and ``gripmon report`` are
-these.
+"""The Python API for recordings: :func:`correct` and :func:`report`, as ``gripmon correct`` and ``gripmon report`` use
+them.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ __all__ = ["Corrected", "CorrectedRun", "Reported", "correct", "report"]
 
 Paths = Sequence[str | PathLike[str]]
 Bar = Callable[[int, str], AbstractContextManager[Callable[[], None]]]
-"""Steps to come and their unit -> a context with the function to call after each."""
+"""Number of steps and their unit -> a context manager that gives the function to call after each step."""
 
 _SUFFIXES = (".jsonl", ".parquet", ".rrd")
 
 
 @dataclass(frozen=True)
 class Reported:
-    """What happened in recordings: as data (SI units), and each recording with its report."""
+    """The report as data (SI units), and each recording with its report."""
 
     report: Report
     analysed: tuple[Analysed, ...]
@@ -64,14 +64,14 @@ def report(
     limit_rad: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reported:
-    """When did the cameras move, how far, why, and which times are affected?
+    """When the cameras moved, how far, why, and which times are affected.
 
-    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them.  A calibration that is off at the TCP by
-    more than the limits counts as affected; None: what the recorded configuration calls worth a warning.  ``progress``
-    is called with bytes read and bytes in all.
+    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them.  Times in which the calibration is off at
+    the TCP by more than the limits count as affected; None: the recorded configuration's limits for a warning.
+    ``progress`` is called with bytes read and bytes in total.
 
-    Raises :class:`~gripmon.model.errors.InputError` where there is no recording,
-    :class:`~gripmon.model.errors.NoResultError` where no frame of any can be read.
+    Raises :class:`~gripmon.model.errors.InputError` if there is no recording,
+    :class:`~gripmon.model.errors.NoResultError` if no frame can be read.
     """
     found = needed_recordings([Path(path) for path in recordings], progress)
     if not any(len(each.frames) for each in found.recordings):
@@ -82,7 +82,7 @@ def report(
 
 @dataclass(frozen=True)
 class Corrected:
-    """Runs with their corrections; ``faults`` is what could not be used, one line each; ``written`` which files."""
+    """Runs with their corrections; ``faults``, one line each: what could not be used; ``written``: the files."""
 
     runs: tuple[CorrectedRun, ...]
     faults: tuple[str, ...]
@@ -96,15 +96,15 @@ def correct(
     stamps: str | PathLike[str] | None = None,
     progress: Bar = lambda _steps, _unit: nullcontext(lambda: None),
 ) -> Corrected:
-    """The best ``cam_T_grip`` for every frame of recordings, from all frames before and after it.
+    """The best estimate of ``cam_T_grip`` for every frame of recordings, from all frames before and after it.
 
-    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them; each run is corrected by itself, since
-    between two anything may have happened.  ``out``: a file to write, .jsonl, .parquet or .rrd (of several runs then
-    one each, ``out-1.rrd`` and on).  ``stamps``: a CSV file whose column ``stamp_ns`` holds the capture times (Unix ns)
-    to write instead of the frames'.
+    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them; each run is corrected separately, since
+    anything may have happened between two runs.  ``out``: the file to write, .jsonl, .parquet or .rrd (several runs
+    give one .rrd each: ``out-1.rrd``, …).  ``stamps``: a CSV file whose column ``stamp_ns`` has the capture times (Unix
+    ns) to write instead of those of the frames.
 
-    Raises :class:`~gripmon.model.errors.InputError` before any work where files are missing or would be replaced,
-    :class:`~gripmon.model.errors.NoResultError` where nothing was measured or writing fails.
+    Raises :class:`~gripmon.model.errors.InputError` before any work if files are missing or would be replaced,
+    :class:`~gripmon.model.errors.NoResultError` if nothing was measured or writing fails.
     """
     paths = [Path(path) for path in recordings]
     target = None if out is None else Path(out)
@@ -133,7 +133,7 @@ def _check_target(out: Path, recordings: Sequence[Path]) -> None:
 
 
 def _targets(out: Path, runs: int) -> list[Path]:
-    """The files to write: one, but a track for each run where there are several, and none of those is replaced."""
+    """The files to write: one, or for several runs one track each, none of which may exist."""
     if out.suffix.lower() != ".rrd" or runs < 2:
         return [out]
     targets = [out.with_name(f"{out.stem}-{number}{out.suffix}") for number in range(1, runs + 1)]
@@ -186,7 +186,7 @@ def _corrected(found: Collection, progress: Bar) -> tuple[list[CorrectedRun], li
 
 
 def _distributed(runs: Sequence[CorrectedRun], wanted_ns: NDArray[np.int64]) -> tuple[list[CorrectedRun], list[str]]:
-    """Each instant to the runs that it lies in; those in none are counted."""
+    """Assign each instant to the runs that contain it; instants in no run are counted."""
     out, faults, known = [], [], np.zeros(len(wanted_ns), bool)
     for each in runs:
         stamps = each.correction.stamp_ns

@@ -1,4 +1,4 @@
-"""Recordings -> their reports; how the monitor ran: rates, latency, noise, shares of verdicts and states."""
+"""Recordings -> reports; how the monitor ran: rates, latency, noise, fractions of verdicts and states."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SEEN = (
     *MOTIONS, AlertKind.VIBRATION, AlertKind.GRIPPER, AlertKind.LOOK, AlertKind.LENS, AlertKind.LOST,
     AlertKind.OCCLUDED, AlertKind.IMAGE, AlertKind.STREAM,
 )  # fmt: skip
-"""Kinds of events that pictures may show something of."""
+"""Kinds of events for which pictures may be instructive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +57,9 @@ def build(
     affected_m: float | None = None,
     affected_rad: float | None = None,
 ) -> tuple[Report, tuple[Analysed, ...]]:
-    """The report on some recordings, in order of robot and time; ``faults`` is what could not be read at all.
+    """The report on recordings, in order of robot and time; ``faults``: what could not be read at all.
 
-    ``affected_m`` and ``affected_rad``: what counts as affected; None: as much as is worth a warning.
+    ``affected_m`` and ``affected_rad``: from where on work counts as affected; None: the limits for a warning.
     """
     analysed = [_analysed(source, affected_m, affected_rad) for source in sources]
     analysed.sort(key=lambda a: (a.report.robot, a.report.camera, a.report.start_ns))
@@ -116,7 +116,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
 
 
 def _keys(source: Recording) -> dict[tuple[str, int], int]:
-    """Id and revision of every reference that frames name, with the index of the first such frame, in order."""
+    """Id and revision of every reference that frames name, with the index of its first frame, in order."""
     table = source.frames
     pairs = np.stack([table.reference.astype(np.int64), table.revision], axis=1)
     distinct, first = np.unique(pairs, axis=0, return_index=True) if len(table) else (pairs, np.empty(0, int))
@@ -155,8 +155,8 @@ def _numbered(events: Sequence[Event], source: Recording, track: Track) -> tuple
 
 
 def _picture_seqs(event: Event, source: Recording, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
-    """The last picture before it began, with the gripper seen if there is one; the first one in it; and the first
-    believed one after it, if it is over.
+    """The last picture before it began, preferably with the gripper measured; the first one in it; and the first valid
+    one after it, if it is over.
     """
     if event.kind not in _SEEN:
         return {}
@@ -183,7 +183,7 @@ def _picture_seqs(event: Event, source: Recording, track: Track, images: NDArray
 
 
 def _with_overlay(source: Recording, seqs: NDArray[np.int64]) -> int:
-    """The first of some frames with a picture that shows what was measured; of an alert's own pictures not all do."""
+    """The first of some frames whose picture has an overlay, which not all pictures of an alert have."""
     for seq in seqs[:_OVERLAY_FRAMES].tolist():
         picture = source.picture(seq)
         if picture is not None and picture.predicted_edges:
@@ -192,7 +192,7 @@ def _with_overlay(source: Recording, seqs: NDArray[np.int64]) -> int:
 
 
 def _summary(reports: Sequence[RecordingReport]) -> str:
-    """One paragraph for all: of several a sentence each for those whose camera moved."""
+    """One paragraph; for several recordings one sentence for each whose camera moved."""
     if len(reports) == 1:
         return reports[0].summary
     robots = len({(r.robot, r.camera) for r in reports})
@@ -204,14 +204,12 @@ def _summary(reports: Sequence[RecordingReport]) -> str:
 
 _FEWEST = 30
 _SLICES = 120
-_MOST_STRETCHES = 2000  # of a history; shorter ones than a part of it are joined
+_MOST_STRETCHES = 2000  # of a history
 _NEIGHBOURS_NS = SECOND_NS // 2
 
 
 def _dropped(source: Recording) -> tuple[str, ...]:
-    """Those of the faults that are about frames which the monitor or its recorder had no time for, or nothing is wrong
-    with the files: these are no damage.
-    """
+    """The faults about frames that the monitor or its recorder dropped for lack of time, if the files are undamaged."""
     seq = source.frames.seq
     missing = int(seq[-1] - seq[0]) + 1 - len(seq) if len(seq) else 0
     by_choice = sum(
@@ -225,7 +223,7 @@ def _dropped(source: Recording) -> tuple[str, ...]:
 def _running(
     table: FrameTable, clock: Clock, track: Track, states: Sequence[StateRecord], dropped: tuple[str, ...]
 ) -> Running:
-    """Of one recording; ``states`` hold how much the recorder dropped, ``dropped`` where."""
+    """How the monitor ran; ``states`` contain how many frames were dropped, ``dropped`` where."""
     steps_s = 1e-9 * np.diff(clock.stamp_ns)
     latency_s = 1e-9 * table.latency_ns[table.latency_ns > 0]
     pauses_s = steps_s[steps_s > 1.0]
@@ -251,7 +249,7 @@ def _running(
 
 
 def _noise(table: FrameTable, track: Track) -> Noise | None:
-    """Between successive frames: a motion adds to few of the differences, and the median passes over them."""
+    """Noise between successive frames; a motion affects few of the differences, which the median ignores."""
     pairs = np.flatnonzero(track.measured[1:] & track.measured[:-1] & (np.diff(track.stamp_ns) < _NEIGHBOURS_NS))
     valid = table.verdict == table.VERDICTS.index("valid")
     pairs = pairs[valid[pairs] & valid[pairs + 1]]
@@ -278,7 +276,7 @@ def _slices(table: FrameTable, clock: Clock) -> tuple[Slice, ...]:
         return ()
     number = max(min(_SLICES, len(table) // _FEWEST), 1)
     length_ns = int(clock.stamp_ns[-1] - clock.stamp_ns[0]) + 1
-    # Counted from the first: Unix nanoseconds have more digits than a float.
+    # Relative to the first, since a float can't represent Unix nanoseconds exactly.
     edges = clock.stamp_ns[0] + np.linspace(0, length_ns, number + 1).astype(np.int64)
     edges[-1] = clock.stamp_ns[-1] + 1
     cuts = np.searchsorted(clock.stamp_ns, edges)
@@ -299,7 +297,7 @@ def _slices(table: FrameTable, clock: Clock) -> tuple[Slice, ...]:
 
 
 def _history(names: Sequence[str], codes: NDArray[np.int8], clock: Clock) -> tuple[Stretch, ...]:
-    """What followed what.  A stretch ends where the next begins, or with a pause of frames."""
+    """Successive stretches of equal names; a stretch ends where the next begins, or at a pause of frames."""
     if not len(codes):
         return ()
     pause = np.cumsum(np.concatenate([[0], np.diff(clock.stamp_ns) > SECOND_NS]))
@@ -311,6 +309,6 @@ def _history(names: Sequence[str], codes: NDArray[np.int8], clock: Clock) -> tup
         out.append(Stretch(names[int(codes[part.start])], int(clock.stamp_ns[part.start]), end_ns))
     if len(out) <= _MOST_STRETCHES:
         return tuple(out)
-    # Of a recording that never rests the longest are given; the data themselves are in the recording.
+    # Only the longest are reported; the data themselves are in the recording.
     shortest = sorted((s.end_ns - s.start_ns for s in out), reverse=True)[_MOST_STRETCHES - 1]
     return tuple(s for s in out if s.end_ns - s.start_ns >= shortest)

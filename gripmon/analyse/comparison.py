@@ -1,4 +1,4 @@
-"""Estimates against the simulator's truth: how far the corrected TCP is off, and what was noticed of every event."""
+"""Estimates compared with the simulator's truth: errors of the corrected TCP, and detection of every event."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ HARMLESS = frozenset({"shadow", "light step"})
 
 
 class Distribution(msgspec.Struct, frozen=True):
-    """Mean, 95th percentile and maximum of absolute values; None where there are none."""
+    """Mean, 95th percentile and maximum of absolute values; None without values."""
 
     mean: float | None
     p95: float | None
     max: float | None
 
     def cells(self) -> str:
-        """Of a table in columns of 8 characters."""
+        """Table cells of 8 characters."""
         return "".join("       —" if v is None else f"{v:8.4f}" for v in (self.mean, self.p95, self.max))
 
 
@@ -51,15 +51,15 @@ class TcpErrors(msgspec.Struct, frozen=True):
     along_mm: Distribution
 
     def row(self, name: str) -> str:
-        """Of :meth:`Comparison.table`."""
+        """A row of :meth:`Comparison.table`."""
         return f"{name:<38}{self.frames:>6} {self.across_mm.cells()}  {self.along_mm.cells()}"
 
 
 class EventReport(msgspec.Struct, frozen=True):
-    """One event of the scenario and what the monitor made of it; times from the first frame.
+    """One event of the scenario and how the monitor reacted; times from the first frame.
 
-    ``noticed_after_s`` is the time to the first alert that isn't good news; ``alerts`` are all until the next event
-    begins.  A ``harmless`` event should not be noticed.
+    ``noticed_after_s``: time to the first alarm (an alert that reports a fault); ``alerts``: all until the next event
+    begins.  A ``harmless`` event should raise no alarm.
     """
 
     event: str
@@ -74,7 +74,7 @@ class EventReport(msgspec.Struct, frozen=True):
     alerts: tuple[str, ...]
 
     def text(self) -> str:
-        """How far off the TCP was, and what was noticed."""
+        """How far the TCP was off, and what was detected."""
         moved = f"TCP up to {self.largest_tcp_shift_mm:.2f} mm off"
         if self.noticed_after_s is None:
             noticed = "rightly no alarm" if self.harmless else "NOT NOTICED"
@@ -96,7 +96,7 @@ class Comparison(msgspec.Struct, frozen=True):
     events: tuple[EventReport, ...]
 
     def table(self) -> list[str]:
-        """The errors, with and without correction, of the whole and in each event."""
+        """The errors with and without correction, overall and for each event."""
         return [
             f"{'TCP error against truth (mm)':<38}      across the optical axis           along it",
             f"{'':<38}{'frames':>6}{'mean':>9}{'95 %':>8}{'max':>8}{'mean':>10}{'95 %':>8}{'max':>8}",
@@ -114,14 +114,14 @@ class _Pair(NamedTuple):
 
 
 class _Alarms:
-    """Separates bad news from other alerts: that something is over, or goes on."""
+    """Separates alarms from other alerts, which say that something is over or continues."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[AlertKind, Severity]] = {}
 
     def among(self, alerts: Iterable[Alert]) -> bool:
-        """Whether alerts of one frame report something new, or something that has become another or worse."""
-        alarms = [self._is_one(alert) for alert in alerts]  # each of them counts for what follows
+        """Whether alerts of one frame report a new fault, or one that changed its kind or became more severe."""
+        alarms = [self._is_one(alert) for alert in alerts]  # all of them must be evaluated
         return any(alarms)
 
     def _is_one(self, alert: Alert) -> bool:
@@ -183,7 +183,7 @@ def _errors(errors_m: Sequence[Array]) -> TcpErrors:
 
 
 def _events(pairs: list[_Pair]) -> tuple[EventReport, ...]:
-    """One report for each uninterrupted time of a label, cut where the next event begins: each frame counts once."""
+    """One report per uninterrupted period of a label, ending where the next event begins: each frame counts once."""
     spans: list[tuple[int, int, str]] = []
     for label, name in EVENT_NAMES.items():
         active = [label in pair.truth.events for pair in pairs]
@@ -225,7 +225,7 @@ _MOST_SHOWN = 3
 
 
 class Differences:
-    """Counted frame by frame."""
+    """The differences between a recorded run and its replay, counted frame by frame."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -252,7 +252,7 @@ class Differences:
         self._alerts_now.add(now.seq, now.alerts)
 
     def text(self, from_jpeg: bool) -> str:
-        """``from_jpeg``: the images that were replayed had lost what a JPEG loses, which changes every number."""
+        """``from_jpeg``: the replayed images were compressed as JPEG, which changes every number."""
         if self._same == self.frames:
             return f"all {self.frames} as they were recorded, every number the same"
         alerts = self._alerts_now.against(self._alerts_then)
@@ -270,10 +270,10 @@ class Differences:
 
 
 class _AlertChanges:
-    """When alerts began, ended, or came to another severity, by kind and what changed."""
+    """When alerts began, ended, or changed severity, by kind and change."""
 
     def __init__(self) -> None:
-        self._severity: dict[str, str] = {}  # of what is open, by the alert's id
+        self._severity: dict[str, str] = {}  # of open alerts, by id
         self._at: defaultdict[str, list[int]] = defaultdict(list)
 
     def add(self, seq: int, alerts: tuple[Alert, ...]) -> None:
@@ -290,7 +290,7 @@ class _AlertChanges:
                 self._at[f"{alert.kind} {change} {alert.severity}"].append(seq)
 
     def against(self, then: _AlertChanges) -> str:
-        """What is more, less, or at another frame than then, in words; empty for nothing."""
+        """What is additional, missing, or at another frame than then, in words; empty if nothing."""
         texts = []
         for what in sorted({*self._at, *then._at}, key=lambda w: ((self._at.get(w) or then._at[w])[0], w)):
             now_at, then_at = self._at.get(what, []), then._at.get(what, [])

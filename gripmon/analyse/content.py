@@ -1,5 +1,5 @@
-"""A report as data: ``gripmon report --json`` writes it, and the page shows no more.  And how its numbers
-and times are written for people: millimetres, degrees, UTC.
+"""A report as data, as ``gripmon report --json`` writes it and the page shows it, and the formatting of its numbers and
+times for people: millimetres, degrees, UTC.
 
 SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.
 """
@@ -23,7 +23,7 @@ def _is(description: str) -> Meta:
 
 
 class Displacement(msgspec.Struct, frozen=True):
-    """By how much something moved."""
+    """The size of a motion."""
 
     tcp_shift_m: Annotated[Vector, _is("of the TCP along the camera's x, y, z, m")]
     size_m: Annotated[float, _is("length of tcp_shift_m")]
@@ -149,7 +149,7 @@ class Share(msgspec.Struct, frozen=True):
 
 
 class Stretch(msgspec.Struct, frozen=True):
-    """As long as a state lasts."""
+    """A period of one state or verdict."""
 
     name: str
     start_ns: int
@@ -170,8 +170,8 @@ class Slice(msgspec.Struct, frozen=True):
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """Something over time: in pieces of time the middle and the bounds of what was measured, ± two standard deviations
-    included.  Null where nothing was measured.
+    """A quantity over time: per piece of time the median and the bounds of the measurements, including ± two standard
+    deviations.  Null where nothing was measured.
     """
 
     name: Annotated[
@@ -262,7 +262,7 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.report/1"):
-    """After a failed shift: what moved, when, how far, why, and what is affected."""
+    """The whole report: what moved, when, how far, why, and what is affected."""
 
     summary: str
     version: Annotated[str, _is("of gripmon, which made the report")]
@@ -271,14 +271,14 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
 
 
 COVERAGE = 2.0
-"""Standard deviations that a ± stands for."""
+"""Standard deviations that ± denotes."""
 
 
 _FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
 
 
 def clock_time(stamp_ns: int, digits: int = 1) -> str:
-    """``12:34:56.7``, UTC, cut, not rounded: no such time lies after the event."""
+    """``12:34:56.7``, UTC, truncated, so that no time is shown after the event."""
     whole, part = divmod(stamp_ns, 1_000_000_000)
     return f"{_at(whole):%H:%M:%S}" + (f".{part:09d}"[: digits + 1] if digits else "")
 
@@ -302,12 +302,12 @@ def iso(stamp_ns: int) -> str:
 
 
 def _at(seconds: int) -> datetime:
-    """Years that the calendar doesn't have are shown as its ends."""
+    """Years outside the calendar are clipped to it."""
     return datetime.fromtimestamp(min(max(seconds, -62_135_596_800), 253_402_300_799), UTC)
 
 
 def duration(seconds: float) -> str:
-    """In the two units that fit."""
+    """A duration in the two units that fit."""
     if seconds < 0.0995:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 59.95:
@@ -328,7 +328,7 @@ def span(start_ns: int, end_ns: int) -> str:
 
 
 def millimetres(metres: float, sigma_m: float | None = None) -> str:
-    """``4.21 ± 0.02 mm``: ± is two standard deviations, and decides the digits."""
+    """``4.21 ± 0.02 mm``: ± is two standard deviations and determines the digits."""
     if not math.isfinite(metres):
         return "unknown"
     return f"{_measured(1e3 * metres, None if sigma_m is None else 1e3 * sigma_m)} mm"
@@ -343,7 +343,7 @@ def degrees(radians: float | None, sigma_rad: float | None = None) -> str:
 
 
 def size(moved: Displacement | None) -> str:
-    """Both of a displacement."""
+    """Shift and turn of a displacement."""
     if moved is None:
         return "–"
     text = millimetres(moved.size_m, moved.sigma_m)
@@ -358,7 +358,7 @@ def signed_mm(values_m: tuple[float, float, float]) -> str:
 
 
 def percent(share: float) -> str:
-    """A share that isn't whole is never shown as 0 or 100 %."""
+    """Per cent; a fraction between 0 and 1 is never shown as 0 or 100 %."""
     text = f"{100.0 * share:.1f}"
     if text == "100.0" and share < 1.0:
         return "> 99.9 %"

@@ -1,4 +1,4 @@
-"""A corrected run, and how it is written: JSON lines, Parquet or a track for the viewer, with where it comes from."""
+"""A corrected run, written as JSON lines, Parquet or a track for the viewer, with its provenance."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
 BETWEEN = "between"
-"""Source of an instant that is no frame's."""
+"""Source of an instant that is not a frame's."""
 
 
 @dataclass(frozen=True)
 class CorrectedRun:
-    """One run of a monitor and its correction; ``wanted_ns`` (n,): the instants to write instead of its frames."""
+    """One run of a monitor and its correction; ``wanted_ns`` (n,): instants to write instead of its frames."""
 
     recording: Recording
     correction: Correction
@@ -43,7 +43,7 @@ class CorrectedRun:
         return name_of(self.recording)
 
     def summary(self) -> str:
-        """For a person: how many frames, how certain, and each change of the pose on a line of its own."""
+        """For people: number of frames, uncertainty, and one line per change point."""
         made = self.correction
         sigma_um = 1e6 * float(np.median(_tcp_sigma_m(made.covariance)))
         points = count(len(made.change_points), "change point")
@@ -59,7 +59,7 @@ class CorrectedRun:
 
 
 def _tcp_sigma_m(covariance: Array) -> Array:
-    """(n,) of the TCP's position, all directions together, from (n, 6, 6)."""
+    """(n,) standard deviation of the TCP's position, all directions together, from (n, 6, 6)."""
     return np.asarray(np.sqrt(np.einsum("nii->ni", covariance)[:, :3].sum(axis=1)))
 
 
@@ -69,7 +69,7 @@ def name_of(recording: Recording) -> str:
 
 
 def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
-    """Correct the frames of a table; ``step`` is called after each stage.  ValueError where too little was measured."""
+    """Correct the frames of a table; ``step`` is called after each stage.  ValueError if too little was measured."""
     held = frames.ORIGINS.index(Origin.HELD.value)
     length = np.linalg.norm(frames.cam_T_grip[:, 3:], axis=1)
     measured = np.isfinite(frames.cam_T_grip).all(axis=1) & (frames.source != held) & ~frames.refused & (length > 0.0)
@@ -90,7 +90,7 @@ class WrittenChangePoint(msgspec.Struct, frozen=True):
 
 
 class WrittenRun(msgspec.Struct, frozen=True):
-    """A run of a monitor; ``learnt`` by the six whitened axes, in units of the reported variance."""
+    """A run of a monitor; ``learnt``: variances per whitened axis, in units of the reported variance."""
 
     recording_id: str
     robot: str
@@ -112,8 +112,8 @@ class Provenance(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.c
 
 
 class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.corrected/1"):
-    """One instant.  ``run`` counts the runs; ``seq`` is -1 for an instant that is no frame's; ``segment`` counts the
-    change points before; ``sigma_tcp_m`` is the standard deviation of the TCP's position, all axes together.
+    """One instant.  ``run``: number of the run; ``seq``: -1 if the instant is not a frame's; ``segment``: number of
+    change points before; ``sigma_tcp_m``: standard deviation of the TCP's position, all axes together.
     """
 
     run: int
@@ -127,7 +127,7 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
 
 
 def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
-    """Where a file comes from."""
+    """The provenance of a file."""
     settings = {
         "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
         "block_s": BLOCK_S,
@@ -165,7 +165,7 @@ def _run(each: CorrectedRun) -> WrittenRun:
 
 
 def _columns(each: CorrectedRun) -> dict[str, Any]:
-    """One run's instants: arrays, and the sources as text."""
+    """One run's instants: arrays, with the sources as text."""
     made, frames = each.correction, each.recording.frames
     if each.wanted_ns is None:
         stamp_ns, seq, segment, poses, covariance = (
@@ -193,7 +193,7 @@ def _columns(each: CorrectedRun) -> dict[str, Any]:
 
 
 def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]], number: int = 0) -> None:
-    """A file, whole or not at all, of the kind that its suffix names; a track (.rrd) is of run ``number`` alone.
+    """Write a file, whole or not at all, of the type given by its suffix; a track (.rrd) has only run ``number``.
 
     ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
     """

@@ -1,9 +1,9 @@
-"""The best transform for every instant of a recording, knowing all of it: before and after.
+"""The best transform for every instant of a recording, from all frames before and after it.
 
-The pose is a random walk with a rate, cut where it changed at once (:mod:`.changes`); frames measure it with errors
-that are new in each of them, last for half a second, or for as long as a background stays (:mod:`.noise`).  Means of
-blocks of frames are smoothed forwards and backwards (:mod:`.smoother`), on vectors about one pose (:mod:`.chart`), axis
-by axis after whitening by what frames claim.  Quick motion is added from what is left (:mod:`.motion`).
+The pose is a random walk with a rate, restarted at change points (:mod:`.quick_motion`); frames measure it with errors
+that are new in each of them, last for half a second, or last as long as a background stays.  Means of blocks of frames
+are smoothed forwards and backwards (:mod:`.smoothing`), on vectors about one pose (:mod:`.vectors`), axis by axis after
+whitening by the reported covariance.  Quick motion is added from the residuals (:mod:`.quick_motion`).
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ BLOCK_S = 0.13
 BLOCK_DOF = 12.0
 """Student's degrees of freedom of a block's error."""
 SURE_CHANGE_CHI2 = 60.0
-"""Squared size of a change, in units of what frames claim, that no background explains."""
+"""Squared size of a change, in reported variances, that no background explains."""
 MIN_VARIANCE = 0.3
-"""Least variance over the reported one: a background that stays as long as the recording shows nothing of its error."""
+"""Least variance over the reported one: the error of a background that never changes can't be seen."""
 RAMP_FRAMES = 32
 FIT_PASSES = 2
 
 SMOOTHED, FOLLOWED, DISBELIEVED, GAP = range(4)
 SOURCES = ("smoothed", "followed", "disbelieved", "gap")
-"""How an instant's transform came about: smoothed; smoothed and followed the frames' quick motion; smoothed without its
-own frame, which is wrong; no frame there."""
+"""How an instant's transform was obtained: smoothed; smoothed and following the frames' quick motion; smoothed without
+its own frame, which is an outlier; no frame there."""
 
 
 @dataclass(frozen=True)
 class ChangePoint:
     """The pose changed between the frames ``index - 1`` and ``index``, or in a gap before it.
 
-    ``size`` (6,) is the perturbation, m and rad in camera axes, from before to after, ``size_covariance`` (6, 6) that
-    of its error.  In 95 of 100 cases it happened between ``earliest_ns`` and ``latest_ns``.
+    ``size`` (6,): the perturbation from before to after, m and rad in camera axes; ``size_covariance`` (6, 6): of its
+    error.  With 95 % probability it happened between ``earliest_ns`` and ``latest_ns``.
     """
 
     index: int
@@ -63,10 +63,10 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class Correction:
-    """One row a frame: ``cam_T_grip`` (n, 4, 4), its error's ``covariance`` (n, 6, 6) in the published convention,
+    """One row per frame: ``cam_T_grip`` (n, 4, 4), its error's ``covariance`` (n, 6, 6) in the published convention,
     ``segment`` (n,) between changes, ``source`` (n,) index into :data:`SOURCES`.
 
-    ``learnt``: what the recording shows of its errors, in units of the reported variance.
+    ``learnt``: error variances estimated from the recording, in units of the reported variance.
     """
 
     stamp_ns: Ints
@@ -87,10 +87,10 @@ def correct(
     measured: Bools,
     progress: Callable[[], None] = lambda: None,
 ) -> Correction:
-    """Correct one run: ``stamp_ns`` (n,), transforms (n, 4, 4) and covariances (n, 6, 6) as recorded, and whether each
-    was ``measured`` (n,); what isn't, is not used.  ``progress`` is called :data:`STAGES` times.
+    """Correct one run: ``stamp_ns`` (n,), transforms (n, 4, 4) and covariances (n, 6, 6) as recorded, and which were
+    ``measured`` (n,); the others are not used.  ``progress`` is called :data:`STAGES` times.
 
-    ValueError when fewer than :data:`.run.MIN_FRAMES` frames were measured.
+    Raises ValueError if fewer than :data:`.vectors.MIN_FRAMES` frames were measured.
     """
     run = prepare(stamp_ns, cam_T_grip, covariance, measured)
     wild = wild_frames(run)
@@ -111,7 +111,7 @@ STAGES = 3
 
 
 def _changes(run: Run) -> list[Found]:
-    """In frames' numbers; a gap before a change is part of where it may have happened."""
+    """Change points by frame index; a gap before a change is part of its interval."""
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
@@ -127,7 +127,7 @@ def _surely_moved(y: Array, index: int) -> bool:
 
 
 def _is_sharp(y: Array, index: int) -> bool:
-    """Whether it is a change at once, rather than the passing over from one background to the next."""
+    """Whether it is a step, rather than a ramp from one background to the next."""
     half = 2 * RAMP_FRAMES
     part = y[max(index - half, 0) : index + half]
     middle = index - max(index - half, 0)
@@ -143,7 +143,7 @@ def _is_sharp(y: Array, index: int) -> bool:
 
 
 def _unexplained(part: Array, law: Array) -> float:
-    """Squares that are left of the rows when each axis is a constant and a multiple of the law."""
+    """Residual sum of squares of a fit of each axis by a constant and a multiple of ``law``."""
     basis = np.stack([np.ones(len(law)), law], axis=1)
     noise = np.sqrt(np.median(np.diff(part, axis=0) ** 2, axis=0)) + 1e-9
     scaled = part / noise
@@ -153,7 +153,7 @@ def _unexplained(part: Array, law: Array) -> float:
 
 @dataclass
 class _Fit:
-    """Blocks at ``time_s`` (m,) of the ``segment`` (m,), smoothed; what is left of the frames; quick motion."""
+    """Smoothed blocks at ``time_s`` (m,) with their ``segment`` (m,); error variances; quick motion per frame."""
 
     found: list[Found]
     time_s: Array
@@ -211,7 +211,7 @@ def _fit(run: Run, found: list[Found]) -> _Fit:
 
 
 def _around(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
-    """x just before and after a change (2, 6), and the variance (6,) of their difference."""
+    """x just before and after a change (2, 6), and the variance (6,) of the difference."""
     at_s = run.time_s[[fit.found[number].index] * 2]
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
     return x, variance.sum(axis=0)
@@ -224,7 +224,7 @@ def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
     good = np.flatnonzero(run.usable)
     source = np.full(len(x), GAP, np.int8)
     source[good], source[wild] = SMOOTHED, DISBELIEVED
-    # Quick motion: a vibration as the spectrum has it, a swing as far as frames scatter more than usual.
+    # Quick motion: vibration from the spectrum, swinging as far as frames scatter more than usual.
     frame = (fit.shares.frame + fit.shares.white + fit.shares.mid) * run.claimed[good]
     follow = fit.swing / (fit.swing + frame)
     rest = run.y[good] - x[good] - fit.quick
@@ -254,7 +254,7 @@ def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
 
 
 def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: Found, x: Array, spread: Array) -> None:
-    """Where nothing was measured before a change it may have happened at any moment, all alike probable."""
+    """In a gap before a change, the change may have happened at any moment with equal probability."""
     before = np.flatnonzero(run.usable[: found.index])[-1]
     gap = np.arange(before + 1, found.index)
     if not len(gap):
@@ -285,9 +285,9 @@ def _point(run: Run, fit: _Fit, number: int, stamp_ns: Ints) -> ChangePoint:
 def sample(correction: Correction, wanted_ns: Ints) -> tuple[Array, Array, Ints]:
     """Transforms (k, 4, 4), their errors' covariances (k, 6, 6) and segments (k,) at the capture times ``wanted_ns``.
 
-    A frame's own time gives the frame's.  Between two frames the transform is taken to go from one to the other, and
-    may have done so at once, at any moment: that is added to the covariance.  All NaN, and segment -1, before the
-    first frame and after the last.  ValueError for a recording in which time runs backwards.
+    At a frame's time it is the frame's transform.  Between two frames it is interpolated, and the covariance includes
+    that the change may have happened at any moment between them.  NaN, and segment -1, before the first frame and after
+    the last.  Raises ValueError for a recording in which time runs backwards.
     """
     stamps = correction.stamp_ns
     if (np.diff(stamps) < 0).any():

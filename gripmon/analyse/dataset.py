@@ -1,4 +1,4 @@
-"""What was measured of a dataset: a journal that survives a kill, the table made of it, and the report."""
+"""The results of a dataset: a journal that survives a kill, the table made from it, and the report."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from gripmon.record.table import pose_matrices
 TABLE, REPORT, _JOURNAL = "stretches", "report.html", "journal.jsonl"
 _NONE = np.full(36, np.nan)
 _GROUP_ROWS, _FILE_ROWS = 1000, 50_000
-"""Rows in memory at once (with their pictures some 20 MB), and in a file."""
+"""Rows in memory at a time (with pictures about 20 MB), and per file."""
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """What an episode gave by one camera: its stretches, or ``fault``: why there are none."""
+    """The result of one episode and camera: its stretches, or ``fault``: why there are none."""
 
     episode: str
     camera: str
@@ -59,9 +59,9 @@ class _Entry(msgspec.Struct, frozen=True):
 
 
 class Journal:
-    """A file with a line for each episode that was measured; a line that was cut by a kill doesn't count.
+    """A file with one line per measured episode; a line truncated by a kill is ignored.
 
-    Raises :class:`InputError` where another process writes it, or it holds what another configuration gave.
+    Raises :class:`InputError` if another process writes it, or if its results are from another configuration.
     """
 
     def __init__(self, folder: Path, fingerprint: str) -> None:
@@ -104,15 +104,15 @@ class Journal:
         return key in self._places
 
     def keep(self, versions: dict[str, str]) -> None:
-        """Forget episodes whose files have changed since."""
+        """Discard episodes whose files have changed."""
         self._places = {key: place for key, place in self._places.items() if versions.get(key) == place[1]}
 
     def add(self, measured: Measured) -> None:
-        """One more; it is kept when this returns, also if the process is killed."""
+        """Add a result, which survives a kill of the process once this has returned."""
         self._places[measured.key] = self._append(measured), measured.version
 
     def read(self, key: str) -> Measured:
-        """What was kept of an episode."""
+        """The stored result of an episode."""
         self._file.seek(self._places[key][0])
         return msgspec.json.decode(self._file.readline(), type=Measured)
 
@@ -125,7 +125,7 @@ class Journal:
 
 
 class Line(msgspec.Struct, frozen=True):
-    """What the report takes of a row of the table: one stretch of an episode, or an episode that failed."""
+    """What the report needs of a table row: one stretch of an episode, or a failed episode."""
 
     key: str
     episode: str
@@ -137,7 +137,7 @@ class Line(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Written:
-    """The files, and what is in them: ``lines`` with their ``mountings`` (-1: none), by camera."""
+    """The files written, and their content: ``lines`` with their ``mountings`` (-1: none)."""
 
     table: Path
     report: Path
@@ -159,7 +159,7 @@ def write_dataset(
     tolerance_m: float,
     tolerance_rad: float,
 ) -> Written:
-    """The table of the episodes ``keys``, in that order; one from before is replaced.  The report on it is written by
+    """Write the table of the episodes ``keys``, in that order, replacing an earlier one; the report is written by
     :func:`gripmon.analyse.dataset_page.write_page`.
     """
     covariances: list[NDArray[np.float64]] = []
@@ -175,7 +175,7 @@ def write_dataset(
 
 
 def _lines(measured: Measured, covariances: list[NDArray[np.float64]]) -> list[Line]:
-    """An episode's; covariances go to a list of arrays, which take less memory: there may be hundreds of thousands."""
+    """An episode's lines; covariances are appended as arrays, which need less memory for hundreds of thousands."""
     plain = measured.key, measured.episode, measured.camera
     if measured.fault is not None:
         covariances.append(_NONE)
@@ -192,7 +192,7 @@ def _mountings(
     tolerance_m: float,
     tolerance_rad: float,
 ) -> NDArray[np.int64]:
-    """Of each line's camera; -1 where no transform is valid: what may be wrong says nothing of a mounting."""
+    """The mounting of each line, per camera; -1 without a valid transform."""
     out = np.full(len(lines), -1, np.int64)
     by_camera: dict[str, list[int]] = {}
     for place, line in enumerate(lines):
@@ -289,7 +289,7 @@ def moved(stretches: Sequence[Stretch]) -> bool:
 
 
 class Rows:
-    """The table's rows, made of the journal one episode at a time."""
+    """The table's rows, made from the journal one episode at a time."""
 
     def __init__(self, journal: Journal, written: Written) -> None:
         self._journal = journal
@@ -297,7 +297,7 @@ class Rows:
         self._mountings = {(line.key, line.number): int(number) for line, number in numbered}
 
     def of(self, key: str) -> tuple[Measured, list[dict[str, Any]]]:
-        """Of an episode by a camera: a row for each stretch, one where there are none."""
+        """An episode and its rows: one per stretch, or a single one if there are none."""
         measured = self._journal.read(key)
         stretches = measured.stretches or (None,)
         return measured, [_row(measured, n, stretch, self._mountings[key, n]) for n, stretch in enumerate(stretches)]

@@ -1,8 +1,8 @@
-"""A dataset's extrinsics in its own format: an MCAP beside each recording, a copy of a LeRobot dataset with columns
-more.  What was recorded is never written to.
+"""A dataset's extrinsics in its own format: an MCAP beside each recording, or a copy of a LeRobot dataset with
+additional columns.  The recordings themselves are never written to.
 
-The columns and what LeRobot keeps of them are as its ``dataset_tools.add_features`` writes them; MCAP's messages are
-JSON with a schema.
+The columns and their metadata are as LeRobot's ``dataset_tools.add_features`` writes them; MCAP messages are JSON with
+a schema.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from gripmon.model.lerobot_columns import POSE_NAMES, extrinsics_features, extri
 from gripmon.model.records import Verdict
 
 _MARK = "meta/gripmon.json"
-"""In a copy: by it a copy of ours is told from anything else, and only that is replaced."""
+"""Marks a copy as made by gripmon; only such copies are replaced."""
 _JSON_TYPES = {pa.string(): "string", pa.int32(): "integer", pa.int64(): "integer", pa.bool_(): "boolean"}
 
 
 class Annotations:
-    """Where the results of ``episodes`` go below the folder or URL ``to``, which has the tree of the dataset: of a
-    LeRobot dataset a copy with columns more (on this machine only), of anything else ``NAME.gripmon.mcap``, which lies
-    beside the recording where ``to`` is the dataset itself.  Only files of ours are replaced.
+    """Writes the results of ``episodes`` below the folder or URL ``to``, in the tree of the dataset: for a LeRobot
+    dataset a copy with additional columns (on this machine only), otherwise ``NAME.gripmon.mcap``, which is beside the
+    recording if ``to`` is the dataset itself.  Only files made by gripmon are replaced.
 
-    Raises :class:`InputError` for a copy that would lie in what is there already, before anything is measured.
+    Raises :class:`InputError` for a copy that would overwrite something else, before anything is measured.
     """
 
     def __init__(self, episodes: Sequence[Episode], to: str) -> None:
@@ -57,7 +57,7 @@ class Annotations:
         }
 
     def write(self, rows: Rows) -> int:
-        """How many files and copies were written.  Raises :class:`InputError` where one can't be."""
+        """Returns how many files and copies were written.  Raises :class:`InputError` if one can't be."""
         for path, episodes in self._datasets.items():
             _copy_with_columns(open_dataset(path), rows, episodes, self._targets[path])
         for name, episodes in self._recordings.items():
@@ -82,7 +82,7 @@ def _put(path: str, data: bytes) -> None:
 
 
 def _mcap(name: str, rows: Rows, episodes: Sequence[Episode]) -> bytes:
-    """One message for each stretch, stamped with its first frame; why there is none is in the metadata."""
+    """One message per stretch, stamped with its first frame; the reason for a missing one is in the metadata."""
     buffer = io.BytesIO()
     writer = needed("mcap.writer").Writer(buffer)
     writer.start("", library=f"gripmon {__version__}")
@@ -105,7 +105,7 @@ def _mcap(name: str, rows: Rows, episodes: Sequence[Episode]) -> bytes:
 
 
 def _json_schema() -> dict[str, Any]:
-    """Of a row of the table, without its picture."""
+    """The schema of a table row, without its picture."""
     properties: dict[str, Any] = {"camera": {"type": "string", "description": "topic of the images"}}
     for field in SCHEMA:
         if field.name == "picture":
@@ -118,7 +118,7 @@ def _json_schema() -> dict[str, Any]:
 
 
 def _target(dataset: LeRobotDataset, cameras: Sequence[str], target: str) -> Path:
-    """Where the copy goes: not into the original, nor onto anything that isn't an earlier copy."""
+    """The folder of the copy, which must not be in the original nor replace anything but an earlier copy."""
     right = "a folder elsewhere on this machine"
     names = [name for camera in cameras for name in extrinsics_features(camera)]
     if there := sorted(set(names) & set(dataset.info["features"])):
@@ -136,7 +136,7 @@ def _target(dataset: LeRobotDataset, cameras: Sequence[str], target: str) -> Pat
 
 
 def _copy_with_columns(dataset: LeRobotDataset, rows: Rows, episodes: Sequence[Episode], target: Path) -> None:
-    """The tables with columns more; videos and images are links to the originals where these are on this machine."""
+    """Copy with additional columns; videos and images become links if the originals are on this machine."""
     cameras = _cameras(episodes)
     features = {name: one for camera in cameras for name, one in extrinsics_features(camera).items()}
     info = dataset.info | {"features": dataset.info["features"] | features}
@@ -166,7 +166,7 @@ def _copy_with_columns(dataset: LeRobotDataset, rows: Rows, episodes: Sequence[E
 
 
 def _files(path: str) -> list[str]:
-    """Every file of a dataset by its path in it; hidden ones are left out."""
+    """Relative paths of a dataset's files, without hidden ones."""
     system, inside = file_system(path)
     names = [posixpath.relpath(one, inside) for one in sorted(system.find(inside))]
     return [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
@@ -178,14 +178,14 @@ def _place(episode: Episode) -> tuple[int, str]:
 
 
 class _Steps:
-    """The transform of an episode as it was at any time: constant within a stretch."""
+    """The transform of an episode over time, constant within a stretch."""
 
     def __init__(self, made: list[dict[str, Any]]) -> None:
         self._rows = [row for row in made if row["start_ns"] is not None and row["cam_T_grip_tx_m"] is not None]
 
     def at(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transforms (n, 7), all 0 where none is known, and flags (n,): 1 where it may be used.  Within the time in
-        which the camera may have moved neither side may.
+        """Transforms (n, 7), all 0 where unknown, and flags (n,), 1 where usable.  While the camera may have moved, the
+        transforms of neither side are usable.
         """
         pose, usable = np.zeros((len(stamps_ns), 7), np.float32), np.zeros(len(stamps_ns), np.float32)
         for row in self._rows:
@@ -210,7 +210,7 @@ def _with_columns(table: pa.Table, cameras: Sequence[str], values: dict[tuple[in
         pose_name, flag_name = extrinsics_names(camera)
         table = table.append_column(pose_name, pa.FixedSizeListArray.from_arrays(pa.array(poses.ravel()), 7))
         table = table.append_column(flag_name, pa.array(flags))
-    # The datasets library would believe its own list of columns, which lacks these.
+    # The datasets library would use its own list of columns, which lacks these.
     return table.replace_schema_metadata(
         {k: v for k, v in (table.schema.metadata or {}).items() if k != b"huggingface"}
     )

@@ -1,4 +1,4 @@
-"""The report on a dataset: how it is mounted over time, what moved, what failed, in one HTML file."""
+"""The report on a dataset: mountings over time, motions and failures, in one HTML file."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
 
 _MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
-"""Episodes with pictures, rows of a table, points of a plot: the table has all of them."""
+"""Episodes with pictures, rows of a table, points of a plot; the Parquet table has all of them."""
 
 
 def write_page(written: Written, journal: Journal, name: str) -> None:
-    """Write the report on the dataset ``name`` where ``written`` says; one from before is replaced."""
+    """Write the report on the dataset ``name`` where ``written`` says, replacing an earlier one."""
     write_atomically(written.report, _page(written, journal, name))
 
 
 def _page(written: Written, journal: Journal, name: str) -> bytes:
-    """The whole page, UTF-8, without need of a network."""
+    """The whole page, UTF-8, which needs no network."""
     from plotly.offline import get_plotlyjs
 
     from gripmon.analyse.plots import as_json, mountings_figure
@@ -65,7 +65,7 @@ def _summary(written: Written, episodes: dict[str, list[Line]]) -> str:
 
 
 def _badness(lines: Sequence[Line]) -> tuple[float, float]:
-    """How far it moved, then how few of its frames were usable; failures stand in a table of their own."""
+    """How far it moved, then the fraction of unusable frames; failures are in a separate table."""
     stretches = [line.stretch for line in lines if line.stretch is not None]
     if not stretches:
         return -1.0, 0.0
@@ -108,7 +108,7 @@ def _mountings(written: Written) -> list[dict[str, Any]]:
 
 
 def _points(written: Written, camera: str) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Episodes, TCPs (n, 3) against the first one, m, and mountings (n,) of a camera; some where there are many."""
+    """Episodes, TCPs (n, 3) relative to the first, m, and mountings (n,) of a camera; thinned if there are many."""
     places = [
         place
         for place, (line, number) in enumerate(zip(written.lines, written.mountings, strict=True))

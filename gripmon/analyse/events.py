@@ -1,4 +1,4 @@
-"""The report's events beside the camera's motions: alerts, each from raised to cleared, pauses, and new references."""
+"""The report's events besides camera motions: alerts, each from raised to cleared, pauses, and new references."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _PAUSE_S = 1.0
 
 
 def alert_events(histories: Sequence[AlertHistory]) -> list[Event]:
-    """An event for each alert that is not about the camera's motion."""
+    """One event per alert that is not about a motion of the camera."""
     return [_event(history) for history in histories if not history.is_motion]
 
 
 def _event(history: AlertHistory) -> Event:
     alerts = history.alerts or history.all
-    # What it became at its worst names it: occluded, then lost, is lost.
+    # It is named after its most severe stage: occluded, then lost, is lost.
     gravest = worst(alerts)
     kind = [each.alert.kind for each in alerts if each.alert.severity == gravest][-1]
     alert = explained(alerts) or alerts[-1].alert
@@ -66,7 +66,7 @@ def _event(history: AlertHistory) -> Event:
 
 
 def pauses_of(clock: Clock) -> list[Event]:
-    """An event for each time without frames, of a second or more."""
+    """One event per pause of a second or more without frames."""
     out = []
     for i in np.flatnonzero(np.diff(clock.stamp_ns) > _PAUSE_S * SECOND_NS).tolist():
         start_ns, end_ns = int(clock.stamp_ns[i]), int(clock.stamp_ns[i + 1])
@@ -89,7 +89,7 @@ def pauses_of(clock: Clock) -> list[Event]:
 def reference_changes(
     events: Sequence[Event], references: Sequence[ReferenceRecord], in_force_ns: dict[tuple[str, int], int]
 ) -> list[Event]:
-    """An event for each change of the reference that no alert reports; ``in_force_ns`` in the order of time."""
+    """One event per change of the reference that no alert reports; ``in_force_ns`` in order of time."""
     alerted = (AlertKind.RECALIBRATED, AlertKind.RESTORED)
     known_ns = [event.onset.stamp_ns for event in events if event.kind in alerted]
     records = {(record.reference_id, record.revision): record for record in references}
@@ -127,7 +127,7 @@ class TimedAlert(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AlertHistory:
-    """All records of one alert, in order; ``over`` is what cleared it, None if nothing did."""
+    """All records of one alert, in order; ``over``: the one that cleared it, None if none did."""
 
     alerts: tuple[TimedAlert, ...]
     over: TimedAlert | None = None
@@ -138,13 +138,13 @@ class AlertHistory:
 
     @property
     def since_ns(self) -> int:
-        """When it was raised, by its own record where the beginning isn't recorded."""
+        """When it was raised; by its own record if the beginning isn't recorded."""
         alert, stamp_ns = self.first.alert, self.first.stamp_ns
         return stamp_ns if alert.since_ns is None else min(alert.since_ns, stamp_ns)
 
     @property
     def is_motion(self) -> bool:
-        """It is about the camera's motion."""
+        """Whether it is about a motion of the camera."""
         return self.first.alert.kind in MOTIONS
 
     @property
@@ -153,7 +153,7 @@ class AlertHistory:
 
 
 def histories_of(alerts: Sequence[AlertRecord], clock: Clock) -> list[AlertHistory]:
-    """In the order in which they began; what is only noted is a history of its own."""
+    """In the order in which they began; an alert that is only noted has its own history."""
     histories: list[AlertHistory] = []
     open_ones: dict[str, int] = {}
     for alert in alerts:
@@ -174,12 +174,12 @@ def histories_of(alerts: Sequence[AlertRecord], clock: Clock) -> list[AlertHisto
 
 
 def worst(alerts: Sequence[TimedAlert]) -> Severity:
-    """The gravest severity among them."""
+    """The highest severity among them."""
     return max((each.alert.severity for each in alerts), key=list(Severity).index, default=Severity.INFO)
 
 
 def explained(alerts: Sequence[TimedAlert]) -> AlertRecord | None:
-    """The last one that names a cause; else the last one that weighed any; else the last."""
+    """The last one that names a cause; else the last one with weighed causes; else the last."""
     records = [each.alert for each in reversed(alerts)]
     named = (record for record in records if record.cause != Cause.UNKNOWN)
     weighed = (record for record in records if record.causes)
@@ -187,5 +187,5 @@ def explained(alerts: Sequence[TimedAlert]) -> AlertRecord | None:
 
 
 def probability(alert: AlertRecord) -> float | None:
-    """Of the cause that it names."""
+    """Probability of the cause that it names."""
     return next((c.probability for c in alert.causes if (c.cause, c.part) == (alert.cause, alert.part)), None)

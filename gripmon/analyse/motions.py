@@ -1,7 +1,7 @@
-"""The camera's motions: when each began, how far it went, and what did it.
+"""The camera's motions: when each began, how far it went, and its cause.
 
-When it began is read from the frames themselves, and from change points of the whole recording: an alert comes later
-than what it is about.
+The beginning is determined from the frames and from the change points of the whole recording, since an alert comes
+later than the motion that it reports.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from gripmon.analyse.vectors import MIN_FRAMES
 from gripmon.model.records import AlertKind, Array, Severity
 from gripmon.record.recordings import Recording
 
-_SIDE_FRAMES = 15  # that a level is the median of
+_SIDE_FRAMES = 15  # for the median that gives a level
 _SETTLED = 0.95
-_RINGING_NS = 2 * SECOND_NS  # a mount that was knocked swings, about where it comes to rest
+_RINGING_NS = 2 * SECOND_NS  # a knocked mount swings about its final position
 _SURE_SIGMAS = 5.0  # standard deviations
 TITLES = {
     AlertKind.STEP: "The camera moved at once",
@@ -35,22 +35,22 @@ TITLES = {
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """The alerts on one motion: a step is one of its own, also within the history of one alert."""
+    """The alerts about one motion; a step is a separate motion, also within the history of one alert."""
 
     alerts: tuple[TimedAlert, ...]
     history: AlertHistory
-    until_ns: int  # the next one was noticed, the alert was cleared, or the recording ends
-    ended: bool  # by being cleared
+    until_ns: int  # when the next one was detected, the alert was cleared, or the recording ends
+    ended: bool  # because it was cleared
 
     @property
     def kind(self) -> AlertKind:
-        """A drift that once showed how it moves is that."""
+        """Step or creep if any of its alerts says so, otherwise drift."""
         kinds = [each.alert.kind for each in self.alerts]
         return next((k for k in (AlertKind.STEP, AlertKind.CREEP) if k in kinds), AlertKind.DRIFT)
 
 
 def motions_of(track: Track, histories: Sequence[AlertHistory], points: Sequence[ChangePoint]) -> list[Event]:
-    """An event for each step, creep or drift, in order of time."""
+    """One event per step, creep or drift, in order of time."""
     stretches = sorted(
         (s for history in histories if history.is_motion for s in _stretches(history, track)),
         key=lambda s: s.alerts[0].stamp_ns,
@@ -86,7 +86,7 @@ def _stretches(history: AlertHistory, track: Track) -> list[_Stretch]:
 
 
 def _stepped(before: TimedAlert, now: TimedAlert) -> bool:
-    """It reports a step that was not reported before."""
+    """Whether ``now`` reports a new step."""
     if now.alert.kind is not AlertKind.STEP:
         return False
     old_m, new_m = before.alert.tcp_shift_m, now.alert.tcp_shift_m
@@ -96,7 +96,7 @@ def _stepped(before: TimedAlert, now: TimedAlert) -> bool:
 
 
 def _is_new(event: Event, before: Event | None) -> bool:
-    """Not the step before it, which was only measured better."""
+    """Whether it is not the same step as before, only measured better."""
     if before is None or event.kind != AlertKind.STEP or before.kind != event.kind or before.alert_id != event.alert_id:
         return True
     return event.moved is None or event.moved.sigma_m is None or event.moved.size_m > _SURE_SIGMAS * event.moved.sigma_m
@@ -124,7 +124,7 @@ def _event(
         kind is AlertKind.DRIFT
         and (at_once := None if moved is None else _change_point_onset(points, onset, moved, _NEARLY_ALL)) is not None
     ):
-        # Noticed late, since nothing was certain at the time.
+        # Detected late, since nothing was certain at the time.
         onset, kind = at_once, AlertKind.STEP
         moved, moved_in_s, at_rest_ns = _size(track, onset, until_ns, kind)
     alert = explained(stretch.alerts)
@@ -163,14 +163,14 @@ def _onset(track: Track, stretch: _Stretch, not_before_ns: int, noise: Array) ->
 
 
 def _level_at(track: Track, stamp_ns: int) -> Array:
-    """(6,) median of the first frames measured from a time on."""
+    """(6,) median of the first frames measured from a given time on."""
     start = track.index_at(stamp_ns)
     frames = start + np.flatnonzero(track.measured[start : start + 20 * _SIDE_FRAMES])[:_SIDE_FRAMES]
     return np.median(track.against_first[frames], axis=0) if frames.size else np.zeros(6)
 
 
 def _size(track: Track, onset: Onset, until_ns: int, kind: AlertKind) -> tuple[Displacement | None, float | None, int]:
-    """How far it went, within which time (s), and when it had gone so far."""
+    """How far it went, in which time (s), and when it had settled."""
     measured = np.flatnonzero(track.measured)
     stamps = track.stamp_ns[measured]
     before = measured[stamps <= onset.earliest_ns][-_SIDE_FRAMES:]
@@ -183,7 +183,7 @@ def _size(track: Track, onset: Onset, until_ns: int, kind: AlertKind) -> tuple[D
         return None, None, onset.stamp_ns
     level = np.median(track.against_first[before], axis=0)
     vector = np.median(track.against_first[after], axis=0) - level
-    # The systematic part of the error is the same before and after: the sum is cautious.
+    # The systematic part of the error is the same before and after, so that the sum is conservative.
     sigma = np.hypot(np.median(track.sigma[before], axis=0), np.median(track.sigma[after], axis=0))
     moved = displacement(vector, sigma)
     if kind is AlertKind.STEP:
@@ -196,7 +196,7 @@ def _size(track: Track, onset: Onset, until_ns: int, kind: AlertKind) -> tuple[D
 
 
 def _alerted_size(stretch: _Stretch) -> Displacement | None:
-    """Against the reference, as the last alert that knows has it; without an uncertainty."""
+    """Shift from the reference by the last alert that has one; without an uncertainty."""
     for each in reversed(stretch.alerts):
         shift = each.alert.tcp_shift_m
         if shift is not None:
@@ -205,7 +205,7 @@ def _alerted_size(stretch: _Stretch) -> Displacement | None:
 
 
 _COMPARED_FRAMES = 5  # frames on either side of a step that are compared
-_BACK_NS = 5 * SECOND_NS  # a step is noticed within this time
+_BACK_NS = 5 * SECOND_NS  # a step is detected within this time
 _CLEAR, _LIKELY = 3.0, 2.0  # robust standard deviations of the axis that is farthest off
 
 
@@ -217,15 +217,15 @@ def robust_sigma(values: Array) -> Array:
 
 
 def frame_noise(track: Track) -> Array:
-    """(6,) standard deviation from one measured frame to the next, over the square root of two; robust."""
+    """(6,) robust standard deviation from one measured frame to the next, divided by the square root of two."""
     return robust_sigma(np.diff(track.against_first[track.measured], axis=0)) / np.sqrt(2.0)
 
 
 def step_onset(track: Track, noticed_ns: int, not_before_ns: int, noise: Array) -> Onset | None:
     """The place near ``noticed_ns`` where the frames on both sides differ most.
 
-    None if too few frames were measured there.  The time is that of the first frame that shows it; ``earliest_ns`` that
-    of the last one that doesn't.
+    None if too few frames were measured there.  Its time is that of the first frame after the step; ``earliest_ns`` is
+    that of the last one before it.
     """
     start = track.index_at(max(noticed_ns - _BACK_NS, not_before_ns))
     stop = track.index_at(noticed_ns + SECOND_NS)
@@ -240,8 +240,8 @@ def step_onset(track: Track, noticed_ns: int, not_before_ns: int, noise: Array) 
 
 
 def _first_nearer(values: Array, i: int) -> int:
-    """Medians are the same one or two frames off: of those around index ``i`` the first one that is nearer to the level
-    after than to that before.
+    """Refine index ``i``, which medians give to within a frame or two: the first frame near it that is closer to the
+    level after the step than to that before.
     """
     start = max(i - _COMPARED_FRAMES, 0)
     before = np.median(values[start:i], axis=0)
@@ -252,7 +252,7 @@ def _first_nearer(values: Array, i: int) -> int:
 
 
 def drift_onset(track: Track, noticed_ns: int, not_before_ns: int, level: Array, noise: Array) -> Onset | None:
-    """Back from ``noticed_ns`` to where the motion was still at its ``level`` (6,) before; None with too few frames."""
+    """The last time before ``noticed_ns`` at the ``level`` (6,) before the motion; None with too few frames."""
     start, stop = track.index_at(not_before_ns), track.index_at(noticed_ns + 1)
     frames = start + np.flatnonzero(track.measured[start:stop])
     if len(frames) < 2 * _COMPARED_FRAMES:
@@ -268,12 +268,12 @@ def drift_onset(track: Track, noticed_ns: int, not_before_ns: int, level: Array,
     return Onset(begun, min(earliest, begun), max(latest, begun), "frames")
 
 
-_NEAR_NS = SECOND_NS // 4  # an onset in the frames and its change point are no farther apart
-_ALIKE = (0.5, 2.0)  # times as large
-_NEARLY_ALL = 0.8  # of a drift's size: a step that makes up more of it is that drift
+_NEAR_NS = SECOND_NS // 4  # largest distance of an onset in the frames from its change point
+_ALIKE = (0.5, 2.0)  # ratio of sizes
+_NEARLY_ALL = 0.8  # fraction of a drift's size: a larger step is that drift
 
-_SHORT_FRAMES = 20_000  # of a recording that is searched as a whole
-_MOST_FRAMES = 60_000  # that are searched of a long one
+_SHORT_FRAMES = 20_000  # recordings up to this are searched as a whole
+_MOST_FRAMES = 60_000  # searched in a long recording
 _BLOCK_FRAMES = 30
 _MARGIN_NS = 20 * SECOND_NS
 
@@ -281,8 +281,8 @@ _MARGIN_NS = 20 * SECOND_NS
 def _change_point_onset(
     points: Sequence[ChangePoint], onset: Onset, moved: Displacement | None, least: float = _ALIKE[0]
 ) -> Onset | None:
-    """The change point that is this step's, if one lies where it began and is as large, at least a share ``least`` of
-    it; else None.
+    """The change point of this step, if there is one at its beginning with a similar size, at least ``least`` times as
+    large; else None.
     """
     near = [
         p for p in points if p.earliest_ns - _NEAR_NS <= onset.latest_ns and onset.earliest_ns <= p.latest_ns + _NEAR_NS
@@ -301,7 +301,7 @@ def _onset_of(point: ChangePoint) -> Onset:
 
 
 def unreported(points: Sequence[ChangePoint], events: Sequence[Event], limits: Limits) -> list[Event]:
-    """Steps past the limit that were never an alert: an event for each."""
+    """One event per step beyond the limit that no alert reported."""
     known = [(e.onset.earliest_ns, max(e.end_ns or 0, e.onset.latest_ns)) for e in events if e.kind in MOTIONS]
     out = []
     for point in points:
@@ -326,9 +326,8 @@ def unreported(points: Sequence[ChangePoint], events: Sequence[Event], limits: L
 
 
 def change_points_of(source: Recording, track: Track, alerted_ns: Sequence[int], limits: Limits) -> list[ChangePoint]:
-    """The change points of a recording, in order of time: of all of it, or, where it is long, of the minutes around
-    alerts (``alerted_ns``) and around every place where the level changes by what matters.  None where too little was
-    measured.
+    """The change points of a recording, in order of time: of all of it or, if it is long, around alerts
+    (``alerted_ns``) and around every significant change of the level.  None where too little was measured.
     """
     table = source.frames
     points: list[ChangePoint] = []
@@ -339,14 +338,14 @@ def change_points_of(source: Recording, track: Track, alerted_ns: Sequence[int],
         matrices = table.matrices() if matrices is None else matrices
         try:
             found = correct(track.stamp_ns[part], matrices[part], table.covariance[part], track.measured[part])
-        except ValueError:  # too few of the frames have a covariance that is one
+        except ValueError:  # too few frames have a valid covariance
             continue
         points += found.change_points
     return points
 
 
 def _parts(track: Track, alerted_ns: Sequence[int], limits: Limits) -> list[slice]:
-    """Frames that may hold change points."""
+    """Ranges of frames that may contain change points."""
     if len(track) <= _SHORT_FRAMES:
         return [slice(0, len(track))]
     measured = np.flatnonzero(track.measured)

@@ -1,6 +1,4 @@
-"""The report as a page: one HTML file that needs neither a network nor other files; with pictures before, at and after
-an event, and what was measured in them.
-"""
+"""The report as a self-contained HTML page, with pictures before, at and after an event and their measurements."""
 
 from __future__ import annotations
 
@@ -39,7 +37,7 @@ from gripmon.model.records import AlertKind, CauseWeight, LookNote, Origin
 from gripmon.record.recorder import to_8_bit
 from gripmon.record.recordings import Picture
 
-_MOST_CARDS = 20  # events of one recording that are shown with pictures and all alerts
+_MOST_CARDS = 20  # events of one recording shown with pictures and all alerts
 _MOST_ROWS = 400
 _AROUND_S = 3.0
 _WEB = resources.files("gripmon.analyse") / "web"
@@ -49,7 +47,7 @@ _RANK = {"error": 2, "warning": 1, "info": 0}
 def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] = lambda: None) -> bytes:
     """The whole page, UTF-8; ``step`` is called after each recording.
 
-    ``analysed`` belongs to ``report``'s recordings, in their order: pictures come from there.
+    ``analysed``: the recordings of ``report``, in the same order, for their pictures.
     """
     from plotly.offline import get_plotlyjs
 
@@ -85,7 +83,7 @@ def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] 
 
 
 def rendered(template: str, **values: Any) -> bytes:
-    """A page by its template, UTF-8, with the functions and the style that all of them have."""
+    """A page from its template, UTF-8, with the functions and the style that all pages share."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -105,7 +103,7 @@ def _title(report: Report) -> str:
 
 
 def _cards(events: Sequence[Event]) -> list[Event]:
-    """Motions, new references and what is worth a warning; if there are many, the gravest and largest of them."""
+    """Motions, new references and warnings; if there are many, the most severe and largest of them."""
     always = (*MOTIONS, AlertKind.RECALIBRATED, AlertKind.LOOK)
     worthy = [e for e in events if e.kind in always or (e.severity != "info" and e.kind != "gap")]
     worthy.sort(key=lambda e: (_RANK.get(e.severity, 0), 0.0 if e.moved is None else e.moved.size_m), reverse=True)
@@ -132,7 +130,7 @@ def _index(analysed: Analysed, seq: int) -> int:
 
 
 def _with_units(text: str) -> str:
-    """No line ends between a number and its unit."""
+    """Keep a number and its unit on one line."""
     return re.sub(r"(?<=[\d>]) (?=(?:±|mm|ms|s|min|h|d|%|\d)(?:\W|\d|$))", "\u00a0", re.sub("± ", "±\u00a0", text))
 
 
@@ -205,7 +203,7 @@ def _look_words(look: LookNote) -> str:
 
 
 def _around(event: Event) -> tuple[float, float]:
-    """Milliseconds, for the plot: the event with what surrounds it."""
+    """Range of the plot, ms: the event with a margin."""
     start_s = 1e-9 * event.onset.earliest_ns
     end_s = 1e-9 * max(event.end_ns or event.onset.latest_ns, event.onset.latest_ns)
     margin_s = max(_AROUND_S, 0.3 * (end_s - start_s))
@@ -219,7 +217,7 @@ _FUNCTIONS = (
 
 _WIDTH_PX = 560  # of a picture on the page
 _MARGIN = 0.18  # of the gripper's size, around it
-_SMALLEST = 0.35  # of the image's width: less is no picture of the scene
+_SMALLEST = 0.35  # of the image's width: a smaller part doesn't show the scene
 _JPEG_QUALITY = 82
 _SUBPIXEL_BITS = 4
 _BGR = tuple[int, int, int]
@@ -232,7 +230,7 @@ BEFORE: _BGR = (255, 255, 255)
 
 
 class JudgedPicture(NamedTuple):
-    """A picture, and whether what was measured in it was believed: else none of its points is shown as such."""
+    """A picture, and whether its measurement was used; otherwise all its points are shown as refused."""
 
     picture: Picture
     believed: bool
@@ -240,7 +238,7 @@ class JudgedPicture(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A picture as it stands on the page: ``uri`` is a JPEG in a data URI."""
+    """A picture on the page; ``uri`` is a JPEG in a data URI."""
 
     seq: int
     uri: str
@@ -251,8 +249,8 @@ class Shown:
 def cut_alike(
     pictures: Sequence[JudgedPicture | None], look: LookNote | msgspec.UnsetType = msgspec.UNSET
 ) -> tuple[Shown | None, ...]:
-    """Pictures in order of time, any may be None, cut to the same part of the image; into the later ones the gripper's
-    place in the first one is drawn, too, in white.  A ``look`` is drawn over them all in place of edge points.
+    """Pictures in order of time (any may be None), cropped to the same part of the image; the gripper's outline in the
+    first one is also drawn into the later ones, in white.  A ``look`` is drawn over all of them instead of edge points.
     """
     there = [each.picture for each in pictures if each is not None]
     if not there:
@@ -268,13 +266,13 @@ def cut_alike(
 
 
 def _corners(picture: Picture) -> Points:
-    """(n, 2) those that were measured and used."""
+    """(n, 2) corners that were measured and used."""
     found = [corner.uv_px for corner in picture.corners if corner.uv_px is not None and corner.used]
     return np.array(found, np.float32).reshape(-1, 2)
 
 
 def _box(points: Sequence[Points], width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom: around the gripper in the image's own proportions; the whole image without one."""
+    """Left, top, right, bottom around the gripper, in the image's aspect ratio; the whole image without a gripper."""
     finite = [p.reshape(-1, 2)[np.isfinite(p.reshape(-1, 2)).all(axis=1)] for p in points]
     joined = np.concatenate([*finite, np.empty((0, 2))])
     inside = joined[(joined >= 0.0).all(axis=1) & (joined[:, 0] < width) & (joined[:, 1] < height)]
@@ -306,7 +304,7 @@ def _shown(
     canvas = cv2.resize(crop, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
 
     def place(points: Points) -> NDArray[np.int32]:
-        """The first pixel's centre is 0 in both images."""
+        """The first pixel's centre is at 0 in both images."""
         moved = (points.reshape(-1, 2) - (left, top) + 0.5) * scale - 0.5
         moved = moved[np.isfinite(moved).all(axis=1) & (np.abs(moved) < 1e5).all(axis=1)]
         return np.round(moved * 2**_SUBPIXEL_BITS).astype(np.int32)
@@ -340,7 +338,7 @@ def _shown(
 def _draw_look(
     canvas: NDArray[Any], place: Callable[[Points], NDArray[np.int32]], look: LookNote, scale: float
 ) -> None:
-    """The blocks of pixels that were learnt: those that look as learnt green, those that look otherwise red."""
+    """The learned blocks of pixels: green where they look as learned, red where they differ."""
     half = round(0.5 * scale * look.block_px * 2**_SUBPIXEL_BITS)
     for number, place_px in enumerate(look.places_px):
         for x, y in place(np.array(place_px, np.float32)).tolist():

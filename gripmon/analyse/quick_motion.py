@@ -1,16 +1,14 @@
-"""Quick motion: where the pose changed within a frame or a few, a mount that vibrates, a camera that swings after a
-knock.  What is left of the frames after the slow motion is noise and quick motion.
+"""Quick motion: change points (the pose changes within one or a few frames), vibration of the mount, and swinging after
+a knock.  After the slow motion is subtracted, frames contain noise and quick motion.
 
-Changes are found from both sides and placed to the frame.
+Change points are localised to the frame, from the frames on both sides.  At each place the mean of the frames after it
+is compared with that of the frames before, over several lengths.  A steady creep (the running median of the
+differences) is subtracted, and the covariance of the rest is estimated from the recording, without its largest tenth;
+where all of it is larger for a while, the threshold rises.  The threshold keeps the probability of a false alarm in an
+hour's frames at :data:`FALSE_ALARMS_PER_HOUR` for errors with Student's distribution.
 
-At each place the mean of the frames after is compared with that of those before, over several lengths.  A steady creep
-is taken away (the running median of the differences), and the covariance of the rest is the recording's own, without
-its wildest tenth; where all of it is larger for a while, more is needed.  The threshold keeps the chance of
-one false alarm in an hour's frames at :data:`FALSE_ALARMS_PER_HOUR` for Student's errors.
-
-A line in the spectrum that stands out of the floor is a vibration, and is given back as far as it stands out (Wiener's
-filter, all six axes together at each frequency).  Where frames scatter far more than they claim for a while, the
-transform follows them.
+A line in the spectrum above the noise floor is a vibration, which a Wiener filter restores (all six axes together at
+each frequency).  Where frames scatter far more than their reported variance for a while, the transform follows them.
 """
 
 from __future__ import annotations
@@ -28,30 +26,30 @@ SIDE_FRAMES = (4, 8, 16)
 """Frames on each side."""
 FALSE_ALARMS_PER_HOUR = 0.02
 STUDENT_DOF, STUDENT_DOF_POWER = 12.0, 1.0 / 3.0
-"""Student's degrees of freedom of a frame's error before clutter, on simulated images, and the power of the number of
-frames with which those of a mean grow: as in the drift test.
+"""Student's degrees of freedom of a frame's error before cluttered backgrounds, on simulated images, and the power of
+the number of frames with which those of a mean grow, as in the drift test.
 """
 BURST_MARGIN = 2.5
-"""Factor on the threshold for changes that are no larger than what frames claim may explain: errors come in bursts (in
-streams simulated after images 2.2 was reached in 1.8 hours).
+"""Factor on the threshold for changes that the reported variance may explain, since errors come in bursts (2.2 was
+reached in 1.8 hours of streams simulated after images).
 """
 CALM_FRACTION = 0.9
-"""Part of the squared differences that is taken for noise, whatever happens in the rest."""
+"""Fraction of the squared differences, the smallest, that is taken as noise."""
 LOCAL_WINDOWS = 48
-"""Neighbouring lengths over which the local size of differences is the median's."""
+"""Half the window, in strides, of the median that gives the local size of differences."""
 MIN_CHANGE_CHI2 = 4.0
-"""Squared size, in units of what frames claim, below which a change may as well be a background's passing."""
+"""Squared size, in reported variances, below which a change may as well be a passing background."""
 SAME_CHANGE_FRAMES = 12
-"""Frames within which there is one change only."""
+"""Frames within which there is only one change."""
 PLACE_PROBABILITY = 0.95
 MIN_NOISE_VARIANCE = 1e-9
-"""Variance, in units of what frames claim, that is never doubted: frames may repeat one another to the bit."""
+"""Least noise variance, in reported variances: frames may be bitwise equal."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A change between the frames ``index - 1`` and ``index``; with :data:`PLACE_PROBABILITY` between the one before
-    ``first`` and ``last``.  ``excess``: how many times its threshold it reached.
+    """A change between the frames ``index - 1`` and ``index``; with :data:`PLACE_PROBABILITY` between the frame before
+    ``first`` and ``last``.  ``excess``: statistic over threshold.
     """
 
     index: int
@@ -61,13 +59,13 @@ class Found:
 
 
 def threshold(length: int, frames_per_hour: float, dof: int = 6) -> float:
-    """For squared distances of ``dof`` numbers, means of ``length`` frames."""
+    """Threshold for squared distances with ``dof`` degrees of freedom, of means of ``length`` frames."""
     chance = FALSE_ALARMS_PER_HOUR / max(frames_per_hour, 1.0) / len(SIDE_FRAMES)
     return float(dof * stats.f.isf(chance, dof, STUDENT_DOF * length**STUDENT_DOF_POWER))
 
 
 def differences(y: Array, length: int) -> Array:
-    """Means of the ``length`` rows from each place on less those before it (n, a); NaN at the ends."""
+    """Mean of the ``length`` rows from each place on minus that of those before it (n, a); NaN at the ends."""
     total = np.concatenate([np.zeros((1, y.shape[1])), np.cumsum(y, axis=0)])
     out = np.full(y.shape, np.nan)
     middle = total[length:-length]
@@ -83,7 +81,7 @@ def squared_changes(y: Array, length: int) -> Array:
     inside = slice(length, len(y) - length + 1)
     moved = differences(y, length)[inside]
     stride = max(length // 2, 1)
-    # Of a slow creep, which is the same all around; a running median of every few.
+    # The slow creep, estimated by a running median of a subset.
     window = 2 * LOCAL_WINDOWS + 1
     coarse = median_filter(moved[::stride], size=(min(window, len(moved[::stride]) | 1), 1), mode="nearest")
     moved = moved - np.repeat(coarse, stride, axis=0)[: len(moved)]
@@ -94,7 +92,7 @@ def squared_changes(y: Array, length: int) -> Array:
 
 
 def _mahalanobis(moved: Array) -> Array:
-    """By the covariance of the calm part, made right for normal numbers."""
+    """Squared distances by the covariance of the calm part, corrected for its truncation."""
     dof = moved.shape[1]
     covariance: Array = np.diag(np.median(moved * moved, axis=0) / CHI2_MEDIAN + MIN_NOISE_VARIANCE)
     for _ in range(6):
@@ -112,7 +110,7 @@ def _local_median(squared: Array, stride: int) -> Array:
 
 
 def find(y: Array, frames_per_hour: float) -> list[Found]:
-    """Changes in the frames ``y`` (n, a), whitened by what they claim."""
+    """Change points in the frames ``y`` (n, a), whitened by their reported covariance."""
     limits = [threshold(length, frames_per_hour, y.shape[1]) for length in SIDE_FRAMES]
     statistic = np.stack(
         [squared_changes(y, length) / limit for length, limit in zip(SIDE_FRAMES, limits, strict=True)]
@@ -126,7 +124,7 @@ def find(y: Array, frames_per_hour: float) -> list[Found]:
 
 
 def _peaks(statistic: Array, limit: float) -> list[int]:
-    """Highest places first, none near a higher one; in order of time."""
+    """Local maxima above ``limit``, none near a higher one, in order of time."""
     left = statistic.copy()
     above = np.flatnonzero(left > limit)
     taken: list[int] = []
@@ -138,13 +136,13 @@ def _peaks(statistic: Array, limit: float) -> list[int]:
 
 
 def _place(y: Array, index: int, length: int) -> Found | None:
-    """The likeliest place within a window's length: both sides have a mean of their own, errors are white."""
+    """The most likely place within a window: each side has its own mean, errors are white."""
     begin, end = max(index - 2 * length, 0), min(index + 2 * length, len(y))
     part = y[begin:end]
     candidates = np.arange(max(index - length, begin + 1), min(index + length, end - 1) + 1) - begin
     total = np.concatenate([np.zeros((1, y.shape[1])), np.cumsum(part, axis=0)])
     all_sum, count = total[-1], len(part)
-    # Within-group squares are what is left of the total by the split's between-group ones.
+    # The within-group sum of squares is the total minus the split's between-group one.
     spread = _own_noise(part)
     before, after = total[candidates], all_sum - total[candidates]
     explained = (before**2 / candidates[:, None] + after**2 / (count - candidates)[:, None]) / spread
@@ -170,19 +168,19 @@ SPECTRUM_FRAMES, SPECTRUM_STEP_FRAMES = 256, 64
 AVERAGED_SPECTRA = 32
 """Windows over which a spectrum is averaged."""
 FLOOR_BINS = (3, 12)
-"""Frequencies beside a line whose median is the floor; the higher one of both sides: the spectrum may fall steeply."""
+"""Bins beside a line whose median is the floor; the higher of both sides, since the spectrum may fall steeply."""
 LINE_OVER_FLOOR = 8.0
-"""Times the floor from which the largest of six parts is more than chance (of about twelve windows that don't overlap
-it is three times the floor on average).
+"""Multiple of the floor from which the largest of six eigenvalues is not due to chance (with about twelve windows that
+don't overlap it is three times the floor on average).
 """
 LOWEST_BIN = 5
 SWING_FRAMES = 12
 SWING_OVER_USUAL, SWING_OVER_CLAIMED = 8.0, 5.0
-"""How many times more than usual, and than they claim, frames scatter where the camera swings."""
+"""Variance of a swinging camera's frames, in multiples of the usual one and of the reported one."""
 
 
 def vibration(rest: Array) -> tuple[Array, Array]:
-    """The vibration in what is left (n, a) of frames, and the mean squares (n, a) of its error."""
+    """The vibration in the residuals (n, a) of frames, and the mean squares (n, a) of its error."""
     none = np.zeros_like(rest)
     if len(rest) < 2 * SPECTRUM_FRAMES:
         return none, none.copy()
@@ -206,7 +204,7 @@ def vibration(rest: Array) -> tuple[Array, Array]:
 
 
 def _stands_out(spectra: Array) -> tuple[Array, Array]:
-    """Wiener gains (f, a, a) by the windows' mean cross spectra, and what their error's power is (f, a)."""
+    """Wiener gains (f, a, a) from the windows' mean cross spectra, and the power of their error (f, a)."""
     count = spectra.shape[1]
     cross = np.einsum("fwi,fwj->fij", spectra, spectra.conj()) / count
     power = np.real(np.einsum("fii->fi", cross))
@@ -222,10 +220,10 @@ def _stands_out(spectra: Array) -> tuple[Array, Array]:
 
 
 def _floor(power: Array) -> Array:
-    """(f, a) what the spectrum is without lines."""
+    """(f, a) the spectrum without lines."""
     near, far = FLOOR_BINS
     size = far - near
-    # The median of what lies around a place ``offset`` away.
+    # The median around a place ``offset`` away.
     middle = median_filter(power, size=(size, 1), mode="nearest")
     offset = near + size // 2
     below = np.concatenate([np.repeat(middle[:1], offset, axis=0), middle[:-offset]])
@@ -234,7 +232,7 @@ def _floor(power: Array) -> Array:
 
 
 def swings(rest: Array, claimed: Array) -> Array:
-    """Variance (n, a) of quick motion where there is some, else 0; ``claimed`` (n, a) is that of the frames."""
+    """Variance (n, a) of swinging, 0 where there is none; ``claimed`` (n, a): reported variance of the frames."""
     squares = np.where(np.isfinite(rest), rest, 0.0) ** 2
     local = uniform_filter1d(squares, SWING_FRAMES, axis=0, mode="nearest")
     usual = np.median(local, axis=0)

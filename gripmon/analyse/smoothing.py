@@ -1,9 +1,10 @@
-"""The smoother, and what the recording itself shows of its errors, axis by axis in units of the reported variance.
+"""The off-line smoother, and the error variances estimated from the recording itself, per axis in units of the reported
+variance.
 
-Second differences ``y(t) - 2 y(t + l) + y(t + 2 l)`` hardly see a pose that stands still or creeps steadily.  Their
-mean squares at growing lags show how much of the error is new in each block, how much lasts for half a second, and how
-much for as long as a background stays.  What frames claim and none shows is kept as an error that never averages
-out.  How the pose itself wanders is the likeliest of a list.
+Second differences ``y(t) - 2 y(t + l) + y(t + 2 l)`` are almost insensitive to a pose that stands still or creeps
+steadily.  Their mean squares at growing lags show how much of the error is new in each block, how much lasts for half a
+second, and how much for as long as a background stays.  Reported variance that does not appear in them is kept as an
+error that never averages out.  The pose's own random walk is the most likely of a list of candidates.
 """
 
 from __future__ import annotations
@@ -21,37 +22,36 @@ Ints = NDArray[np.int64]
 
 MAX_LAG_S = 30.0
 TRIMMED_FRACTION, TRIMMED_MEAN = 0.98, 0.8735
-"""Part of the squares that is averaged (the rest may be wild), and the mean of that part for normal errors."""
+"""Fraction of the squares that is averaged (the rest may be outliers), and its mean for normal errors."""
 CHI2_MEDIAN = 0.4549
 MIN_WHITE_VARIANCE = 1e-4
 MIN_SLOW_VARIANCE = 0.3
-"""The error that lasts is believed to be as large as the reported one, and this at least, if differences show it."""
+"""Prior of the lasting error: the reported variance that is not found elsewhere, and at least this."""
 PRIOR_BACKGROUNDS = 3.0
-"""How many backgrounds the assumption counts as that all that is claimed, and seen nowhere else, lasts."""
+"""Weight, in backgrounds, of the assumption that all reported variance not found elsewhere lasts."""
 
 WANDER_VARIANCES = (1e-6, 1e-3, 1e-1)
 TURN_VARIANCES = ((1e-9, 1e-6), (1e-7, 1e-2), (1e-6, 1e2), (1e-4, 1e2), (1e-2, 1e2), (1.0, 1e2))
-"""Variances that are tried, a second: of x, of its rate together with that of the first rate (reported sd/s, squared).
-"""
+"""Candidate variances per second: of x; of its rate, together with that of the first rate ((reported sd/s)²)."""
 SLOW_FACTORS = (1.0, 2.5, 6.0)
 WANDER_STEP_COST, TURN_STEP_COST, SLOW_STEP_COST = 6.0, 1.5, 1.0
-"""What the logarithm of the likelihood has to grow by for each step to the next.  Backgrounds that change look like
-wandering, hardly like a rate.
+"""Required gain in log-likelihood for each step to the next candidate.  Changing backgrounds look like a random walk,
+hardly like a rate.
 """
 KINK_PLACES, MAX_KINKS, KINK_COST = 48, 6, 20.0
-"""Places where the rate may have become another one that are tried, how many are believed at most, and by how much the
-logarithm of the likelihood has to grow for one.
+"""Candidate places for a change of the rate, the largest number accepted, and the gain in log-likelihood that one
+needs.
 """
 LIKELIHOOD_STEP_S, MAX_LIKELIHOOD_STEPS = 2.0, 600
-"""Of the means that the likelihood is computed of: their length at least, in which a background passes to the next one,
-and how many at most.
+"""Least length of the means from which the likelihood is computed, the time of a change of background, and their
+largest number.
 """
 
 
 @dataclass(frozen=True)
 class Shares:
-    """(a,) each: variance of a block's own error, of that which lasts for :data:`MID_S`, for :data:`SLOW_S`; of a
-    single frame about its block; and what is claimed beyond that.
+    """(a,) each: variance of a block's own error, of the error that lasts for :data:`MID_S`, for :data:`SLOW_S`; of a
+    single frame about its block; and the reported variance beyond these.
     """
 
     white: Array
@@ -62,7 +62,7 @@ class Shares:
 
 
 def second_differences(time_s: Array, y: Array, segment: NDArray[np.int64], lag: int) -> Array:
-    """(k, a), only of evenly spaced triples within a segment."""
+    """(k, a) of evenly spaced triples within a segment."""
     first, middle, last = slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None)
     usual = lag * step_of(time_s)
     even = np.abs(time_s[middle] - time_s[first] - usual) < 0.2 * usual
@@ -73,7 +73,7 @@ def second_differences(time_s: Array, y: Array, segment: NDArray[np.int64], lag:
 
 
 def mean_squares(differences: Array, trimmed: bool) -> Array:
-    """(a,) of columns, steps and gross errors left out."""
+    """(a,) mean squares of the columns, robust against steps and gross errors."""
     squares = differences * differences
     if not trimmed:
         return np.asarray(np.median(squares, axis=0) / CHI2_MEDIAN)
@@ -82,7 +82,7 @@ def mean_squares(differences: Array, trimmed: bool) -> Array:
 
 
 def step_of(time_s: Array) -> float:
-    """Usual interval, s."""
+    """Median interval, s."""
     steps = np.diff(time_s)
     steps = steps[steps > 0.0]  # stamps may repeat
     return float(np.median(steps)) if len(steps) else 1.0
@@ -106,7 +106,7 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
         lag *= 2
     out = np.zeros((3, series))
     if len(rows) < 3:
-        # Too short to estimate: a half of what is claimed is new, the other half lasts.
+        # Too short to estimate: half of the reported variance is new, half lasts.
         out[0], out[2] = 0.25, 0.5
     else:
         for axis in range(series):
@@ -123,14 +123,14 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
 
 
 def _seen(lag_s: float, correlation_s: float) -> float:
-    """Variance of second differences over six, of an error with the variance 1."""
+    """Variance of second differences, divided by six, of an error with variance 1."""
     return 1.0 - 4.0 / 3.0 * float(np.exp(-lag_s / correlation_s)) + float(np.exp(-2.0 * lag_s / correlation_s)) / 3.0
 
 
 def likeliest_dynamics(
     time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
 ) -> tuple[Dynamics, list[float]]:
-    """How the pose wanders, for each axis by itself; and the times (s) at which its rate became another one."""
+    """The most likely random walk of the pose, per axis; and the times (s) at which its rate changes."""
     series = _Series(*_for_likelihood(time_s, y, variance, restarts, shares), shares.slow)
     kinks: list[float] = []
     dynamics, best = series.likeliest(kinks)
@@ -146,7 +146,7 @@ def likeliest_dynamics(
 def _for_likelihood(
     time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
 ) -> tuple[Array, Array, Array, Bools, Array]:
-    """Coarser means; what errors that last for less make of them is white."""
+    """Coarser means; errors that last for less become white noise in them."""
     group = max(round(LIKELIHOOD_STEP_S / step_of(time_s)), -(-len(time_s) // MAX_LIKELIHOOD_STEPS), 1)
     if group == 1 or len(time_s) < 8 * group:
         return time_s, y, variance, restarts, shares.mid
@@ -164,7 +164,7 @@ class _Series:
     slow: Array
 
     def likeliest(self, kinks_s: list[float]) -> tuple[Dynamics, float]:
-        """The best dynamics with these kinks, and the logarithm of its likelihood, costs taken off, of all axes."""
+        """The best dynamics with these kinks, and its log-likelihood minus costs, summed over axes."""
         tried, cost = _candidates()
         axes = self.y.shape[1]
         found = self._likelihoods(tried, self._kinks(kinks_s)[:, None]) - cost[:, None]
@@ -173,7 +173,7 @@ class _Series:
         return Dynamics(factor * self.slow, self.mid, wander, turn, rate), float(found[best, np.arange(axes)].sum())
 
     def likeliest_kink(self, kinks_s: list[float]) -> float:
-        """Where one more helps most, with rates that are nearly constant between."""
+        """The time of the one more kink that helps most, with nearly constant rates in between."""
         places = np.unique(np.linspace(1, len(self.time_s) - 2, KINK_PLACES).astype(int))
         tried = np.array([(WANDER_VARIANCES[0], turn, UNKNOWN_RATE_VARIANCE, 1.0) for turn in (1e-6, 1e-2)])
         kinks = np.repeat(self._kinks(kinks_s)[:, None], len(places), axis=1)
@@ -200,7 +200,7 @@ class _Series:
 
 
 def _candidates() -> tuple[Array, Array]:
-    """Rows of wander, turn, first rate's variance, factor on the slow error (c, 4), and what each costs (c,)."""
+    """Rows of wander, turn, first rate's variance, factor on the slow error (c, 4), and their costs (c,)."""
     rows, costs = [], []
     for i, wander in enumerate(WANDER_VARIANCES):
         for j, turn in enumerate(TURN_VARIANCES):
@@ -229,19 +229,19 @@ def _coarser(
 
 
 SLOW_S, MID_S = 15.0, 0.5
-"""Correlation times of the two errors: a background that stays for a while, and what passes behind the edges."""
+"""Correlation times of the two errors: a background that stays for a while, and details passing behind the edges."""
 
 UNKNOWN_VARIANCE = 1e7
 """Variance of an unknown state, in units of the reported variance."""
 
 UNKNOWN_RATE_VARIANCE = 100.0
-"""Likewise of a rate (1/s²)."""
+"""The same for a rate (1/s²)."""
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """All (a,), one value a series, in units of the reported variance: ``slow`` and ``mid`` of the errors, ``wander``
-    of x in a second, ``turn`` of its rate in a second (1/s²).  ``rate``: a priori variance of the rate (1/s²).
+    """All (a,), one value per series, in units of the reported variance: ``slow`` and ``mid`` of the errors, ``wander``
+    of x per second, ``turn`` of its rate per second (1/s²).  ``rate``: prior variance of the rate (1/s²).
     """
 
     slow: Array
@@ -262,9 +262,9 @@ class Smoothed:
 
 
 def smooth(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics) -> Smoothed:
-    """Series ``y`` (m, a) with the variances (m, a) of v, infinite where nothing was measured, at the times (m,).
+    """Smooth series ``y`` (m, a) with noise variances (m, a), infinite where nothing was measured, at the times (m,).
 
-    ``restarts`` (m,): x is another one from there on, all else stays; ``kinks`` (m,) or (m, a): its rate is.
+    ``restarts`` (m,): x is unknown again from there on; ``kinks`` (m,) or (m, a): its rate is.
     """
     forward = _filter(time_s, y, variance, restarts, kinks, dynamics)
     means, covariances = _backward(forward)
@@ -274,7 +274,7 @@ def smooth(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Boo
 def log_likelihood(
     time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics
 ) -> Array:
-    """(a,) natural logarithm of the series' probability density."""
+    """(a,) log-likelihood of the series."""
     return _filter(time_s, y, variance, restarts, kinks, dynamics).log_likelihood
 
 
@@ -308,7 +308,7 @@ def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bo
         covariance = move @ covariance @ move.T + added[k]
         out.predicted[k], out.predicted_covariance[k] = mean, covariance
         if any_known[k]:
-            # Of the state all but the rate is measured.
+            # The measurement is the sum of the state without the rate.
             towards = covariance[..., 0] + covariance[..., 2] + covariance[..., 3]
             expected = towards[:, 0] + towards[:, 2] + towards[:, 3] + noise[k]
             innovation = values[k] - (mean[:, 0] + mean[:, 2] + mean[:, 3])
@@ -324,7 +324,7 @@ def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bo
 
 
 def _steps(time_s: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics, series: int) -> tuple[Array, Array]:
-    """Transitions (m, 4, 4) and what they add (m, a, 4, 4)."""
+    """Transitions (m, 4, 4) and their process noise (m, a, 4, 4)."""
     steps = len(time_s)
     elapsed = np.diff(time_s, prepend=time_s[0])
     fade = np.exp(-elapsed[:, None] / np.array([SLOW_S, MID_S]))
@@ -349,7 +349,7 @@ def _steps(time_s: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics, ser
 
 def _backward(forward: _Forward) -> tuple[Array, Array]:
     means, covariances = forward.mean.copy(), forward.covariance.copy()
-    # A state without any spread at all can't be inverted, nor need it be corrected.
+    # The regularisation makes a covariance of zero invertible; such a state needs no correction.
     least = 1e-12 * np.eye(4)
     inverse = np.linalg.inv(forward.predicted_covariance + least)
     for k in range(len(means) - 2, -1, -1):

@@ -1,4 +1,4 @@
-"""An episode's transforms as few: one for each stretch in which the camera stood still against the gripper."""
+"""An episode's transforms, reduced to one per stretch in which the camera stood still relative to the gripper."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _is(text: str) -> Meta:
 
 
 class Motion(msgspec.Struct, frozen=True):
-    """What lies before a stretch."""
+    """The motion before a stretch."""
 
     stamp_ns: Annotated[int, _is("when the camera moved, most probably")]
     earliest_ns: Annotated[int, _is("it had not moved by then, in 95 of 100 cases")]
@@ -67,8 +67,8 @@ def stretches_of(
     """The stretches of one episode, in order; ``alerts`` with their stamps (ns); ``reasons`` (n,): why frames weren't
     valid.
 
-    The camera moved where the off-line smoother finds a change, and the transforms before and after it differ by
-    ``verify``'s test at :data:`CHANCE`; what doesn't differ is one stretch.  ValueError where too little was measured.
+    The camera moved where the off-line smoother finds a change point and the transforms before and after it differ by
+    ``verify``'s test at :data:`CHANCE`; otherwise it is one stretch.  Raises ValueError if too little was measured.
     """
     correction = correct_table(table, lambda: None)
     poses, measured = table.matrices(), ~table.refused & np.isfinite(table.cam_T_grip).all(axis=1)
@@ -93,7 +93,7 @@ def _next(correction: Correction, point: ChangePoint) -> int:
 
 
 def _used(valid: Bools, measured: Bools, part: slice) -> NDArray[np.intp]:
-    """The frames that a transform rests on: the valid ones, where there are none all that were measured."""
+    """The frames from which a transform is averaged: the valid ones, or if there are none all measured ones."""
     rows = np.flatnonzero(valid[part])
     return part.start + (rows if len(rows) else np.flatnonzero(measured[part]))
 
@@ -140,7 +140,7 @@ def _stretch(
     motion: Motion | None,
     reasons: Sequence[str | None],
 ) -> Stretch:
-    # Numbers differ from frame to frame, and so do what stands in brackets.
+    # Numbers differ from frame to frame, and so does text in brackets.
     why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in reasons[part] if reason)
     counted = "; ".join(f"{count} times: {reason}" for reason, count in why.most_common(3))
     plain = {
@@ -176,7 +176,7 @@ def _stretch(
 
 
 def _largest(values: Array) -> float | None:
-    """None where one isn't known: there is no bound then."""
+    """The largest; None if any is unknown, since there is no bound then."""
     return float(values.max()) if np.isfinite(values).all() else None
 
 
@@ -187,12 +187,13 @@ def mountings_of(
     tolerance_m: float = 0.0,
     tolerance_rad: float = 0.0,
 ) -> NDArray[np.int64]:
-    """Which transforms (n, 4, 4) with covariances (n, 6, 6) are of one mounting (n,): numbers from 0, in the order in
-    which they first occur.
+    """The mounting (n,) of each transform (n, 4, 4) with covariances (n, 6, 6): numbers from 0, in the order of their
+    first occurrence.
 
-    The most certain transform stands for its mounting: all belong to it that ``verify``'s test doesn't tell from it, or
-    that lie within both tolerances; of what is left again.  What agrees with several belongs to the first.  ``level``
-    is the chance that any of the n is parted from its mounting, so that each test has ``level / n``.
+    The most certain transform represents its mounting: all others belong to it that ``verify``'s test can't distinguish
+    from it, or that are within both tolerances; this is repeated for the rest.  A transform that agrees with several
+    belongs to the first.  ``level`` is the probability that any of the n is wrongly separated from its mounting, so
+    that each test has ``level / n``.
     """
     count = len(cam_T_grip)
     out = np.full(count, -1, np.int64)

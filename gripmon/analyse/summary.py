@@ -54,7 +54,7 @@ def cause_words(event: Event) -> str:
 
 
 def paragraph(report: RecordingReport) -> str:
-    """When did the camera move, how far, what did it, is it still so, what is affected, what was lost?"""
+    """When the camera moved, how far, why, whether it still is displaced, what is affected, what was lost."""
     who = f"{report.robot} / {report.camera}"
     if not report.running.frames:
         return f"{who}: no frame could be read, so nothing is known about its camera."

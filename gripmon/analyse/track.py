@@ -1,6 +1,6 @@
-"""The motion of the TCP through a recording, against the reference in force and against the first one; its clock,
-which must not run backwards; and its curves: of a long series the median and the bounds per piece of time, so that no
-outlier is lost and pages stay small.
+"""The motion of the TCP over a recording, relative to the reference in force and to the first one; a clock that doesn't
+run backwards; and the curves: for a long series the median and the bounds per piece of time, so that outliers remain
+visible and pages stay small.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _ALLOWED_SIGMA = 4.0  # as the monitor's own baseline
 class Track:
     """Arrays over the n frames of a recording; (n, 6) are TCP shift (m) and turn (rad) in camera axes.
 
-    ``measured`` (n,): the frame has a transform of its own, which isn't held.  ``against_reference`` is counted from
-    the reference that the frame names, ``against_first`` from the one in force at the beginning; both less that first
-    one's own error, if it is a configured one and the first frames show it within its uncertainty.  ``sigma`` (n, 6)
-    standard deviations.  NaN where nothing was measured.  ``error`` (6,) is what was subtracted.
+    ``measured`` (n,): the frame has its own transform, not a held one.  ``against_reference`` is relative to the
+    reference that the frame names, ``against_first`` to the one in force at the beginning; both minus that first
+    reference's own error, if it was configured and the first frames show an error within its uncertainty.  ``sigma``
+    (n, 6): standard deviations.  NaN where nothing was measured.  ``error`` (6,): what was subtracted.
     """
 
     seq: NDArray[np.int64]
@@ -47,11 +47,11 @@ class Track:
         return len(self.seq)
 
     def index_at(self, stamp_ns: int) -> int:
-        """Of the first frame at or after a time; n if there is none."""
+        """Index of the first frame at or after a time; n if there is none."""
         return int(np.searchsorted(self.stamp_ns, stamp_ns))
 
     def displacement(self, vectors: Array, of: NDArray[np.intp]) -> Displacement | None:
-        """Median over some frames (indices) of (n, 6) ``vectors``, with what a frame's transform is uncertain by."""
+        """Median of ``vectors`` (n, 6) over some frames (indices), with the median uncertainty of a frame."""
         of = of[self.measured[of]]
         if not of.size:
             return None
@@ -59,8 +59,8 @@ class Track:
 
 
 def displacement(vector: Array, sigma: Array) -> Displacement:
-    """From (6,) with its standard deviations (6,); that of a length is the one along its direction, the largest where
-    it has none.
+    """From a vector (6,) with standard deviations (6,); that of a length is along its direction, the largest if the
+    length is zero.
     """
     lengths, sigmas = [], []
     for part in (slice(0, 3), slice(3, 6)):
@@ -75,7 +75,7 @@ def displacement(vector: Array, sigma: Array) -> Displacement:
 def make_track(
     table: FrameTable, references: Sequence[ReferenceRecord], known_error: Sequence[float] | None = None
 ) -> Track:
-    """``known_error`` (6,): what the monitor itself took for the configured reference's error, where that is known."""
+    """``known_error`` (6,): the configured reference's error as estimated by the monitor, if known."""
     seq, stamp_ns, poses = table.seq, table.stamp_ns, table.cam_T_grip
     held = table.source == table.ORIGINS.index("held")
     measured = np.isfinite(poses).all(axis=1) & ~held
@@ -107,7 +107,7 @@ def _pose_of(
     measured: NDArray[np.bool_],
     mine: NDArray[np.bool_],
 ) -> Array:
-    """(7,) of a reference; of one that isn't recorded by its own frames: the turn only from the first of them."""
+    """(7,) of a reference; one that isn't recorded is inferred from its frames, the turn from the first ones only."""
     record = known.get((table.reference_ids[key[0]], key[1]))
     if record is not None:
         return np.array([*record.cam_T_grip.translation_m, *record.cam_T_grip.rotation_xyzw])
@@ -120,13 +120,13 @@ def _pose_of(
 
 
 def _between(from_poses: Array, to_poses: Array) -> Array:
-    """(m, 6) from (m, 7) each: ``perturbation_between`` of the geometry, for many."""
+    """(m, 6) from (m, 7) each: ``perturbation_between`` of the geometry, vectorised."""
     turn = Rotation.from_quat(to_poses[:, 3:]) * Rotation.from_quat(from_poses[:, 3:]).inv()
     return np.hstack([to_poses[:, :3] - from_poses[:, :3], turn.as_rotvec()])
 
 
 def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequence[float] | None) -> Array:
-    """(6,) the part of the shift that an inexact configured reference explains: no drift."""
+    """(6,) the part of the shift that is the configured reference's own error, and no drift."""
     if first is None or first.origin != "configuration" or not len(shifts):
         return np.zeros(6)
     if known_error is not None:
@@ -137,19 +137,19 @@ def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequen
 
 
 SECOND_NS = 1_000_000_000
-_LONGEST_NS = 7 * 86400 * SECOND_NS  # a pause within one run
+_LONGEST_NS = 7 * 86400 * SECOND_NS  # longest pause within one run
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Frames' numbers ``seq`` (n,), ascending, and the times ``stamp_ns`` (n,) that the report gives them."""
+    """Frame numbers ``seq`` (n,), ascending, and the times ``stamp_ns`` (n,) that the report uses."""
 
     seq: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
 
     def of(self, seq: int, stamp_ns: int) -> int:
-        """When something was that belongs to a frame, or else to no frame: then by its own stamp, brought among the
-        frames if it lies far outside.
+        """The time of an event: that of its frame, or if it belongs to none its own stamp, clipped to the frames' times
+        if it is far outside.
         """
         i = int(np.searchsorted(self.seq, seq))
         if i < len(self.seq) and self.seq[i] == seq:
@@ -163,10 +163,10 @@ class Clock:
 
 
 def straightened(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> tuple[Clock, tuple[str, ...]]:
-    """Where the clock was set back, or ahead by more than a week, time goes on as before by one frame's length; what
-    was done, in words.
+    """A clock in which time continues by one frame interval where the original was set back, or ahead by more than a
+    week; and what was corrected, in words.
     """
-    steps_ns = np.diff(stamp_ns.astype(np.float64))  # as integers those of absurd stamps would overflow
+    steps_ns = np.diff(stamp_ns.astype(np.float64))  # as integers, absurd stamps would overflow
     wrong = np.flatnonzero((steps_ns < 0.0) | (steps_ns > _LONGEST_NS))
     absurd = bool(len(stamp_ns)) and not 0 <= int(stamp_ns[0]) < 2**62
     if not wrong.size and not absurd:
@@ -194,18 +194,18 @@ def _clock_fault(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], wrong: Seq
 
 
 _PIECES = 1200
-_DETAIL_NS = 2 * SECOND_NS  # on either side of a motion every frame is shown
+_DETAIL_NS = 2 * SECOND_NS  # every frame is shown on either side of a motion
 _MOST_DETAIL = 2400  # frames
 
 
 def curves_of(table: FrameTable, track: Track, moments_ns: Sequence[int]) -> tuple[Curve, ...]:
-    """The TCP's way from the calibration at the beginning and from the reference in force, and that one's parts; with
-    every frame around some moments; and the bounds on errors, where the recording has them.
+    """The TCP's displacement from the calibration at the beginning and from the reference in force, the latter's
+    components, and the error bounds if recorded; with every frame around the given moments.
     """
     if not len(track):
         return ()
     cuts = pieces(track.stamp_ns, moments_ns)
-    # Of a length the largest along any axis: its own direction changes from frame to frame.
+    # For a length the largest sigma of any axis, since its direction changes from frame to frame.
     position, turn = (
         np.where(track.measured, track.sigma[:, part].max(axis=1), np.nan) for part in (slice(3), slice(3, 6))
     )
@@ -224,8 +224,8 @@ def curves_of(table: FrameTable, track: Track, moments_ns: Sequence[int]) -> tup
 
 
 def pieces(stamp_ns: NDArray[np.int64], moments_ns: Sequence[int]) -> NDArray[np.intp]:
-    """(k,) ascending indices where a new piece begins, the first 0: every frame, if there are few; else equal times,
-    with every frame around some moments, and a new piece after every pause.
+    """(k,) ascending indices where pieces begin, the first 0: every frame if there are few; otherwise equal times, with
+    every frame around the given moments, and a new piece after every pause.
     """
     n = len(stamp_ns)
     if n <= 2 * _PIECES:

@@ -1,7 +1,7 @@
-"""A recording as whitened vectors about one pose, the frames that are plainly wrong left out; poses as vectors
-``xi = (rho, omega)`` about one of them, and back; means of blocks of frames, and what lies between them.
+"""A recording as whitened vectors about one pose, without outlier frames; poses as vectors ``xi = (rho, omega)`` about
+one of them, and back; means of blocks of frames, and interpolation between them.
 
-About the pose ``T0`` a pose T is ``t = t0 + rho``, ``R = exp(omega) R0``.  The error that a covariance speaks of is
+About the pose ``T0`` a pose T is ``t = t0 + rho``, ``R = exp(omega) R0``.  The error that a covariance describes is
 applied after that; to first order ``exp(e) exp(omega) = exp(omega + J(omega)^-1 e)`` with the left Jacobian J of SO(3)
 (Solà, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, eq. 145).
 """
@@ -21,18 +21,18 @@ from gripmon.model.records import Array
 
 MIN_FRAMES = 3
 MAX_GAP_S = 3600.0
-"""Beyond, everything may have happened: more time in a gap means no more, and overflows."""
+"""Longer gaps count as this long: anything may have happened, and longer ones overflow."""
 MAX_DISTANCE_M = 1e6
-"""A transform that reaches farther is none, and its squares overflow."""
+"""Transforms with a larger translation are rejected; their squares overflow."""
 MIN_COVARIANCE_DIAGONAL, MIN_CORRELATION_EIGENVALUE = 1e-24, 1e-9
-"""Of a covariance (m², rad²: a picometre, no camera's) and of its correlations: below, it is taken for none."""
+"""Least diagonal of a covariance (m², rad²: a picometre) and least eigenvalue of its correlations."""
 WILD_SIGMAS, WILD_WINDOW_FRAMES, WILD_MAX_FRAMES = 8.0, 9, 2
-"""A frame farther off the median of its window is wrong if no more than this many in a row are, and few are around."""
+"""A frame farther than this from its window's median is an outlier if at most this many in a row are."""
 
 
 @dataclass
 class Run:
-    """A recording in whitened vectors: ``y`` (n, 6), NaN where nothing was measured, with the variances ``claimed``."""
+    """A recording in whitened vectors: ``y`` (n, 6), NaN where not measured; ``claimed``: reported variances."""
 
     time_s: Array
     origin_T: Array
@@ -44,7 +44,7 @@ class Run:
 
     @property
     def frame_s(self) -> float:
-        """Usual interval of the frames that were measured."""
+        """Median interval of the measured frames, s."""
         return step_of(self.time_s[self.usable])
 
 
@@ -108,7 +108,7 @@ def are_definite(covariance: Array) -> Bools:
 
 
 def wild_frames(run: Run) -> Bools:
-    """Frames that lie off their neighbours on both sides, alone or in pairs."""
+    """Outliers: frames far from their neighbours on both sides, singly or in pairs."""
     out = np.zeros(len(run.y), bool)
     good = np.flatnonzero(run.usable)
     if len(good) < 2 * WILD_WINDOW_FRAMES:
@@ -120,7 +120,7 @@ def wild_frames(run: Run) -> Bools:
     far = (np.abs(off) > WILD_SIGMAS * np.maximum(usual, local)).any(axis=1)
     far &= (off * off / run.claimed[good]).max(axis=1) > 4.0
     crowd = np.convolve(far, np.ones(17), mode="same")
-    # A short swing is motion; a frame by itself is not.
+    # Several frames in a row are motion; a single one is not.
     out[good[far & (crowd <= WILD_MAX_FRAMES)]] = True
     return out
 
@@ -146,7 +146,7 @@ def covariances_to_vectors(covariance: Array, vectors: Array) -> Array:
 
 
 def covariances_to_poses(covariance: Array, vectors: Array) -> Array:
-    """The way back."""
+    """The inverse of :func:`covariances_to_vectors`."""
     return _mapped(covariance, left_jacobians(vectors[:, 3:]))
 
 
@@ -158,7 +158,7 @@ def _mapped(covariance: Array, turn: Array) -> Array:
 
 
 GAP_BLOCKS = 4.0
-"""Times the usual interval of blocks from which there is a gap, which gets places of its own."""
+"""Multiple of the median block interval that makes a gap, in which additional states are placed."""
 MAX_GAP_PLACES = 200
 
 
@@ -183,11 +183,11 @@ class Blocks:
         self._swing = np.add.reduceat(swing, self._at, axis=0) / self._count[:, None]
 
     def variance(self, white: Array) -> Array:
-        """(m, 6) of the blocks' own errors, ``white`` (6,) being that of a usual block."""
+        """(m, 6) of the blocks' own errors; ``white`` (6,): that of a full block."""
         return np.maximum(white * self._size * self._noise, 1e-6) + self._swing
 
     def frame_variance(self) -> Array:
-        """(6,) of frames about the mean of their block, wild ones left out."""
+        """(6,) of frames about the mean of their block, robust against outliers."""
         if self._size == 1:
             return np.zeros(6)
         number = np.repeat(np.arange(len(self._at)), self._count.astype(int))
@@ -197,7 +197,7 @@ class Blocks:
 
 
 def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
-    """Times with more of them in long gaps, and before the first and after the last block; where the blocks are."""
+    """Block times with additional ones in long gaps and beyond both ends; and the indices of the blocks in them."""
     usual = step_of(time_s)
     extra = []
     edges = np.concatenate([[min(run.time_s[0], time_s[0])], time_s, [max(run.time_s[-1], time_s[-1])]])
@@ -213,7 +213,7 @@ def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
 
 
 def at(time_s: Array, segment: Ints, smoothed: Smoothed, wanted_s: Array, wanted_segment: Ints) -> tuple[Array, Array]:
-    """x (k, 6) and its variance (k, 6) at any times, from the places of the same segment before and after."""
+    """x (k, 6) and its variance (k, 6) at any times, from the neighbouring states of the same segment."""
     first = np.searchsorted(segment, wanted_segment, side="left")
     last = np.searchsorted(segment, wanted_segment, side="right") - 1
     after = np.clip(np.searchsorted(time_s, wanted_s, side="left"), first, last)
