@@ -1,4 +1,4 @@
-"""Keeping the monitor's state: at once what others will rest on, soon what only has to be remembered."""
+"""Writing the monitor's state: immediately what messages will depend on, the rest in another thread."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from gripmon.judge.statefile import StateFile
 from gripmon.model.records import MonitorState, ReferenceRecord
 
 RETRY_S = 1.0
-"""Pause before a state that could not be written is tried again."""
+"""Pause before a failed write of the state is retried."""
 
 
 class StateKeeper:
-    """Writes states, the newest wins.  ``None`` in place of a sink: keeps nothing."""
+    """Writes states, of which the newest wins.  Without a sink (None) nothing is written."""
 
     def __init__(self, sink: StateFile | None) -> None:
         self._sink = sink
-        self._writing = threading.Lock()  # held while a state is written: an older one never replaces a newer one
+        self._writing = threading.Lock()  # held during a write, so that an older state never replaces a newer one
         self._changed = threading.Condition()  # guards what follows
         self._waiting: MonitorState | None = None
-        self._newest: MonitorState | None = None  # that was given to keep
+        self._newest: MonitorState | None = None  # passed to this keeper
         self._closing = False
         self._thread: threading.Thread | None = None
 
     @property
     def failure(self) -> str:
-        """Why the state is not kept just now; empty if it is."""
+        """Why the state can't be written at present; empty if it can."""
         return "" if self._sink is None else self._sink.failure
 
     def now(self, state: MonitorState) -> None:
-        """Keep a state before this returns: it takes as long as the disk does.  A fault is in :attr:`failure`, and the
-        state is tried again.
+        """Write a state before this returns, which takes as long as the disk does.  A fault is in :attr:`failure`, and
+        the write is retried.
         """
         if self._sink is None:
             return
@@ -45,10 +45,11 @@ class StateKeeper:
             self.soon(state)
 
     def references(self, references: tuple[ReferenceRecord, ...]) -> str:
-        """Keep a chain of references before its newest gets into force; why that can't be, empty if it is done.
+        """Write a chain of references before the newest takes effect; returns why it failed, empty if it succeeded.
 
-        What can't be kept is not tried again: the caller goes without.  The rest of the state is the newest known, but
-        a proposal, which a new reference withdraws, and the look, which belonged to the reference before.
+        A failed write is not retried: the caller does without the new reference.  The rest of the state is the newest
+        known, without a proposal, which a new reference withdraws, and without the look, which belonged to the previous
+        reference.
         """
         if self._sink is None:
             return ""
@@ -63,7 +64,7 @@ class StateKeeper:
         return ""
 
     def soon(self, state: MonitorState) -> None:
-        """Keep a state in another thread."""
+        """Write a state in another thread."""
         if self._sink is None:
             return
         with self._changed:
@@ -74,7 +75,7 @@ class StateKeeper:
                 self._thread.start()
 
     def close(self) -> None:
-        """Keep what still waits, once, and let go of the sink."""
+        """Try once to write a pending state, and close the sink."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -101,7 +102,7 @@ class StateKeeper:
         with self._writing:
             with self._changed:
                 state, self._waiting = self._waiting, None
-            if state is None:  # overtaken by a newer one that was written at once
+            if state is None:  # superseded by a newer one that was written directly
                 return True
             done = self._sink.write(state)
             if not done:

@@ -1,4 +1,4 @@
-"""What the loop needs of those around it, which tests stand in for."""
+"""The loop's interfaces to its surroundings, which tests replace."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class JawFeed(Protocol):
-    """Where the jaw opening at a frame's time comes from when the frames don't bring it, e.g.
+    """Provides the jaw opening at a frame's time if the frames don't contain it, e.g.
     :class:`gripmon.io.publish.inputs.ZenohJaw`.
     """
 
@@ -18,11 +18,11 @@ class JawFeed(Protocol):
 
 @dataclass(frozen=True)
 class Reports:
-    """What the state message says of things that the loop doesn't see itself; asked in its thread, at once answered.
+    """Values for the state message that the loop doesn't know itself; called in its thread, and must not block.
 
-    ``faults`` say what is wrong in a few words, empty or None while nothing is; ``unsent`` counts transforms that could
-    not be sent, ``malformed`` messages received that were none; ``alert_limit_m`` as configured; ``others`` are the ids
-    of other monitors of this name.
+    ``faults`` return what is wrong in a few words, empty or None while nothing is; ``unsent`` counts transforms that
+    could not be sent, ``malformed`` invalid messages received; ``alert_limit_m`` as configured; ``others``: ids of
+    other monitors with this name.
     """
 
     faults: Sequence[Callable[[], str | None]] = ()

@@ -1,4 +1,4 @@
-"""A recorded run as the input of a replay, and the one file that a replay records into."""
+"""A recorded run as the input of a replay, and the recording of a replay in one file."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from gripmon.record.recorder import Recorder, make_scene
 from gripmon.record.write import open_recorder
 
 RECORDING_PATIENCE_S = 30.0
-"""Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""
+"""Input that can wait is faster than any camera: it waits this long for the recording before a frame is dropped (s)."""
 
 
 class RecordedRun:
-    """What was recorded, and how a monitor goes through it again: with ``config``, beginning with ``state`` (None: with
-    the configured reference).  ``notes``: what is missing, one line each.
+    """A recorded run, to be processed again with ``config``, starting from ``state`` (None: the configured reference).
+    ``notes``, one line each: what is missing.
     """
 
     def __init__(self, paths: Sequence[Path], config: Config | None, opened: contextlib.ExitStack) -> None:
-        """``config`` None: the recorded configuration.  What is opened is closed with ``opened``.
+        """``config`` None: the recorded configuration.  What this opens is closed by ``opened``.
 
         Raises :class:`InputError`, :class:`NoResultError`.
         """
@@ -55,7 +55,7 @@ class RecordedRun:
         self._note_what_is_missing()
 
     def compare(self, record: FrameRecord) -> None:
-        """Count what is decided now, about the frame that the source gave last, against what was then."""
+        """Compare the record of the frame that the source returned last with the recorded one."""
         then = self.source.record
         assert then is not None, "every replayed frame has a record"
         unbounded = then.protection is None and record.protection is not None
@@ -63,7 +63,7 @@ class RecordedRun:
         self._differences.add(then, as_recorded_before_bounds(record) if unbounded else record)
 
     def summary(self) -> str:
-        """What differs from the recording."""
+        """How the replay differs from the recording."""
         lost, damaged = self.source.passed_over, self.source.images_damaged
         unread = f"; {lost} more could no longer be read" if lost else ""
         unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
@@ -75,9 +75,9 @@ class RecordedRun:
 
     @contextmanager
     def compared_in(self, path: Path) -> Iterator[ComparedRecorder]:
-        """A recorder into one file that shows what was recorded and what is replayed, overlaid.
+        """A recorder into one file that overlays the recorded run and the replay.
 
-        Raises :class:`InputError` where ``path`` can't be written, :class:`NoResultError` where writing fails later.
+        Raises :class:`InputError` if ``path`` can't be written, :class:`NoResultError` if writing fails later.
         """
         config, reference = self.config, self.config.reference
         if path.resolve() in {source.resolve() for source in self.source.paths}:
@@ -113,7 +113,7 @@ class RecordedRun:
             raise InputError(f"{self.name}: {wrong}; one of this version", "config") from None
 
     def _begin(self, config: Config) -> tuple[Config, MonitorState | None]:
-        """Where the monitor starts from: the state then, if that was about this calibration."""
+        """Configuration and initial state of the monitor: the recorded state, if it is of the same calibration."""
         source = self.source
         state = None if source.configuration is None else source.configuration.start
         first, recorded = source.reference, self.recorded_config
@@ -149,12 +149,12 @@ class RecordedRun:
 
 
 def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
-    """The record as a version wrote it that stated no bounds, and a reason only where nothing was measured."""
+    """The record as written by versions without bounds, which gave a reason only where nothing was measured."""
     return msgspec.structs.replace(record, protection=None, reason=None if record.measured else record.reason)
 
 
 def _limits(config: Config | None) -> Limits | None:
-    """Those that a configuration sets; what a monitor learns of a stream is not among them."""
+    """The configured limits, without what a monitor learns from a stream."""
     if config is None:
         return None
     policy, nothing = config.settings.monitor.policy, (0.0,) * 6
@@ -167,13 +167,13 @@ def _limits(config: Config | None) -> Limits | None:
 def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
     """A recorder into exactly one file, finished when the context ends; the null recorder without a path.
 
-    Raises :class:`InputError` where the file can't be made, :class:`NoResultError` at the end where writing failed:
-    what was there before stays then.
+    Raises :class:`InputError` if the file can't be created, :class:`NoResultError` at the end if writing failed; an
+    earlier file then stays.
     """
     if path is None:
         yield Recorder()
         return
-    # One file, whatever its length.
+    # One file of any length.
     settings = msgspec.structs.replace(
         config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
     )
@@ -199,13 +199,13 @@ def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
             yield recorder
         finally:
             recorder.close(timeout_s=60.0)
-            # A disk that failed for a moment has left a whole file of the frames after it.
+            # After a temporary disk failure there is a complete file with only the later frames.
             missing = _missing(recorder)
             keep_whole(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
 
 
 def _missing(recorder: Recorder) -> str | None:
-    """What is not in a recording that is to hold all; None if nothing is missing."""
+    """What is missing from a recording that must be complete; None if nothing is."""
     if recorder.dropped:
         return f"{recorder.dropped} frames are missing"
     return f"{recorder.images_dropped} images are missing" if recorder.images_dropped else None
@@ -213,7 +213,7 @@ def _missing(recorder: Recorder) -> str | None:
 
 @contextmanager
 def _silent_recording() -> Iterator[None]:
-    """What a daemon logs of its recording while it goes on, a replay reports in one line when it is over."""
+    """Suppress the recorder's log lines, which a replay replaces by one line at its end."""
     logger = logging.getLogger("gripmon.record")
     propagates, silent = logger.propagate, logging.NullHandler()
     logger.addHandler(silent)

@@ -1,4 +1,4 @@
-"""What a service manager reads of a daemon: its log, and whether it is ready, alive, or about to stop."""
+"""A daemon's interface to a service manager: its log, and whether it is ready, alive, or stopping."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import msgspec
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line: ``time`` (Unix time, s), ``level``, ``logger``, ``text``; of errors also ``trace``."""
+    """One JSON object per line: ``time`` (Unix time, s), ``level``, ``logger``, ``text``; for errors also ``trace``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as one line."""
@@ -28,8 +28,8 @@ class JsonLines(logging.Formatter):
 
 
 def log_to_stderr(*, verbose: bool = False, as_json: bool = False) -> None:
-    """Let the ``gripmon`` loggers write lines on stderr, for people or ``as_json``; ``verbose`` adds tracebacks of
-    survived errors.
+    """Let the ``gripmon`` loggers write lines to stderr, as text or ``as_json``; ``verbose`` adds tracebacks of
+    recovered errors.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -40,14 +40,14 @@ def log_to_stderr(*, verbose: bool = False, as_json: bool = False) -> None:
 
 
 class ServiceManager:
-    """systemd, or whoever else set ``NOTIFY_SOCKET``, by the datagrams of sd_notify(3); without one nothing happens.
+    """Notifies systemd, or any other setter of ``NOTIFY_SOCKET``, by sd_notify(3); does nothing without one.
 
-    Who asks for a sign of life (``WATCHDOG_USEC``) gets four in the time that he waits, of the thread that calls
-    :meth:`alive`: if that hangs, the service is started again.
+    With a watchdog (``WATCHDOG_USEC``), four signs of life are sent per period from the thread that calls
+    :meth:`alive`: if that hangs, the service is restarted.
     """
 
     def __init__(self) -> None:
-        """Raises nothing: a manager that can't be reached is none."""
+        """Raises nothing: an unreachable manager is ignored."""
         address = os.environ.get("NOTIFY_SOCKET", "")
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         waits_us = os.environ.get("WATCHDOG_USEC", "")
@@ -56,11 +56,11 @@ class ServiceManager:
         self._due_s = -math.inf if math.isfinite(self._period_s) else math.inf
 
     def ready(self) -> None:
-        """The start is over: frames are waited for."""
+        """The start-up is complete."""
         self._send("READY=1")
 
     def alive(self, now_s: float) -> None:
-        """The loop goes on; ``now_s`` is monotonic time."""
+        """The loop is running; ``now_s``: monotonic time."""
         if now_s >= self._due_s:
             self._due_s = now_s + self._period_s
             self._send("WATCHDOG=1")
@@ -70,7 +70,7 @@ class ServiceManager:
         self._send(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """The end has begun."""
+        """The shutdown has begun."""
         self._send("STOPPING=1")
 
     def _send(self, text: str) -> None:

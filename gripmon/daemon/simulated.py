@@ -1,4 +1,4 @@
-"""What is simulated: images with the truth beside them, and the whole daemon on a simulated wrist camera."""
+"""Simulation: images with ground truth, and the whole daemon on a simulated wrist camera."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _TRACKING = ("tracking", "drifting")
 
 
 class SimulatedImages(NamedTuple):
-    """The folder, a configuration that fits (None where calibrations come first), and how many images there are."""
+    """The folder, a matching configuration (None if calibrations come first), and the number of images."""
 
     folder: Path
     config: Path | None
@@ -67,16 +67,17 @@ def simulate_images(
     fps: float | None = None,
     step: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> SimulatedImages:
-    """Write one PNG a frame, ``timestamps.csv``, ``truth.jsonl`` (:class:`gripmon.simulate.FrameTruth`) and
+    """Write one PNG per frame, ``timestamps.csv``, ``truth.jsonl`` (:class:`gripmon.simulate.FrameTruth`) and
     ``config.yaml`` with ``gripper.yaml`` to a new or empty folder.
 
-    ``scenario`` is a built-in name (:data:`gripmon.simulate.SCENARIO_NAMES`), which ``duration_s`` (s) and ``fps``
-    (1/s) stretch, or a YAML file; or what a calibration starts from (:data:`gripmon.simulate.CALIBRATION_KINDS`):
-    single images with ``truth.json``.  "work" and these come without a configuration: the calibrations make it.
-    ``config`` has camera, gripper and calibration; None: those of the demo.  ``step`` is called after each image with
-    how many are done, of how many.  The same seed gives the same images.
+    ``scenario``: a built-in name (:data:`gripmon.simulate.SCENARIO_NAMES`), which ``duration_s`` (s) and ``fps`` (1/s)
+    adapt, or a YAML file; or the input of a calibration (:data:`gripmon.simulate.CALIBRATION_KINDS`): single images
+    with ``truth.json``.  For "work" and these there is no configuration, which results from the calibrations.
+    ``config``: camera, gripper and calibration; None: those of the demo.  ``step`` is called after each image with the
+    number of images done and in total.  The same seed gives the same images.
 
-    Raises :class:`InputError`: an unknown scenario, one that doesn't fit the configuration, a folder that isn't empty.
+    Raises :class:`InputError` for an unknown scenario, one that doesn't fit the configuration, or a folder that isn't
+    empty.
     """
     out = Path(out)
     config = load_config(builtin_config("demo.yaml"), check_source=False) if config is None else config
@@ -135,7 +136,7 @@ def _make_empty(path: Path) -> None:
 
 
 def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
-    """The command that takes these images of ``gripper``."""
+    """The command that uses these images of ``gripper``."""
     out = str(made.folder)
     if made.config is not None:
         return shlex.join(["gripmon", "replay", out, "--config", str(made.config), "--out", f"{out}.jsonl"])
@@ -155,7 +156,7 @@ def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
 
 
 def _config_text(config: Config, scenario: Scenario, seed: int) -> str:
-    """A configuration for the sequence, commented, in the form of the hand-written ones."""
+    """A commented configuration for the sequence, like the hand-written ones."""
     reference = config.reference.cam_T_grip
     jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
     return f"""\
@@ -178,14 +179,14 @@ source:
 
 
 class Latency(msgspec.Struct, frozen=True):
-    """From a frame to its published transform (ms); None without frames."""
+    """Latency from a frame to its published transform (ms); None without frames."""
 
     median: float | None
     p99: float | None
 
 
 class DemoSummary(msgspec.Struct, frozen=True):
-    """How the demo went: what ``summary.json`` holds."""
+    """The result of the demo, as in ``summary.json``."""
 
     frames: int
     frames_dropped: int
@@ -198,9 +199,9 @@ class DemoSummary(msgspec.Struct, frozen=True):
 
 
 def demo_config(duration_s: float, *, fps: float | None = None, seed: int = 1, viewed: bool = False) -> Config:
-    """The shipped configuration, with the length asked for and ports that are free.
+    """The shipped configuration with the given duration and free ports.
 
-    Raises :class:`InputError` for what no scenario can have.
+    Raises :class:`InputError` for values that no scenario can have.
     """
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     settings = config.settings
@@ -218,10 +219,10 @@ def demo_config(duration_s: float, *, fps: float | None = None, seed: int = 1, v
 
 
 class Demo:
-    """One run: a simulated camera, the daemon, and a client on the network that counts what it receives."""
+    """One run of the demo: a simulated camera, the daemon, and a client that counts the messages it receives."""
 
     def __init__(self, config: Config) -> None:
-        """``config`` by :func:`demo_config`.  Raises :class:`InputError` if its scenario can't be."""
+        """``config``: from :func:`demo_config`.  Raises :class:`InputError` if its scenario is impossible."""
         assert isinstance(config.settings.source, SimulatedSettings), "the shipped demo.yaml has a simulated camera"
         self._config = config
         try:
@@ -231,7 +232,7 @@ class Demo:
 
     @property
     def frame_count(self) -> int:
-        """How many frames the scenario has."""
+        """Number of frames of the scenario."""
         return self._simulator.frame_count
 
     def run(
@@ -279,7 +280,7 @@ class _Receiver(AbstractContextManager["_Receiver"]):
         self._client: Client | None = None
 
     def connect(self) -> None:
-        """Join the network and wait until the monitor is seen there."""
+        """Join the network and wait until the monitor appears."""
         from gripmon.client import Client
 
         settings = self._config.settings

@@ -28,12 +28,12 @@ from gripmon.teach.mounts import (
 )
 
 _MOST_MOUNTS = 20000
-_DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), (0.0, 75.0, 6)  # first, last, count: times the present one, degrees
+_DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), (0.0, 75.0, 6)  # first, last, count: multiples of the present distance, degrees
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The mounts of a grid as they were tried, and the present one; ``at_px``: where the TCP shows in all of them."""
+    """The evaluated mounts of a grid, and the present one; ``at_px``: position of the TCP in all images."""
 
     config: Config
     grid: Grid
@@ -54,11 +54,11 @@ def make_grid(
     at_px: tuple[float, float] | None = None,
 ) -> tuple[Grid, tuple[float, float]]:
     """All combinations of ``ranges``: ``distance`` (m), ``tilt``, ``side``, ``roll`` (degrees), see :class:`Mount`, and
-    ``focal`` (px) or ``fov`` (degrees over the image's width); in place of the last two ``lenses``, files of calibrated
-    cameras.  What isn't there stays as it is, but for distance and tilt.  ``at_px``: where the TCP shows in the present
-    camera's image, which is given back, too; None: as now.
+    ``focal`` (px) or ``fov`` (degrees over the image's width), or instead of these ``lenses``, files of calibrated
+    cameras.  Missing ranges keep the present value, except distance and tilt, which have default ranges.  ``at_px``:
+    position of the TCP in the present camera's image (None: as now), which is also returned.
 
-    Raises :class:`InputError` for lenses that can't be, a place outside of the image, and too many mounts.
+    Raises :class:`InputError` for impossible lenses, a position outside the image, and too many mounts.
     """
     present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
     distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
@@ -107,13 +107,13 @@ def _calibrated(path: Path) -> Camera:
 
 
 def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tuple[float, float]:
-    """A point of one camera's image in that of another one, which may have more pixels, or fewer."""
+    """The corresponding point in another camera's image, which may have another size."""
     (u, v), across, down = at_px, other.width_px / camera.width_px, other.height_px / camera.height_px
     return (u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5
 
 
 def _place(config: Config, at_px: tuple[float, float] | None) -> tuple[float, float]:
-    """Where the TCP is to show: as now, or as given."""
+    """The position of the TCP in the image: as now, or as given."""
     camera = config.camera
     where = "lies at" if at_px is not None else "the TCP shows now at"
     u, v = at_px if at_px is not None else camera.project(config.cam_T_grip[None, :3, 3])[0].tolist()
@@ -130,8 +130,8 @@ def sweep(
     travel_m: tuple[float, float] | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> Sweep:
-    """Try every mount of the grid, at the openings of ``travel_m`` (None: all); ``step`` is called after each.  Raises
-    :class:`InputError` for openings that the jaw hasn't.
+    """Evaluate every mount of the grid at the openings ``travel_m`` (None: all); ``step`` is called after each.  Raises
+    :class:`InputError` for openings outside the jaw's travel.
     """
     gripper = config.gripper
     if travel_m is not None:

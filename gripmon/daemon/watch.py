@@ -1,4 +1,4 @@
-"""What there is to report besides the frames' own records: counts, silence, internal errors, dropped frames."""
+"""What is reported besides the frame records: counts, silence, internal errors, dropped frames."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from gripmon.model.records import (
 
 _RATE_OVER_FRAMES = 64
 _UPDATE_S = 10.0
-"""Pause between two reasons of what fails: a disk that is gone and then full is news; figures that change are not."""
+"""Pause between updates of a failure's text; another reason is reported at once, other figures are not."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 _OTHERS, _DROPS = "others", "drops"
 
 OVER_S = 10.0
-"""Dropped frames are counted over this time: the first seconds after a start are slow and don't matter."""
+"""Dropped frames are counted over this time; the first slow seconds after a start don't matter."""
 
 _LOOK_EVERY_S = 1.0
 
 
 class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When the loop says that something is wrong, and when it gives up."""
+    """When the loop raises alerts, and when it gives up."""
 
     state_period_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="period of state messages while nothing changes (s)")
@@ -85,7 +85,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class Judged(NamedTuple):
-    """What is kept of a frame.  ``usable``: it was measured; ``refused``: it could not be looked at; ``reason``: what
+    """What is kept of a frame.  ``usable``: it was measured; ``refused``: its image could not be used; ``reason``: what
     is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
 
@@ -103,10 +103,10 @@ _NOTHING = Judged(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
 
 
 class Watch:
-    """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
+    """Counts frames and raises alerts from records and times alone, without a clock.  All times are monotonic seconds.
 
-    ``state``, ``verdict``, ``message`` and ``undelivered`` are what the state message says now.  Alerts about images
-    are the monitor's, those about their absence come from here: raised when it has lasted, cleared when it is over.
+    ``state``, ``verdict``, ``message`` and ``undelivered`` are those of the state message.  The monitor raises alerts
+    about images; this raises those about missing images, when they have been missing for a while, and clears them.
     """
 
     def __init__(self, settings: DaemonSettings, now_s: float) -> None:
@@ -126,11 +126,11 @@ class Watch:
         self._judged = _NOTHING
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
-        """A frame was judged; the alerts that are due beside the record's own."""
+        """A frame was judged; returns the alerts that are due besides the record's own."""
         return self.judged(_of_record(record), now_s)
 
     def judged(self, frame: Judged, now_s: float) -> list[Alert]:
-        """The same of any camera's frame."""
+        """The same for a frame of either kind of camera."""
         alerts = self._end_of_silence(now_s)
         self.frames += 1
         self.frames_usable += frame.usable
@@ -146,7 +146,7 @@ class Watch:
         return alerts
 
     def no_frame(self, reason: str, now_s: float, stamp_ns: int) -> list[Alert]:
-        """The source waits, for the reason that it gives; ``stamp_ns``: Unix time."""
+        """The source has no frame, for the given reason; ``stamp_ns``: Unix time."""
         silence_s = now_s - self._last_frame_s
         if silence_s >= self._settings.stale_after_s:
             self.state, self.verdict = State.STALE, Verdict.UNKNOWN
@@ -157,10 +157,10 @@ class Watch:
         return list(self._alerts.present(_SILENCE, silent, now_s, stamp_ns))
 
     def end_of_frame(self, failure: str, undelivered: str, now_s: float, stamp_ns: int) -> list[Alert]:
-        """What failed here, not in the camera: the monitor on the frame, or passing on what it had to say.
+        """What failed in the daemon, not in the camera: ``failure`` of the monitor, ``undelivered`` outputs.
 
-        Only the first says something about the transform, and only it counts as an error: an output that fails must not
-        take the monitor, and the other outputs, with it.
+        Only the first affects the transform and counts as an error: a failing output must not end the monitor and the
+        other outputs.
         """
         self.undelivered = undelivered
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
@@ -176,45 +176,45 @@ class Watch:
         return [*alerts, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
-        """Recording has stopped or thins, as it says itself; the monitor goes on."""
+        """Recording has stopped or drops data, as ``failure`` says; the monitor continues."""
         if failure is None:
             return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
         return self._fails(_RECORDING, stopped, now_s, stamp_ns)
 
     def _fails(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> list[Alert]:
-        """What there is to tell of something that fails, also when it now does for another reason."""
+        """Alerts about a failure, also when it now has another reason."""
         before = self._alerts.about(topic)
         news = before is not None and _kind(before.text) != _kind(alert.text)
         return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
 
     def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
-        """So many frames have come since the start while another one was worked on."""
+        """``count``: frames dropped since the start because another one was being processed."""
         if not (text := self._drops.look(self.frames, count, now_s)):
             return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
         slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, text)
         return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
 
     def others(self, text: str, now_s: float, stamp_ns: int) -> list[Alert]:
-        """Other monitors of this name: ``text`` about them, empty while there are none."""
+        """``text``: about other monitors with this name, empty while there are none."""
         if not text:
             return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
         several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, text)
         return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
 
     def stopped(self) -> None:
-        """The end: a reader that keeps the last state message must not go on trusting the last transform."""
+        """The end: a reader of the last state message must not continue to trust the last transform."""
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
     def last(self) -> Judged:
-        """What is kept of the last frame while its state and verdict still hold; else one that knows nothing."""
+        """What is kept of the last frame while its state and verdict still hold; otherwise one without values."""
         if (self.state, self.verdict) == (self._judged.state, self._judged.verdict):
             return self._judged
         return _NOTHING
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
-        """All that is raised and not cleared, the monitor's and what comes from here, the oldest first."""
+        """All open alerts, the monitor's and those raised here, the oldest first."""
         alerts = [each.alert for each in (*of_the_monitor, *self._alerts.open)]
         return tuple(
             StandingAlert(a.alert_id, a.kind, a.severity, a.text, a.since_ns, a.acknowledged)
@@ -223,18 +223,18 @@ class Watch:
 
     @property
     def gives_up(self) -> bool:
-        """Have errors persisted for as long as the settings allow?"""
+        """Whether errors have persisted for as long as the settings allow."""
         return self.errors_in_a_row >= self._settings.give_up_after_errors
 
     def frames_per_s(self, now_s: float) -> float:
-        """The rate of the last frames; 0 while they are missing."""
+        """The rate of the last frames; 0 while there are none."""
         times_s = self._frame_times_s
         if len(times_s) < 2 or now_s - times_s[-1] >= self._settings.stale_after_s or times_s[-1] <= times_s[0]:
             return 0.0
         return (len(times_s) - 1) / (times_s[-1] - times_s[0])
 
     def _keep_message(self, text: str) -> None:
-        """A reason's figures may change with every frame; it is reported again only when its kind changes."""
+        """Update the message only if it changes in more than its figures, which may differ in every frame."""
         if _kind(text) != _kind(self.message):
             self.message = text
 
@@ -246,7 +246,7 @@ class Watch:
 
 
 def _kind(message: str) -> str:
-    """Without figures, which differ in every frame, and what comes behind a second colon."""
+    """The message without figures, which differ in every frame, and without what follows a second colon."""
     return FIGURES.sub("", ":".join(message.split(":")[:2]))
 
 
@@ -265,21 +265,21 @@ def _of_record(record: FrameRecord) -> Judged:
 
 
 def is_refused(record: FrameRecord) -> bool:
-    """Could the frame not be measured at all?  Then every corner says so."""
+    """Whether the frame was refused, which every corner then says."""
     return bool(record.corners) and record.corners[0].reason is CornerFault.FRAME_REFUSED
 
 
 class Drops:
-    """Counts over the last seconds; all times are monotonic seconds."""
+    """Detects dropped frames over the last seconds; all times are monotonic seconds."""
 
     def __init__(self, allowed_share: float) -> None:
-        """``allowed_share`` of the camera's frames may be dropped; beyond that it is reported, until they are half."""
+        """``allowed_share``: fraction of dropped frames that raises the alert; half of it clears the alert."""
         self._allowed = allowed_share
         self._counts: deque[tuple[float, int, int]] = deque()  # time, frames handled, frames dropped
         self._said = ""
 
     def look(self, handled: int, dropped: int, now_s: float) -> str:
-        """What is wrong and what to change, of the counts since the start; empty if all is well."""
+        """What is wrong and what to change, from the counts since the start; empty if nothing."""
         counts = self._counts
         if counts and now_s - counts[-1][0] < _LOOK_EVERY_S:
             return self._said

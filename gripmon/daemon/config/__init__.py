@@ -1,6 +1,6 @@
-"""A configuration file -> checked, typed settings with the camera, the gripper and the reference that they describe.
+"""A configuration file -> checked, typed settings with the camera, gripper and reference that they describe.
 
-Everything that can be wrong is found here, before anything starts, and reported in one line: :class:`ConfigError`.
+Every fault is found here, before anything starts, and reported in one line: :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """A configuration that holds together."""
+    """A consistent configuration."""
 
     path: Path
     settings: Settings
@@ -76,34 +76,34 @@ class Config:
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
-        """What was taught, as the monitor takes it; None without a taught model."""
+        """The taught edges for the monitor; None without a taught model."""
         return None if self.taught is None else TaughtEdges.of_model(self.taught, self.gripper)
 
     @property
     def taught_path(self) -> Path | None:
-        """The file with the taught model, whether it is there or not."""
+        """The file of the taught model, whether it exists or not; None: none is named."""
         return None if self.settings.taught is None else self.directory / self.settings.taught
 
     @property
     def state_path(self) -> Path | None:
-        """The file for what survives a restart; None: nothing does."""
+        """The file for the state that survives a restart; None: no state is kept."""
         settings = self.settings
         if settings.state.file != AUTO:
             return None if settings.state.file is None else self.directory / settings.state.file
-        # What is replayed or simulated begins afresh each time, and so does the camera's motion.
+        # A replay or simulation begins again each time, and so does its camera's motion.
         live = isinstance(settings.source, LiveSettings | NetworkSettings)
         return default_path(settings.robot, settings.camera_name) if live else None
 
     @property
     def state_owner(self) -> Owner:
-        """Whose state that is, and of which calibration."""
+        """The owner of the state: robot, camera and calibration."""
         settings = self.settings
         calibration = calibration_of(settings.camera, self.gripper.model, self.reference)
         return Owner(settings.robot, settings.camera_name, calibration)
 
     @property
     def directory(self) -> Path:
-        """Where relative paths in the file count from."""
+        """The folder to which paths in the file are relative."""
         return self.path.parent
 
     @property
@@ -113,18 +113,18 @@ class Config:
 
     @property
     def jaw_opening_m(self) -> float | None:
-        """The fixed jaw opening, nominal where it comes from elsewhere, None for a gripper without jaw (m)."""
+        """The fixed jaw opening (m), the nominal one if it has another source; None for a gripper without jaw."""
         if not self.gripper.has_jaw:
             return None
         return self.gripper.jaw_nominal_m if self.settings.jaw.opening_m is None else self.settings.jaw.opening_m
 
     @property
     def scene(self) -> SimulatedScene:
-        """What a simulated camera renders: undisturbed, it stands as the reference says."""
+        """The scene of a simulated camera; undisturbed, it is at the reference."""
         return SimulatedScene(self.camera, self.gripper, self.cam_T_grip)
 
     def view(self) -> View:
-        """What the reference predicts to be seen at :attr:`jaw_opening_m`."""
+        """What should be visible at the reference and :attr:`jaw_opening_m`."""
         return predict_view(self.camera, self.gripper, self.cam_T_grip, self.jaw_opening_m)
 
 
@@ -133,9 +133,9 @@ def load_config(
 ) -> Config:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
-    ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
-    ``with_taught=False`` leaves out the taught model, for those who teach it again; ``say_deprecated=False`` logs no
-    warning of settings that have been replaced, for files that can't be edited.
+    ``check_source=False``: don't check that the source's files exist, for callers with their own input;
+    ``with_taught=False``: ignore the taught model, for callers that teach it again; ``say_deprecated=False``: no
+    warning about replaced settings, for files that can't be edited.
     """
     path = Path(path)
     values = read_configuration(path)
@@ -173,7 +173,7 @@ def load_config(
 def check_network(config: Config | SecondConfig) -> Joining | None:
     """How the network would be joined; None if nothing is published.
 
-    It finds what only matters to those who join it: files of Zenoh's, endpoints, packages for ROS 2.  Raises
+    Checks what matters only for joining it: Zenoh configuration files, endpoints, packages for ROS 2.  Raises
     :class:`ConfigError`.
     """
     try:
@@ -183,7 +183,7 @@ def check_network(config: Config | SecondConfig) -> Joining | None:
 
 
 def builtin_config(name: str) -> Path:
-    """The path of a file in ``configs/``, in a checkout or in an installed wheel (there it lies in the package)."""
+    """The path of a file in ``configs/``, in a checkout or in an installed wheel (inside the package)."""
     package = Path(gripmon.__file__).resolve().parent
     for folder in (package / "configs", package.parent / "configs"):
         if (folder / name).is_file():
@@ -209,7 +209,7 @@ def read_gripper(gripper_path: Path) -> Gripper:
     """Read and check a gripper file.  Raises :class:`ConfigError`."""
     try:
         model = to_settings(read_yaml(gripper_path), GripperModel)
-        # Before anything is made of them: points in millimetres break most other rules, too.
+        # Checked first: points in millimetres break most other rules, too.
         for name, point in model.points.items():
             if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:
                 wrong = f"{max(map(abs, point.xyz_m)):g} m from the TCP"
@@ -241,7 +241,7 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
 
 
 def _taught(config: Config) -> TaughtModel | None:
-    """The taught model that the configuration names; refused unless it was taught with the very same things."""
+    """The configuration's taught model; refused unless it was taught with the same camera, gripper and settings."""
     path = config.taught_path
     if path is None:
         return None

@@ -23,14 +23,14 @@ _WHAT = {
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFiles:
-    """``paths``: the files by key of the configuration; ``hand_eye``: what the reference's says."""
+    """``paths``: the files by configuration key; ``hand_eye``: the content of the reference's file."""
 
     paths: dict[str, Path] = field(default_factory=dict)
     hand_eye: HandEyeCalibration | None = None
 
 
 def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], CalibrationFiles]:
-    """The configuration's values with the sections that the files stand for.  Raises :class:`ConfigError`."""
+    """The configuration's values with file names replaced by their sections.  Raises :class:`ConfigError`."""
     values, paths, hand_eye = dict(values), {}, None
     if isinstance(values.get("camera"), str):
         paths["camera"] = _file(path, "camera", values["camera"])
@@ -58,7 +58,7 @@ def read_hand_eye(path: Path) -> HandEyeCalibration:
 
 
 def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Gripper) -> Fault | None:
-    """Why a hand/eye calibration isn't one of this camera and this gripper."""
+    """Why a hand/eye calibration doesn't belong to this camera and gripper; None if it does."""
     if hand_eye.camera != camera:
         return Fault("camera", "isn't the configuration's camera", "the hand/eye calibration made with the same camera")
     if hand_eye.gripper.sha256 != gripper_digest(gripper):
@@ -73,7 +73,7 @@ def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Grippe
 
 
 def _as_read(value: msgspec.Struct) -> Any:
-    """As it stands in a file, with lists."""
+    """As if read from a file, with lists."""
     return msgspec.json.decode(msgspec.json.encode(value))
 
 

@@ -1,4 +1,4 @@
-"""Checks that need more than one key, or more than the file: camera and gripper, pairs, sources, the network."""
+"""Checks that involve several keys, or more than the file: camera and gripper, pairs, sources, the network."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ _IN_FRONT = (
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the calibration predicts at one jaw opening: arrays over the gripper's edges, and its landmarks, which are
-    its corners if it has some.
+    """The predicted view at one jaw opening: arrays over the gripper's edges and its landmarks, which are its corners
+    if it has any.
 
-    ``corners_px`` (c, 2) is NaN where the lens maps nothing; ``in_image``, ``visible`` (c,); ``edges_visible`` (e,).
+    ``corners_px`` (c, 2): NaN outside the lens model's range; ``in_image``, ``visible`` (c,); ``edges_visible`` (e,).
     """
 
     corners_cam_m: Array
@@ -65,7 +65,7 @@ class View:
 
 
 def reference_transform(settings: ReferenceSettings) -> Array:
-    """``cam_T_grip`` (4, 4) of a reference; :class:`SettingsError` for one that is wrong by itself."""
+    """``cam_T_grip`` (4, 4) of a reference.  Raises :class:`SettingsError` if it is invalid."""
     x, y, z, w = settings.cam_T_grip.rotation_xyzw
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if abs(length - 1.0) > _UNIT_TOLERANCE:
@@ -87,7 +87,7 @@ def reference_transform(settings: ReferenceSettings) -> Array:
 
 
 def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
-    """The reference's covariance, row by row; :class:`SettingsError` for one that can't be."""
+    """The reference's covariance, row by row.  Raises :class:`SettingsError` if it is invalid."""
     if settings.covariance is None:
         variances = [settings.position_sigma_m**2] * 3 + [settings.rotation_sigma_rad**2] * 3
         return tuple(np.diag(variances).ravel().tolist())
@@ -119,7 +119,7 @@ def monitor_fault(settings: MonitorSettings) -> Fault | None:
 
 
 def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> View:
-    """Where the calibration expects the gripper's corners in the image."""
+    """The view of the gripper that the calibration predicts."""
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     corners_cam_m = points_cam_m[gripper.landmarks]
@@ -137,7 +137,7 @@ def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_openin
 
 
 def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
-    """Why this calibration can't see this gripper, None if it can."""
+    """Why the gripper is not visible with this calibration; None if it is."""
     key = "reference.cam_T_grip"
     depths_m = view.corners_cam_m[:, 2]
     if (depths_m <= 0.0).all():
@@ -165,7 +165,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
 
 
 class _Pair(NamedTuple):
-    """``lower`` and ``upper`` are keys of one section; ``why`` the first may be at most as large as the second."""
+    """``lower`` and ``upper``: keys of one section; ``why``: the reason that the first must not exceed the second."""
 
     section: str
     lower: str
@@ -186,7 +186,7 @@ _OF_A_CAMERA = (_Pair("source", "retry_first_s", "retry_longest_s", _GROWS),)
 
 
 def order_fault(settings: Settings) -> Fault | None:
-    """The first pair that is in the wrong order."""
+    """The first pair in the wrong order."""
     for pair in _PAIRS + _OF_A_CAMERA * isinstance(settings.source, LiveSettings):
         section = functools.reduce(getattr, pair.section.split("."), settings)
         lower, upper = getattr(section, pair.lower), getattr(section, pair.upper)
@@ -200,7 +200,7 @@ _NETWORK_JAWS = ("zenoh", "ros2_joint_state")
 
 
 def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
-    """What is wrong with the section ``jaw``, by itself and beside the others."""
+    """What is wrong with the section ``jaw``, by itself and together with other sections."""
     jaw = settings.jaw
     if jaw.source != "fixed" and not gripper.has_jaw:
         return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
@@ -213,7 +213,7 @@ def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
 
 
 def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | None:
-    """Why a camera on the network can't be heard."""
+    """Why images from the network can't be received."""
     if not isinstance(source, NetworkSettings):
         return None
     if not publish.enabled:
@@ -226,7 +226,7 @@ def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | N
 
 
 def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
-    """A source of files that aren't there, or a camera that can't be any; paths count from ``directory``."""
+    """A source whose files don't exist, or an impossible camera; paths are relative to ``directory``."""
     if isinstance(source, FolderSettings) and not (directory / source.path).is_dir():
         wrong = f"there is no folder {directory / source.path}"
         return Fault("source.path", wrong, "a folder with images, relative to this file")
@@ -245,7 +245,7 @@ def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
 
 
 def _without_jaw(source: SourceSettings) -> str | None:
-    """What brings frames without a jaw opening, in words; None if they may have one."""
+    """The kind of source, in words, if its frames never have a jaw opening; None if they may."""
     if isinstance(source, LiveSettings):
         return "a camera"
     if isinstance(source, VideoSettings):
@@ -272,7 +272,7 @@ def _opening_fault(jaw: JawSettings, gripper: Gripper) -> Fault | None:
 
 
 def _joint_fault(jaw: JawSettings) -> Fault | None:
-    """``topic`` and ``opening`` belong to joint states, and joint states need both."""
+    """``topic`` and ``opening`` are for joint states, which need both."""
     needed = jaw.source == "ros2_joint_state"
     for key, value, right in (
         ("topic", jaw.topic, "the full name of a topic, /joint_states"),
@@ -294,7 +294,7 @@ def _joint_fault(jaw: JawSettings) -> Fault | None:
 
 
 def joined(settings: Settings | SecondSettings, camera: Camera, directory: Path) -> Joining | None:
-    """How the network would be joined; None if it won't be.  :class:`SettingsError` where it can't be."""
+    """How the network would be joined; None if it won't be.  :class:`SettingsError` if it can't be."""
     if (missing := package_fault(settings.metrics)) is not None:
         raise SettingsError(Fault(*missing))
     if not settings.publish.enabled:
@@ -317,7 +317,7 @@ def joined(settings: Settings | SecondSettings, camera: Camera, directory: Path)
 
 
 def _split(text: str) -> Fault:
-    """Of a line ``key: what is wrong; what would be right``."""
+    """The fault in a line ``key: what is wrong; what would be right``."""
     key, _, rest = text.partition(": ")
     wrong, _, right = rest.partition("; ")
     return Fault(key, wrong, right)
@@ -329,9 +329,9 @@ _LARGEST_LIMIT_M = 1.0
 
 
 def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings:
-    """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: a warning names both.
+    """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: log a warning that names both.
 
-    ``values`` is what the file holds: with both of them it isn't clear which is meant.
+    ``values``: the content of the file; if it has both keys it is ambiguous.
     """
     policy = settings.monitor.policy
     if policy.suspect_sigma_m is None:

@@ -1,8 +1,9 @@
-"""A configuration as a recording holds it: all that the monitor's decisions rest on, so that a replay needs no other.
+"""A configuration as stored in a recording: everything on which the monitor's decisions depend, so that a replay needs
+no other.
 
-Every value is written down, defaults too: a later version with other defaults decides the same.  Where images come
-from, the network and the place of the kept state are left out: decisions don't rest on them, and passwords may stand
-there.
+Every value is stored, including defaults, so that a later version with other defaults decides the same.  The source of
+images, the network and the location of the state file are omitted: decisions don't depend on them, and they may contain
+passwords.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ _NO_SOURCE = {"kind": "folder", "path": "images-of-this-recording"}
 
 
 def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedConfiguration:
-    """The configuration with the files that it names, by plain names; ``start`` is what the monitor begins with.
+    """The configuration with the files that it names, under plain names; ``start``: the monitor's initial state.
 
-    Raises :class:`ConfigError` for a file that is there no more.
+    Raises :class:`ConfigError` for a file that no longer exists.
     """
     named = {"gripper": config.gripper_path, **config.calibrated.paths}
     if config.taught is not None and config.taught_path is not None:
@@ -41,7 +42,7 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
 
 
 def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
-    """The same of a second camera, with its laser calibration."""
+    """The same for a second camera, with its laser calibration."""
     values, name = _plain(config), config.calibration_path.name
     name = name if name != config.path.name else f"laser-{name}"
     values["laser"] = {key: value for key, value in values["laser"].items() if value is not None}
@@ -50,7 +51,7 @@ def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
 
 
 def _plain(config: Config | SecondConfig) -> dict[str, Any]:
-    """The sections that decisions rest on."""
+    """The sections on which decisions depend."""
     values: dict[str, Any] = msgspec.to_builtins(config.settings)
     kept = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
     return kept | {"source": _NO_SOURCE}
@@ -69,7 +70,7 @@ def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:
     """
     for name, file in recorded.files.items():
         path = folder / name
-        if not _PLAIN_NAME.fullmatch(name) or name in (".", ".."):  # a recording may come from anywhere
+        if not _PLAIN_NAME.fullmatch(name) or name in (".", ".."):  # a recording may come from an untrusted source
             raise ConfigError(folder, "", f"the recorded configuration has a file {name!r}", "a plain name")
         try:
             path.write_bytes(file.data)

@@ -1,4 +1,4 @@
-"""The configuration of a second camera: a laser calibration that is watched, in place of a gripper and a reference."""
+"""The configuration of a second camera: a laser calibration to be watched, instead of a gripper and a reference."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "stat
 
 @dataclass(frozen=True, slots=True)
 class SecondConfig:
-    """A configuration that holds together.  ``pulses`` are those of a table, empty where they come over the network."""
+    """A consistent configuration.  ``pulses``: those of a table; empty if they come over the network."""
 
     path: Path
     settings: SecondSettings
@@ -36,24 +36,24 @@ class SecondConfig:
 
     @property
     def directory(self) -> Path:
-        """Where relative paths in the file count from."""
+        """The folder to which paths in the file are relative."""
         return self.path.parent
 
     def pulsed_watch(self) -> PulsedWatch:
-        """A watch that begins."""
+        """A new watch."""
         laser = self.settings.laser
         return PulsedWatch(self.calibration, laser.watch, laser.frames)
 
 
 def is_second(path: Path) -> bool:
-    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that isn't YAML."""
+    """Whether this is the configuration of a second camera.  Raises :class:`ConfigError` for a file that isn't YAML."""
     return SECTION in read_configuration(path)
 
 
 def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
-    ``check_source=False`` leaves out whether the source's files exist, and the pulses.
+    ``check_source=False``: don't check that the source's files exist, and don't read the pulses.
     """
     values = read_configuration(path)
     _refuse_wrist(path, values)
@@ -70,7 +70,7 @@ def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
 
 
 def load_pulses(config: SecondConfig) -> SecondConfig:
-    """The same with the pulses of its table, if there is one.  Raises :class:`ConfigError`."""
+    """The configuration with the pulses of its table, if there is one.  Raises :class:`ConfigError`."""
     name = config.settings.laser.pulses
     return config if name is None else replace(config, pulses=_pulses(config.path, name))
 
@@ -84,7 +84,7 @@ def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
     calibration = read_document(calibration_path, LaserCalibration)
     try:
         make_camera(calibration.camera)
-        # Everything that its numbers must have in common is checked where they are used.
+        # The consistency of its numbers is checked where they are used.
         PulsedWatch(calibration, SpotWatchSettings(), PulseSettings())
     except (CalibrationError, ValueError) as error:
         raise ConfigError(calibration_path, "", str(error)) from None
@@ -100,7 +100,7 @@ def _pulses(path: Path, name: str) -> tuple[ReportedPulse, ...]:
 
 
 def _refuse_wrist(path: Path, values: dict[str, Any]) -> None:
-    """A second camera with keys of a wrist camera: which one is meant?"""
+    """Refuse keys of a wrist camera, with which it is ambiguous."""
     both = [key for key in _OF_A_WRIST if key in values]
     if both:
         right = f"{SECTION} for a second camera, or {both[0]} for a wrist camera; two cameras are two files"
@@ -110,7 +110,7 @@ def _refuse_wrist(path: Path, values: dict[str, Any]) -> None:
 
 
 def _fault_between(settings: SecondSettings) -> Fault | None:
-    """Where frames come from, and the pulses: both recorded, or both live."""
+    """Frames and pulses must be both recorded or both live."""
     source, pulses = settings.source, settings.laser.pulses
     if isinstance(source, SimulatedSettings):
         return Fault("source.kind", "is simulator, which shows a gripper and no laser", "folder, video, live or zenoh")

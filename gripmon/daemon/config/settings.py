@@ -1,4 +1,4 @@
-"""The settings of one monitor, assembled from the sections that the rooms define beside their algorithms."""
+"""The settings of one monitor, assembled from the sections that each package defines beside its algorithms."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is watched, and how."""
+    """The laser calibration that is watched, and how."""
 
     calibration: Annotated[
         str, Meta(min_length=1, description="file of gripmon calibrate laser, its path relative to this file")

@@ -1,9 +1,8 @@
 """Parsed YAML -> typed settings, with errors that a person can act on.
 
 ``msgspec`` does the conversion.  As its errors name neither the entry of a mapping nor what would be right, the first
-fault is searched for here, along the type, with the description and the bounds that stand in the settings.  This stays
-beside pydantic, which names the entry, but not what would be right, and would be a second model of what ``msgspec``
-also encodes.
+fault is searched here along the type, using the descriptions and bounds in the settings.  pydantic is no replacement:
+it names the entry, but not what would be right, and would be a second model of what ``msgspec`` also encodes.
 """
 
 from __future__ import annotations
@@ -137,7 +136,7 @@ def _struct_fault(value: Any, node: mi.StructType, key: str, description: str) -
 
 
 def _with_unit(fault: Fault, key: str, name: str, known: list[str]) -> Fault:
-    """``opening`` is a section, but has a number, and there is an ``opening_m``: perhaps that was meant."""
+    """Suggest ``opening_m`` if the section ``opening`` is given a number."""
     longer = [each for each in known if each.startswith(f"{name}_")]
     if fault.key != key or len(longer) != 1:
         return fault
@@ -201,7 +200,7 @@ def _fits_leaf(value: Any, node: mi.Type) -> bool:
         if isinstance(value, bool) or not isinstance(value, int | float):
             return False
         return (isinstance(value, int) or isinstance(node, mi.FloatType)) and _in_bounds(value, node)
-    return True  # msgspec itself is asked afterwards
+    return True  # msgspec itself checks it afterwards
 
 
 def _in_bounds(value: float, node: mi.IntType | mi.FloatType) -> bool:
@@ -217,7 +216,7 @@ def _expected(node: mi.Type, description: str = "") -> str:
     """What would be right for a type, in words: kind, bounds and the settings' own description with the unit."""
     if isinstance(node, mi.Metadata):
         return _expected(node.type, (node.extra_json_schema or {}).get("description", "") or description)
-    # What says by itself "true: …; false: …" would be a second colon in the line.
+    # A description with a colon of its own goes into brackets.
     suffix = "" if not description else f" ({description})" if ": " in description else f": {description}"
     if isinstance(node, mi.UnionType):
         options = [t for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]

@@ -1,4 +1,4 @@
-"""Files of ours in YAML, read as settings and written."""
+"""gripmon's YAML files, read as settings and written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LINES, _SEE = "`key: value` lines, indented with blanks", "`key: value` lines; 
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.  :class:`ConfigError` if unreadable, not YAML, no mapping, or with a key twice."""
+    """The mapping in a YAML file.  :class:`ConfigError` if unreadable, not YAML, not a mapping, or with a key twice."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -41,7 +41,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = None) -> _T:
-    """What a YAML file holds (or ``values``, if it was read), as a settings type.  :class:`ConfigError`."""
+    """The content of a YAML file (or ``values``, if already read) as a settings type.  :class:`ConfigError`."""
     try:
         return to_settings(read_yaml(path) if values is None else values, kind)
     except SettingsError as error:
@@ -66,8 +66,8 @@ _NAMED_UNDER = {
 
 
 def read_configuration(path: Path) -> dict[str, Any]:
-    """The mapping in a configuration, a wrist camera's or a second camera's.  :class:`ConfigError`, also for another
-    file of ours, which it names.
+    """The mapping in a configuration of a wrist camera or a second camera.  :class:`ConfigError`, which names the type
+    of any other gripmon file.
     """
     values = read_yaml(path)
     kind = kind_of(values)
@@ -79,13 +79,13 @@ def read_configuration(path: Path) -> dict[str, Any]:
 
 
 def kind_of(values: dict[str, Any]) -> str | None:
-    """Which file of ours this is, in words; None if it looks like none."""
+    """The type of gripmon file, in words; None if unknown."""
     known = _SCHEMAS.get(str(values.get("schema")).partition("/")[0])
     return known or next((what for key, what in _LOOKS_LIKE.items() if key in values), None)
 
 
 def read_document(path: Path, kind: type[_T]) -> _T:
-    """The same of a file whose ``schema`` says what it is.  :class:`ConfigError`."""
+    """The content of a file with a ``schema`` as that type.  :class:`ConfigError`."""
     values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
     schema = values.get("schema")
     if schema is None:
@@ -101,7 +101,7 @@ def read_document(path: Path, kind: type[_T]) -> _T:
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
-    """Quotes just what the loader here would take for something else than text."""
+    """Quotes only texts that the loader would not read as text."""
 
 
 _Dumper.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers
@@ -114,9 +114,9 @@ def as_yaml(value: dict[str, Any]) -> str:
 
 
 def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
-    """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
+    """The lines of a section, each with its description; ``off``: commented out, for defaults.
 
-    Keys without value are left out.
+    Keys without value are omitted.
     """
     lines = []
     tag = type(settings).__struct_config__
@@ -138,7 +138,7 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
 
 
 def yaml_value(value: Any) -> str:
-    """A value on one line, as both YAML and JSON read it back."""
+    """A value on one line that is valid in both YAML and JSON."""
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
     if isinstance(value, int | float):
