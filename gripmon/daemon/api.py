@@ -1,6 +1,6 @@
-"""What programs and notebooks begin with: a monitor and a source of frames, without network and without files.
+"""The Python API for programs and notebooks: a monitor and a source of frames, without network and files.
 
-What ``check`` and ``run`` need of a configured source stands here, too.
+Also the functions for configured sources that ``check`` and ``run`` use.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from gripmon.model.records import Frame, FrameRecord, MonitorState
 
 
 class Monitor(monitor.Monitor):
-    """The per-frame method of a configuration: frames in, records out, nothing else."""
+    """The per-frame method with a configuration: frames in, records out, nothing else."""
 
     def __init__(self, config: Config, state: MonitorState | None = None, keep: Keep = lambda _: "") -> None:
-        """``state`` and ``keep``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for a state that doesn't
-        hold together.  The very first frame on a machine takes a minute: what frames need is compiled.
+        """``state`` and ``keep``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for an inconsistent state.
+        The very first frame on a machine takes a minute, in which the per-frame code is compiled.
         """
         super().__init__(
             config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, state, keep
@@ -44,28 +44,28 @@ class Monitor(monitor.Monitor):
         self._fixed = config.settings.jaw.source == "fixed"
 
     def process(self, frame: Frame) -> FrameRecord:
-        """One frame in, one record out; with ``jaw.source: fixed`` at the configuration's jaw opening.  Never raises
-        for a bad frame: that is a record with a reason.
+        """One frame in, one record out; with ``jaw.source: fixed`` at the configuration's jaw opening.  A bad frame
+        never raises, but gives a record with a reason.
         """
         return super().process(self.with_opening(frame))
 
     def with_opening(self, frame: Frame) -> Frame:
-        """The frame with the opening that the monitor takes it at."""
+        """The frame with the jaw opening that the monitor uses."""
         if not self._fixed or frame.jaw_opening_m == self._config.jaw_opening_m:
             return frame
         return dataclasses.replace(frame, jaw_opening_m=self._config.jaw_opening_m)
 
     def ignores_opening(self, frame: Frame) -> bool:
-        """Whether the frame brings an opening that ``jaw.source: fixed`` overrules."""
+        """Whether the frame has an opening that ``jaw.source: fixed`` overrides."""
         return self._fixed and self._has_jaw and frame.jaw_opening_m not in (None, self._config.jaw_opening_m)
 
 
 def open_source(source: str | Path | SourceSettings | Config, fps: float | None = None) -> OpenedSource:
-    """Frames to iterate over: of a folder of images, a video file, an MCAP file, a rosbag2 or a LeRobot dataset of
-    one episode, of a source's settings, or a configuration's own.
+    """Frames to iterate over, from a folder of images, a video file, an MCAP file, a rosbag2 or a LeRobot dataset of
+    one episode, from a source's settings, or a configuration's own source.
 
-    ``fps``: frames a second where a folder or a video has no time stamps (1/s).  It is a context manager, too.  Raises
-    :class:`SourceError`: nothing there, or nothing that can be read.
+    ``fps``: frame rate if a folder or a video has no time stamps (1/s).  The result is also a context manager.  Raises
+    :class:`SourceError` if there is nothing, or nothing that can be read.
     """
     if isinstance(source, Config):
         return OpenedSource(open_configured(source))
@@ -88,8 +88,8 @@ def open_configured(config: Config | SecondConfig, link: Link | None = None) -> 
 
 
 def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
-    """What is found at the beginning of recorded frames, in a few words, and what is odd about it (None: nothing); None
-    for a source of another kind.
+    """A description of the first recorded frame, and what is odd about it (None: nothing); None for a source that isn't
+    recorded.
 
     Raises :class:`ConfigError` for frames that don't fit the camera, and :class:`NoResultError` if none can be read.
     """

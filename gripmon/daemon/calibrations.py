@@ -1,4 +1,4 @@
-"""Calibrations as files: of ``gripmon calibrate``, or what a configuration, a monitor's state or its estimates say."""
+"""Calibrations from files of ``gripmon calibrate``, a configuration, a monitor's state or its estimates."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its
 
 
 def read_calibrated(path: Path) -> Calibrated:
-    """What a file says; :class:`~gripmon.model.errors.InputError` if nothing."""
+    """The calibration in a file.  :class:`~gripmon.model.errors.InputError` if there is none."""
     data = read_bytes(path)
     head = data[:4096].lstrip()
     if head.startswith(b'{"sha256"'):
@@ -88,7 +88,7 @@ def _camera(path: Path) -> Calibrated:
 
 
 def _plain(camera: LensSettings) -> dict[str, float]:
-    """A camera's numbers by the names that its calibration gives them."""
+    """A camera's numbers by their names in a calibration."""
     values: dict[str, float] = {}
     for key, value in msgspec.structs.asdict(camera).items():
         values.update({f"{key}.{i}": v for i, v in enumerate(value)} if isinstance(value, tuple) else {key: value})
@@ -180,7 +180,7 @@ def _uncertainty(covariance: tuple[float, ...]) -> list[str]:
 
 
 def read_given_camera(path: Path) -> GivenCamera:
-    """A calibrated camera that can be used, with its covariance.  :class:`~gripmon.model.errors.InputError`."""
+    """A valid calibrated camera with its covariance.  :class:`~gripmon.model.errors.InputError`."""
     found = read_camera(path)
     try:
         make_camera(found.camera)
@@ -191,7 +191,7 @@ def read_given_camera(path: Path) -> GivenCamera:
 
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
-    """Rough corners of a gripper, or (None) of one that isn't known.  :class:`~gripmon.model.errors.InputError`."""
+    """Rough corners of a gripper (None: an unknown one).  :class:`~gripmon.model.errors.InputError`."""
     rough = read_settings(path, RoughCorners).corners
     try:
         if gripper is None:
@@ -204,12 +204,12 @@ def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[f
 
 
 def is_target_file(text: str) -> bool:
-    """Whether this names a file instead of describing a target."""
+    """Whether the text is a file name instead of a target's description."""
     return text.lower().endswith((".yaml", ".yml"))
 
 
 def target_of(text: str) -> Target:
-    """A target as a command line has it: described, or in the file of a calibration that was made with it.
+    """A target as given on a command line: a description, or the file of a calibration made with it.
 
     Raises :class:`~gripmon.model.targets.TargetError`, one line.
     """
@@ -236,7 +236,7 @@ def target_of(text: str) -> Target:
 
 
 def _target_of_command(provenance: object) -> str | None:
-    """What a file's provenance gives after ``--target``."""
+    """The target in the command of a file's provenance."""
     command = provenance.get("command") if isinstance(provenance, dict) else None
     try:
         words = shlex.split(command) if isinstance(command, str) else []
@@ -258,8 +258,8 @@ def import_camera(
     fisheye: bool | None,
     command: str,
 ) -> tuple[str, CameraCalibration]:
-    """The format of another program's file (None: recognised by its content), and the camera that it holds.
-    ``command`` goes into the provenance.  :class:`~gripmon.model.errors.InputError`.
+    """The format of another program's file (``kind`` None: recognised by its content), and its camera.  ``command`` is
+    for the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
     data = read_bytes(path)
     kind = kind or format_of(data, str(path))
@@ -273,7 +273,7 @@ def import_camera(
 
 
 def export_notes(source: Calibrated, command: str, *, with_pose: bool) -> tuple[str, ...]:
-    """What a file for another program says of where it comes from; ``with_pose``: also about the transform."""
+    """Provenance notes in a file for another program; ``with_pose``: also about the transform."""
     made = provenance_of(command, [Path(source.name)])
     written = f"written {made.time} by gripmon {made.gripmon}: {made.command}"
     origin = f"from {source.name}, SHA-256 {made.inputs[0].sha256}"
@@ -282,8 +282,8 @@ def export_notes(source: Calibrated, command: str, *, with_pose: bool) -> tuple[
 
 @dataclass(frozen=True)
 class PlaneInputs:
-    """What :func:`gripmon.calibrate_plane` takes beside images and target; ``notes``: what was assumed; ``files``:
-    those that were read.
+    """The inputs of :func:`gripmon.calibrate_plane` besides images and target; ``notes``: assumptions; ``files``: the
+    files that were read.
     """
 
     camera: GivenCamera
@@ -304,8 +304,8 @@ def plane_inputs(
     *,
     infer: bool,
 ) -> PlaneInputs:
-    """Read what files name; a configuration stands in for camera, gripper, jaw opening and rough calibration that are
-    not named.  ``infer``: the gripper isn't known.  :class:`~gripmon.model.errors.InputError`.
+    """Read the files; a configuration supplies camera, gripper, jaw opening and rough calibration if they are not
+    given. ``infer``: the gripper is unknown.  :class:`~gripmon.model.errors.InputError`.
     """
     files = [path for path in (camera, config, gripper, *corners) if path is not None]
     loaded = None if config is None else load_config(config, check_source=False, with_taught=False)
@@ -342,8 +342,8 @@ def measure_again(
     *,
     jaw_opening_m: float | None = None,
 ) -> tuple[Calibrated, tuple[str, ...]]:
-    """The hand/eye calibration that images (files, folders) show, to compare with the ``first`` one; on the plate if
-    there is a ``target``, else as the configuration's monitor sees them.  And what is doubtful about it.
+    """The hand/eye calibration from images (files, folders), to compare with the ``first`` one: on the plate if there
+    is a ``target``, otherwise as the configuration's monitor measures it.  And warnings about it.
     """
     config = _same_config(first, config_file)
     opening_m = _opening(first, config, jaw_opening_m)
@@ -366,7 +366,7 @@ def measure_again(
 
 
 def _same_config(first: Calibrated, file: Path | None) -> Config:
-    """The configuration, which has to be of the same camera and gripper."""
+    """The configuration, which must be of the same camera and gripper."""
     if file is None:
         raise InputError("is missing; with images, the configuration with gripper and monitor", "config")
     if first.cam_T_grip is None:

@@ -1,4 +1,4 @@
-"""One JSON line a frame, or a pulse, in a file."""
+"""A file with one JSON line per frame or pulse."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from gripmon.model.records import FrameRecord, SpotRecord, to_json
 
 _log = logging.getLogger(__name__)
 _BUFFER_BYTES = 1 << 16
-_FILES = 10  # that the budget is for
+_FILES = 10  # the budget is for this many files
 
 
 class EstimatesFile:
-    """Begins a new file; one of before is kept beside it (``estimates-1.jsonl`` and so on, the newest has the highest
-    number).  Without a path it takes records and writes none.
+    """Begins a new file; an earlier one is kept beside it (``estimates-1.jsonl``, …, the newest has the highest
+    number). Without a path it writes nothing.
 
-    A file of a tenth of ``budget_bytes`` is set aside likewise, and the oldest beyond the budget are deleted, earlier
-    runs' too; 0: one file without end.
+    A file that reaches a tenth of ``budget_bytes`` is kept likewise, and the oldest beyond the budget are deleted,
+    including those of earlier runs; 0: one file without limit.
 
     A disk that fails later must not stop the monitor: ``failure`` then says what is wrong, and writing ends.
     """
@@ -40,7 +40,7 @@ class EstimatesFile:
                 self._give_up(error)
 
     def flush(self) -> None:
-        """Write what has been added; between two frames, since a file that is full is changed here."""
+        """Write what has been added; called between frames, since it also starts a new file when this one is full."""
         if self._file is not None and self._path is not None:
             try:
                 self._file.flush()
@@ -59,7 +59,7 @@ class EstimatesFile:
                 self._give_up(error)
 
     def _begin(self, path: Path) -> IO[bytes]:
-        """A new file, and room for it."""
+        """Open a new file, after making room for it."""
         _set_aside(path)
         if self._budget_bytes > 0:
             _remove_oldest(path, self._budget_bytes - self._budget_bytes // _FILES)
@@ -75,7 +75,7 @@ class EstimatesFile:
 
 
 def _set_aside(path: Path) -> None:
-    """Keep what an earlier run wrote: what came before a crash is what people look for."""
+    """Keep the file of an earlier run, which is what people look for after a crash."""
     if not path.is_file() or path.stat().st_size == 0:
         return
     number = 1 + max(_kept(path), default=0)
@@ -85,7 +85,7 @@ def _set_aside(path: Path) -> None:
 
 
 def _remove_oldest(path: Path, most_bytes: int) -> None:
-    """Delete files that were set aside until the rest takes ``most_bytes`` at most."""
+    """Delete the oldest kept files until the rest takes at most ``most_bytes``."""
     kept = _kept(path)
     size = sum(each.stat().st_size for each in kept.values())
     for number in sorted(kept):
@@ -97,7 +97,7 @@ def _remove_oldest(path: Path, most_bytes: int) -> None:
 
 
 def _kept(path: Path) -> dict[int, Path]:
-    """What was set aside, by its number."""
+    """The kept files by number."""
     numbered = re.compile(rf"{re.escape(path.stem)}-(\d+){re.escape(path.suffix)}").fullmatch
     found = ((numbered(each.name), each) for each in path.parent.iterdir())
     return {int(match[1]): each for match, each in found if match}

@@ -1,5 +1,5 @@
-"""What ``gripmon check`` finds: one line for each thing that matters, OK, WARN or FAIL; and what lies outside of the
-monitor: the network, the source, the recording, metrics.
+"""The findings of ``gripmon check``: one line each, OK, WARN or FAIL; and the monitor's surroundings: network, source,
+recording, metrics.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from gripmon.model.units import in_degrees, in_mm
 Level = Literal["OK", "WARN", "FAIL"]
 
 _USUAL_SPREAD = 2.0
-"""By how much the bound of one frame in twenty is larger than the predicted one (no unit; docs/integrity.md)."""
+"""Ratio of the bound of one frame in twenty to the predicted one (no unit; docs/integrity.md)."""
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
 _CONNECT_S = 2.0
 
 
 class Finding(NamedTuple):
-    """``FAIL``: the monitor can't do its work so; ``WARN``: it can, but not all that is expected of it."""
+    """``FAIL``: the monitor can't work like this; ``WARN``: it can, but not as expected."""
 
     level: Level
     about: str
@@ -51,8 +51,8 @@ class Finding(NamedTuple):
 
 
 class SourceReport(msgspec.Struct, frozen=True):
-    """Whether frames can come from the source now (``reachable`` None: only starting it would show); ``odd``: what is
-    strange about it.
+    """Whether the source can deliver frames now (``reachable`` None: only running it would show); ``odd``: what is odd
+    about it.
     """
 
     kind: str
@@ -62,7 +62,7 @@ class SourceReport(msgspec.Struct, frozen=True):
 
 
 class Surroundings(msgspec.Struct, frozen=True):
-    """Where messages, recording and metrics go, and where frames come from; None: nowhere."""
+    """Destinations of messages, recording and metrics (None: none), and the source of frames."""
 
     keys: str | None
     recording: str | None
@@ -73,8 +73,8 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Checked:
-    """A configuration that was checked: what its calibration lets expect, of a wrist camera a ``forecast``, of a second
-    camera plain values (m, rad, px, ns), and what lies outside.
+    """A checked configuration: for a wrist camera a ``forecast``, for a second camera plain values (m, rad, px, ns),
+    and the surroundings.
     """
 
     forecast: Forecast | None
@@ -82,13 +82,13 @@ class Checked:
     around: Surroundings
 
     def values(self) -> dict[str, Any]:
-        """All of it as plain values for JSON."""
+        """Everything as plain values for JSON."""
         expected = self.second if self.second is not None else msgspec.to_builtins(self.forecast)
         return {**expected, **msgspec.to_builtins(self.around)}
 
     @property
     def findings(self) -> list[Finding]:
-        """What to know of the configuration before it runs."""
+        """What to know about the configuration before it runs."""
         about = _of_wrist(self.forecast) if self.forecast is not None else _of_second(self.second or {})
         keys = self.around.keys
         network = Finding("OK", "network", "off" if keys is None else f"Zenoh keys {keys}…")
@@ -97,8 +97,8 @@ class Checked:
 
 
 def check_file(path: Path) -> Checked:
-    """Check a configuration file, a wrist camera's or a second camera's.  Raises :class:`ConfigError`, and
-    :class:`NoResultError` where a laser calibration or recorded frames can't be used.
+    """Check a configuration file of a wrist camera or a second camera.  Raises :class:`ConfigError`, and
+    :class:`NoResultError` if a laser calibration or recorded frames can't be used.
     """
     if not is_second(path):
         config = load_config(path)
@@ -110,10 +110,10 @@ def check_file(path: Path) -> Checked:
 
 
 def _look_around(config: Config | SecondConfig) -> Surroundings:
-    """Look at what the configuration names; nothing is joined or started but a connection to a camera's address.
+    """Check what the configuration names; nothing is joined or started except a connection to a camera's address.
 
-    Raises :class:`ConfigError` for what can't be joined or doesn't fit, and :class:`NoResultError` if no recorded frame
-    can be read.
+    Raises :class:`ConfigError` for a network that can't be joined or frames that don't fit, and :class:`NoResultError`
+    if no recorded frame can be read.
     """
     settings, metrics = config.settings, config.settings.metrics
     joining = check_network(config)
@@ -196,7 +196,7 @@ def _camera(camera: CameraValues) -> Finding:
 
 
 def _mount(reference: ReferenceValues) -> Finding:
-    """The gripper's z axis points out of the gripper: a camera on the wrist is on its negative side."""
+    """The gripper's z axis points out of the gripper, so a wrist camera is on its negative side."""
     ahead_m = reference.camera_ahead_m
     if ahead_m <= 0.0:
         way = f"which looks along the fingers at {math.degrees(reference.tilt_rad):.0f}°"
@@ -212,7 +212,7 @@ def _mount(reference: ReferenceValues) -> Finding:
 def _view(in_view: InView, gripper: GripperValues) -> Finding:
     if not in_view.enough:
         return Finding("FAIL", "view", f"nothing can be measured: {in_view.reason}")
-    few = gripper.corners < in_view.corners_needed  # then ends of curves or edges stand for them
+    few = gripper.corners < in_view.corners_needed  # then ends of curves or edges are used instead
     corners = f"{in_view.corners} points" if few else f"{in_view.corners} of {gripper.corners} corners"
     seen = f"{corners} and {in_view.edges} edges can be measured"
     spans = {} if in_view.camera_may_move is None else in_view.camera_may_move.shift_m
@@ -269,9 +269,9 @@ def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | N
 
 
 def past_limit(certainty: OpeningCertainty) -> str | None:
-    """At which openings the bounds exceed the alert limits, in words; None for nowhere.
+    """The openings at which the bounds exceed the alert limits, in words; None if there are none.
 
-    Neighbours among the openings that were looked at make a span.
+    Neighbouring sampled openings are joined to a span.
     """
     limit_m, limit_rad = certainty.alert_limit_m, certainty.alert_limit_rad
     rows = zip(certainty.opening_m, certainty.protection_m, certainty.protection_rad, strict=True)

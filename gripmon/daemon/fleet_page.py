@@ -1,4 +1,4 @@
-"""All monitors on the network as a page: how each is, what it sees, and the orders that an operator may give."""
+"""All monitors on the network as a web page: condition and view of each, and commands for an operator."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from gripmon.teach.messages import BadRequest, Request
 from gripmon.teach.page_server import Action, Served, web_files
 
 CARDS_MOST = 60
-"""Monitors shown at once, the worst ones: what a person can look through.  *Find* shows others."""
+"""Monitors shown at a time, the worst ones: as many as a person can look through.  *Find* shows others."""
 PICTURE_PX = 640
 """Columns of a picture: as wide as a card on a large screen."""
-_KEPT_S = 8.0  # a picture: the page asks every 10 s, and several pages cost a monitor no more than one
+_KEPT_S = 8.0  # a picture is reused: the page asks every 10 s, and several pages must not load a monitor more than one
 _PICTURES_KEPT = 4 * CARDS_MOST
-_AT_ONCE = 4  # snapshots under way: a PNG of some megabytes each
+_AT_ONCE = 4  # concurrent snapshots, a PNG of some megabytes each
 _ANSWER_S = 5.0
-_LONGEST_TEXT = 300  # of what a monitor says: it came from the network, and has a megabyte for it
+_LONGEST_TEXT = 300  # characters of a monitor's text, which may be up to a megabyte from the network
 _ALERTS_SHOWN = 8
 
 Text = Annotated[str, Meta(max_length=1000)]
 
 
 class Order(Request, frozen=True):
-    """What an operator wants of the monitor that the page showed: this start of it, and this revision."""
+    """An operator's command for the monitor as shown on the page: for this start and this revision."""
 
     robot: Text
     camera: Text
@@ -46,14 +46,14 @@ class Order(Request, frozen=True):
 
 
 class Answered(msgspec.Struct, frozen=True):
-    """The monitor's own answer; ``done`` is false where it refused, and nothing has changed."""
+    """The monitor's own reply; ``done`` is false if it refused and changed nothing."""
 
     done: bool
     text: str
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True):
-    """One monitor: lengths in metres, times in seconds; None is unknown.  ``more_alerts``: beside those listed."""
+    """One monitor: lengths in metres, times in seconds; None: unknown.  ``more_alerts``: how many are not listed."""
 
     robot: str
     camera: str
@@ -77,8 +77,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Shown(msgspec.Struct, frozen=True, kw_only=True):
-    """The page: ``fault`` of the network, how many monitors there are of which condition, and the worst; ``hidden``:
-    how many more match.
+    """The page: ``fault`` of the network, number of monitors per condition, and the worst ones; ``hidden``: how many
+    more match.
     """
 
     version: str
@@ -90,7 +90,7 @@ class Shown(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Picture(msgspec.Struct, frozen=True):
-    """JPEG with the overlay, when its frame was captured, and the transform's verdict in it."""
+    """JPEG with the overlay, capture time of its frame, and verdict of its transform."""
 
     jpeg: bytes
     stamp_ns: int
@@ -98,9 +98,7 @@ class Picture(msgspec.Struct, frozen=True):
 
 
 class FleetSite:
-    """Any thread may ask.  Orders go through the fleet's own session: whoever may not command by the router's rules
-    can't here.
-    """
+    """Thread-safe.  Commands go through the fleet's own session, so that the router's access rules apply here, too."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -124,11 +122,11 @@ class FleetSite:
         return None
 
     def post(self, path: str) -> Action | None:
-        """Orders."""
+        """The action of a command."""
         return (Order, self.carry_out) if path == "order" else None
 
     def shown(self, find: str = "") -> Shown:
-        """Monitors whose name has ``find`` in it, the worst first."""
+        """Monitors whose name contains ``find``, the worst first."""
         monitors = self._fleet.monitors()
         found = sorted((each for each in monitors if find.lower() in str(each.name).lower()), key=trouble)
         fault = [f"{self._fleet.unreadable} messages can't be read"] if self._fleet.unreadable else []
@@ -142,12 +140,12 @@ class FleetSite:
         )
 
     def carry_out(self, order: Order) -> Answered:
-        """Tell the monitor.  Raises :class:`BadRequest` where it isn't known what became of it, or it isn't there."""
+        """Send the command.  Raises :class:`BadRequest` if the result is unknown or the monitor isn't there."""
         name = self._known(MonitorName(order.robot, order.camera), order.monitor_id).name
         if order.name != "undo" and not order.argument:
             raise BadRequest(f"{order.name} names nothing; what the page showed")
         if order.name == "undo":
-            # Without a name it goes back by one: from what was seen, or someone else has been faster.
+            # Undo without an argument goes back by one: only from the revision shown, unless someone else was faster.
             now = self._ask(name, CommandName.STATE, "", order.monitor_id)[0]
             if now.revision != order.revision:
                 text = f"revision {now.revision} is in force by now, not {order.revision}; look at it first"
@@ -156,7 +154,7 @@ class FleetSite:
         return Answered(reply.done, _short(reply.text))
 
     def picture(self, name: MonitorName, monitor_id: str) -> Picture:
-        """What it sees, at most 8 s old.  Raises :class:`BadRequest`, which says why there is none."""
+        """Its picture, at most 8 s old.  Raises :class:`BadRequest`, which says why there is none."""
         self._known(name, monitor_id)
         key = name, monitor_id
         with self._lock:
@@ -189,7 +187,7 @@ class FleetSite:
         return Picture(jpeg, snapshot.record.stamp_ns, snapshot.record.verdict.value)
 
     def _known(self, name: MonitorName, monitor_id: str) -> MonitorStatus:
-        """Only who was seen is asked: no name that a request makes up."""
+        """The status of a known monitor; names invented by a request are refused."""
         for each in self._fleet.monitors():
             if each.name == name and each.monitor_id == monitor_id:
                 if each.gone_since_ns is not None:

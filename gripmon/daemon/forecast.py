@@ -1,4 +1,4 @@
-"""What a configuration's view lets a monitor expect, before there is any image: what ``gripmon check`` prints."""
+"""The forecast of a configuration's view before there is any image, as ``gripmon check`` prints it."""
 
 from __future__ import annotations
 
@@ -75,9 +75,10 @@ _STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is given
 
 
 def forecast(config: Config) -> Forecast:
-    """What a monitor of this configuration may expect; without network and without its source.
+    """The forecast for a configuration, without network and source.
 
-    A view that shows too little isn't an error: ``in_view.reason`` says what is missing, and what needs more is None.
+    A view that shows too little isn't an error: ``in_view.reason`` says what is missing, and values that need more are
+    None.
     """
     settings, gripper, found = config.settings, config.gripper, promise_of(config)
     policy = settings.monitor.policy
@@ -113,7 +114,7 @@ def forecast(config: Config) -> Forecast:
 
 
 def rig_of(config: Config) -> Rig:
-    """What the configuration looks with and at."""
+    """Camera, gripper and settings of the configuration."""
     return Rig(config.camera, config.gripper, config.settings.monitor, config.taught_edges)
 
 
@@ -124,7 +125,7 @@ def rig_once_taught(config: Config) -> Rig:
 
 
 def promise_of(config: Config) -> Promise | None:
-    """What a frame at the configured pose and opening may promise; None where too little is in view to measure it."""
+    """The promised accuracy at the configured pose and opening; None if too little is visible for a measurement."""
     rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
     if not see(rig, cam_T_grip, opening_m).enough:
         return None
@@ -137,7 +138,7 @@ def promise_of(config: Config) -> Promise | None:
 
 
 def limits_warning(config: Config) -> str | None:
-    """What to say at the start when no transform of the configured view can be valid; None otherwise."""
+    """A warning if no transform of the configured view can be valid; None otherwise."""
     found = promise_of(config)
     if found is None or found.reachable:
         return None
@@ -145,8 +146,8 @@ def limits_warning(config: Config) -> str | None:
 
 
 def _if_bevelled(config: Config) -> Bounds | None:
-    """What a frame may promise if no edge is sharp; None where edges are known as they show, because they were taught
-    or the gripper file was made from images, or where it is said to be exact.
+    """The protection level if no edge is sharp; None if edges are known as they appear, because they were taught or the
+    gripper file was made from images, or if the file is stated to be exact.
     """
     rig = rig_of(config)
     made_of = () if rig.gripper.model.provenance is None else rig.gripper.model.provenance.inputs
@@ -185,7 +186,7 @@ def _reference(config: Config) -> ReferenceValues:
 
 
 def _sound_as_wxyz(config: Config) -> bool:
-    """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips and in
+    """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips with a
     view of them.
     """
     w, x, y, z = config.reference.cam_T_grip.rotation_xyzw
@@ -267,7 +268,7 @@ def _drift(config: Config, expected: AccuracyForecast) -> DriftForecast:
 
 
 def _recalibration(config: Config, expected: AccuracyForecast) -> RecalibrationForecast:
-    """One frame's certainty counts: what is averaged over frames whose errors last is hardly more certain."""
+    """Judged by one frame: an average over frames with lasting errors is hardly more certain."""
     gripper, settings = config.gripper, config.settings.monitor
     taken = gripper.innermost_corners(expected.corners, CORNER_COUNTS[settings.recalibrate_corners])
     points_grip_m = gripper.points_grip_m(config.jaw_opening_m)[gripper.corner_points][taken]

@@ -1,4 +1,4 @@
-"""What a forecast consists of: frozen values, plain enough for JSON."""
+"""The values of a forecast, as frozen structures for JSON."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from gripmon.model.records import Array
 
 Vector = tuple[float, float, float]
 Both = tuple[float | None, float | None]
-"""To the negative and to the positive side, as amounts; None: farther than was sought."""
+"""Amounts to the negative and to the positive side; None: farther than the range that was searched."""
 
 
 class PoseValues(msgspec.Struct, frozen=True):
-    """Six numbers about a pose: of the TCP's position in camera axes (m), of the rotation about them (rad)."""
+    """Six numbers about a pose: the TCP's position in camera axes (m) and the rotation about them (rad)."""
 
     tcp_m: Vector
     rotation_rad: Vector
@@ -27,7 +27,7 @@ class PoseValues(msgspec.Struct, frozen=True):
 
 
 class CameraValues(msgspec.Struct, frozen=True):
-    """The lens, and how wide it sees (rad)."""
+    """The lens and its field of view (rad)."""
 
     model: str
     width_px: int
@@ -38,7 +38,7 @@ class CameraValues(msgspec.Struct, frozen=True):
 
 
 class GripperValues(msgspec.Struct, frozen=True):
-    """The gripper file and how many of what it has; ``jaw_m``: the jaw's travel, None without a jaw."""
+    """The gripper file and its counts; ``jaw_m``: the jaw's travel, None without a jaw."""
 
     file: str
     name: str
@@ -50,7 +50,7 @@ class GripperValues(msgspec.Struct, frozen=True):
 
 
 class ReferenceValues(msgspec.Struct, frozen=True):
-    """The reference calibration, and what shows that it can't be meant so."""
+    """The reference calibration, and values that reveal a mistake in it."""
 
     id: str
     translation_m: Vector
@@ -64,7 +64,7 @@ class ReferenceValues(msgspec.Struct, frozen=True):
 
 
 class FarthestEdge(msgspec.Struct, frozen=True):
-    """The taught edge that lies farthest from the sharp model."""
+    """The taught edge with the largest offset from the sharp model."""
 
     edge: str
     offset_m: float
@@ -72,7 +72,7 @@ class FarthestEdge(msgspec.Struct, frozen=True):
 
 
 class TaughtValues(msgspec.Struct, frozen=True):
-    """What was taught."""
+    """The taught model."""
 
     file: str
     time: str
@@ -82,7 +82,7 @@ class TaughtValues(msgspec.Struct, frozen=True):
 
 
 class JawValues(msgspec.Struct, frozen=True):
-    """Where the opening comes from, and the one that all is predicted at (m)."""
+    """The source of the jaw opening, and the opening of all predictions (m)."""
 
     source: str
     opening_m: float | None
@@ -90,7 +90,7 @@ class JawValues(msgspec.Struct, frozen=True):
 
 
 class CornerView(msgspec.Struct, frozen=True):
-    """A corner as the calibration predicts it."""
+    """A corner predicted by the calibration."""
 
     id: str
     uv_px: tuple[float, float] | None
@@ -115,7 +115,7 @@ class UnknownJaw(msgspec.Struct, frozen=True):
 
 
 class JawAccuracy(msgspec.Struct, frozen=True):
-    """What the opening is known to, and what the image tells of it by itself."""
+    """The uncertainty of the reported opening, and how well the image alone determines it."""
 
     reported_sigma_m: float
     unknown: UnknownJaw
@@ -126,7 +126,7 @@ class JawAccuracy(msgspec.Struct, frozen=True):
 
 
 class DriftForecast(msgspec.Struct, frozen=True):
-    """The smallest step that the drift test notices, and after how many frames it notices others."""
+    """The smallest step that the drift test detects, and its delay in frames for other steps."""
 
     false_alarms_per_day: float
     frames_per_s: float
@@ -139,7 +139,7 @@ class DriftForecast(msgspec.Struct, frozen=True):
 
 
 class RecalibrationForecast(msgspec.Struct, frozen=True):
-    """Whether the corners in view give a pose by themselves, and how certain one frame's is (m)."""
+    """Whether the visible corners determine a pose by themselves, and the uncertainty of one frame (m)."""
 
     corners: int
     coplanar: bool
@@ -151,7 +151,7 @@ class RecalibrationForecast(msgspec.Struct, frozen=True):
 
 
 class Accuracy(msgspec.Struct, frozen=True):
-    """How exact one frame will be; None where too few edges are in view."""
+    """The expected accuracy of one frame; None if too few edges are visible."""
 
     measurement: str
     edges: int
@@ -165,7 +165,7 @@ class Accuracy(msgspec.Struct, frozen=True):
 
 
 class Bounds(msgspec.Struct, frozen=True):
-    """Protection levels: bounds on the error of a transform, and the risk that it lies beyond."""
+    """Protection levels: bounds on the error of a transform, and the risk of exceeding them."""
 
     position_m: float
     rotation_rad: float
@@ -185,7 +185,9 @@ class BorderValues(msgspec.Struct, frozen=True):
 
 
 class CameraFreedom(msgspec.Struct, frozen=True):
-    """How far the camera may move alone along each axis (m, rad) until too little is in view, and what then misses."""
+    """How far the camera may move along each axis alone (m, rad) before too little is visible, and what is missing
+    then.
+    """
 
     shift_m: dict[str, Both]
     turn_rad: dict[str, Both]
@@ -204,7 +206,7 @@ class GapValues(msgspec.Struct, frozen=True):
 
 
 class OpeningCertainty(msgspec.Struct, frozen=True):
-    """How certain the TCP is at which opening, and the bounds that are held against the alert limits."""
+    """The TCP's uncertainty over the openings, and the bounds that are compared with the alert limits."""
 
     opening_m: tuple[float, ...]
     worst_sigma_m: tuple[float | None, ...]
@@ -215,7 +217,7 @@ class OpeningCertainty(msgspec.Struct, frozen=True):
 
 
 class JawTravelForecast(msgspec.Struct, frozen=True):
-    """In which part of the jaw's travel enough is visible; corners and edges: the fewest and the most."""
+    """The part of the jaw's travel in which enough is visible; corners and edges: least and most."""
 
     share: float
     gaps: tuple[GapValues, ...]
@@ -227,7 +229,7 @@ class JawTravelForecast(msgspec.Struct, frozen=True):
 
 
 class InView(msgspec.Struct, frozen=True):
-    """What is seen, how far it is from the border, and how far camera and jaws may move."""
+    """What is visible, its distance from the image border, and how far camera and jaws may move."""
 
     corners: int
     edges: int
@@ -243,11 +245,11 @@ class InView(msgspec.Struct, frozen=True):
 
 
 class Forecast(msgspec.Struct, frozen=True):
-    """What the calibration expects to see: metres, radians, px; positions in the camera frame.
+    """The forecast of a configuration's view: metres, radians, px; positions in the camera frame.
 
-    ``protection``: what one frame may promise; ``protection_if_bevelled``: the same if the gripper has bevels that no
-    one has said or taught, null where it can't; ``needed``: the alert limits that this view could keep, or teaching,
-    where no transform of it can be valid.
+    ``protection``: the protection level of one frame; ``protection_if_bevelled``: the same if the gripper has bevels
+    that are neither stated nor taught, null if that is excluded; ``needed``: the alert limits that this view could
+    meet, or teaching, if no transform of it can be valid.
     """
 
     config: str

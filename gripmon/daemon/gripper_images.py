@@ -1,4 +1,4 @@
-"""What ``gripmon gripper from-images`` is given, read from files."""
+"""The inputs of ``gripmon gripper from-images``, read from files."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from gripmon.model.records import Array
 
 @dataclass(frozen=True)
 class ImagesInputs:
-    """The ``camera``; the jaw's opening in each image (m), None without tables; the reference ``cam_T_grip`` (4, 4)
-    with its covariance (6, 6), if one is named; the ``files`` read.
+    """The ``camera``; the jaw opening in each image (m), None without tables; the reference ``cam_T_grip`` (4, 4) with
+    its covariance (6, 6), if one is given; the ``files`` that were read.
     """
 
     camera: LensSettings
@@ -29,7 +29,7 @@ class ImagesInputs:
 
 
 def images_inputs(images: list[Path], camera: Path, reference: Path | None) -> ImagesInputs:
-    """Read the files; openings from a ``timestamps.csv`` beside each image, where there is one.
+    """Read the files; openings come from a ``timestamps.csv`` beside each image, if there is one.
     :class:`~gripmon.model.errors.InputError`.
     """
     files = [camera, *([] if reference is None else [reference])]

@@ -1,4 +1,4 @@
-"""The loop: a frame in, a transform out; everything that goes wrong is said and survived."""
+"""The loop: a frame in, a transform out; every fault is reported and survived."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gripmon.monitor import Monitor
 from gripmon.record.recorder import Recorder
 
 KEEP_LAST_EVERY_S = 60.0
-"""How old the last transform that is kept may be; references and alerts are kept when they change."""
+"""How old the stored last transform may be; references and alerts are stored when they change."""
 
 
 class Daemon(Loop):
@@ -72,7 +72,7 @@ class Daemon(Loop):
         self._make_reference_known()
 
     def _between(self) -> None:
-        """The frames bring all that there is."""
+        """Nothing to do between frames."""
 
     def _finish(self) -> None:
         self._beside.shutdown()
@@ -86,7 +86,7 @@ class Daemon(Loop):
         several = self._not_alone()
         self._deliver("transform", self._publisher.transform, withheld(record, several) if several else record)
         self._newest = Newest(frame, record, time.monotonic())
-        # The rest is less urgent.
+        # Everything below is less urgent.
         self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:
             self._alert(alert, record.state, frame.stamp_ns, recorded=True)
@@ -102,20 +102,20 @@ class Daemon(Loop):
             self._alert(alert, record.state, frame.stamp_ns)
 
     def _work_beside_the_frames(self) -> None:
-        """The search and the analysis of causes go on in a thread of their own."""
+        """Run the search and the cause analysis in a separate thread."""
         if self._monitor.pending and (self._working is None or self._working.done()):
             self._working = self._beside.submit(self._monitor.run_pending)
 
     def _judge(self, frame: Frame) -> tuple[Frame, FrameRecord, str]:
-        """The frame with its jaw opening, what the monitor makes of it, and the monitor's failure (mostly empty).
+        """The frame with its jaw opening, its record, and the monitor's failure (usually empty).
 
-        A reference that came with the frame is made known first: what follows names it.
+        A new reference is published first, since the messages that follow name it.
         """
         try:
             if self._jaw is not None:
                 frame = dataclasses.replace(frame, jaw_opening_m=self._jaw.opening_m(frame.stamp_ns))
             record = self._monitor.process(frame)
-        except Exception as error:  # noqa: BLE001  said and counted
+        except Exception as error:  # noqa: BLE001  reported and counted
             failure = f"internal error: {in_short(error)}"
             self._log_once("monitor", f"frame {frame.seq}: ", failure, error)
             self._make_reference_known()
@@ -128,10 +128,10 @@ class Daemon(Loop):
         return self._monitor.command(command, stamp_ns)
 
     def _settle(self, answer: CommandReply | None) -> CommandReply | None:
-        """What has been answered as done must be so after a crash, too."""
+        """What is reported as done must persist after a crash."""
         self._make_reference_known()
         self._deliver("state's keeping", self._keep_changes, at_once=True)
-        if self._keeper.failure:  # also after a refusal for this reason: what is there is tried again
+        if self._keeper.failure:  # also after a refusal for this reason: retry with the present state
             self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor_state()))
             if answer and answer.done:
                 text = f"{answer.text}; but {self._keeper.failure}"
@@ -143,7 +143,7 @@ class Daemon(Loop):
         self._keeper.now(self._monitor_state())
 
     def _keep_changes(self, *, at_once: bool = False) -> None:
-        """Keep the monitor's state if it has changed."""
+        """Write the monitor's state if it has changed."""
         if self._monitor.state_revision == self._kept_revision:
             return
         if at_once:
@@ -159,7 +159,7 @@ class Daemon(Loop):
         return state
 
     def _make_reference_known(self) -> None:
-        """Say a new reference, which is kept before: no other one may ever get its revision."""
+        """Publish a new reference after writing it, since no other may ever get its revision."""
         newest, known = self._monitor.reference, self._reference
         if (newest.reference_id, newest.revision) != (known.reference_id, known.revision):
             self._deliver("state's keeping", self._keep_now)
@@ -171,7 +171,7 @@ class Daemon(Loop):
     def _keep_house(self) -> None:
         self._estimates.flush()
         if (now_s := time.monotonic()) >= self._next_keeping_s:
-            # The last transform alone: where to look first after a restart.
+            # Only for the last transform: where to search first after a restart.
             self._next_keeping_s = now_s + KEEP_LAST_EVERY_S
             self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
         super()._keep_house()

@@ -1,4 +1,4 @@
-"""What a configuration says of the network, opened: one session, and everybody on it."""
+"""Opens the network of a configuration: one session, with everything that uses it."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _log = logging.getLogger(__name__)
 
 
 class NameTakenError(NoResultError):
-    """Another monitor has the robot's and camera's name."""
+    """Another monitor has the same robot and camera name."""
 
     exit_code = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """The session (None: nothing is published), the publisher, where the jaw opening (None: with the frames) and a
-    laser's pulses come from, where commands come from, and what the state message says of all this.
+    """The session (None: nothing is published), the publisher, the sources of the jaw opening (None: the frames), of a
+    laser's pulses and of commands, and the reports of all these for the state message.
     """
 
     link: Link | None
@@ -45,8 +45,8 @@ class Network:
 
 
 def open_network(config: Config | SecondConfig, *, take_over: bool = False) -> Network:
-    """Open all of it.  Raises :class:`ConfigError` where it can't be opened as configured, and :class:`NameTakenError`
-    where the robot's and camera's name is another monitor's, unless it is to ``take_over``.
+    """Open the network.  Raises :class:`ConfigError` if it can't be opened as configured, and :class:`NameTakenError`
+    if another monitor has the same robot and camera name, unless ``take_over``.
     """
     jaw = None
     if isinstance(config, Config) and config.settings.jaw.source == "fixed":
@@ -56,7 +56,7 @@ def open_network(config: Config | SecondConfig, *, take_over: bool = False) -> N
     if link is not None:
         settings = config.settings
         with contextlib.ExitStack() as failed:
-            failed.callback(link.close)  # a process must not end while its session is being opened
+            failed.callback(link.close)  # the process must not end while its session is being opened
             presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
             if isinstance(config, SecondConfig):
                 network = _second_on_link(config, link, presence)
@@ -82,7 +82,7 @@ def _open_link(config: Config | SecondConfig) -> Link | None:
 
 
 def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
-    """Who this start of the monitor is; raises :class:`NameTakenError` where another monitor has the name, keeps it."""
+    """The presence of this start of the monitor.  Raises :class:`NameTakenError` if another monitor keeps the name."""
     presence = Presence(link, Keys(robot, camera))
     _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
     others = () if take_over else presence.wait_alone()
@@ -121,8 +121,8 @@ def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Net
 
 
 def _with_metrics(config: Config | SecondConfig, network: Network) -> Network:
-    """With the server for Prometheus beside the publisher where the configuration wants one.  Raises
-    :class:`ConfigError` where it can't listen.
+    """Add the metrics server for Prometheus to the publisher if configured.  Raises :class:`ConfigError` if it can't
+    listen.
     """
     settings = config.settings
     if not settings.metrics.enabled:
@@ -137,7 +137,7 @@ def _with_metrics(config: Config | SecondConfig, network: Network) -> Network:
 
 
 def with_source(reports: Reports, source: Source) -> Reports:
-    """The reports, and what a camera on the network says beside them."""
+    """The reports, extended by those of a camera on the network."""
     if not isinstance(source, NetworkCamera):
         return reports
     malformed = reports.malformed
@@ -147,7 +147,7 @@ def with_source(reports: Reports, source: Source) -> Reports:
 
 
 def _ros2_node(config: Config, link: Link) -> Publisher | None:
-    """The monitor as a ROS 2 node, where the configuration wants one."""
+    """The monitor as a ROS 2 node, if configured."""
     settings = config.settings
     if not settings.ros2.enabled:
         return None
@@ -155,7 +155,7 @@ def _ros2_node(config: Config, link: Link) -> Publisher | None:
 
 
 def _show_listeners(config: Config, link: Link) -> None:
-    """Let ROS 2 know of the topics that frames and jaw opening come from."""
+    """Announce to ROS 2 the topics that are subscribed for frames and jaw opening."""
     settings = config.settings
     jaw, source = settings.jaw, settings.source
     topics = []
@@ -170,7 +170,7 @@ def _show_listeners(config: Config, link: Link) -> None:
 
 
 def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
-    """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
+    """The jaw opening that the robot publishes, on gripmon's key or on a ROS 2 topic."""
     jaw = config.settings.jaw
     travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
     if jaw.source == "zenoh":
@@ -182,7 +182,7 @@ def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
 
 @dataclasses.dataclass(frozen=True)
 class _FixedJaw:
-    """A jaw that never moves, in the form that the daemon asks for; None for a gripper without jaw."""
+    """A fixed jaw opening as a :class:`JawFeed`; None for a gripper without jaw."""
 
     fixed_m: float | None
 

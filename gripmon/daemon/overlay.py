@@ -1,4 +1,4 @@
-"""A monitor's frame as a picture for a person: the image with what was measured in it."""
+"""A monitor's frame as a picture for people: the image with its measurements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gripmon.model.records import Array, FrameRecord, Image, Outlines
 from gripmon.teach.drawing import Canvas, Colour
 from gripmon.teach.snapping import outlines_px
 
-_POINTS = 17  # of each edge: a lens bends it
+_POINTS = 17  # per edge, which the lens bends
 _OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
 _LOST: Colour = (80, 80, 255)
 _CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
@@ -20,7 +20,7 @@ _QUALITY = 85  # of JPEG, percent
 
 
 def outlines_of(camera: Camera, gripper: Gripper, record: FrameRecord) -> Outlines:
-    """The gripper's visible edges where the record's transform has them, px; none without a transform."""
+    """The gripper's visible edges at the record's transform, px; none without a transform."""
     if record.cam_T_grip is None:
         return ()
     opening_m = record.jaw_opening_m if gripper.has_jaw else None
@@ -29,15 +29,15 @@ def outlines_of(camera: Camera, gripper: Gripper, record: FrameRecord) -> Outlin
 
 
 def overlay(image: Image, record: FrameRecord, outlines: Outlines, width_px: int) -> bytes:
-    """JPEG of about ``width_px`` columns: the outlines, green if the transform is valid, orange if suspect, and the
-    corners, yellow where they were used, red where not.
+    """JPEG about ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners,
+    yellow if they were used, red if not.
     """
     scale = min(1.0, width_px / image.shape[1])
     smaller = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     canvas = Canvas(np.asarray(smaller), max(1, round(width_px / smaller.shape[1])))
 
     def placed(points_px: object) -> Array:
-        """Centres of pixels are at whole numbers."""
+        """Pixel centres are at integers."""
         return (np.asarray(points_px, dtype=float) + 0.5) * scale - 0.5
 
     for line_px in outlines:

@@ -1,4 +1,4 @@
-"""Frames that can wait, through the monitor as the daemon drives it: images, a video, or what was recorded."""
+"""Replays images, a video or a recording through the monitor as the daemon drives it."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ _LATENCY_BIN = 0.02  # natural logarithm
 
 
 class Past(NamedTuple):
-    """What a monitor went through beside its frames."""
+    """What affected a monitor besides its frames."""
 
     state: MonitorState | None = None
-    """What it began with; None: with the configured reference."""
+    """Its initial state; None: the configured reference."""
     commands: tuple[RecordedCommand, ...] = ()
-    """In their order; each came after the frame that it names."""
+    """In order; each came after the frame that it names."""
 
 
 NOTHING_BEFORE = Past()
@@ -70,14 +70,14 @@ def replay(
     past: Past = NOTHING_BEFORE,
     warn: Callable[[str], None] = _log.warning,
 ) -> Iterator[FrameRecord]:
-    """Process every frame of a source that isn't live: one record for each, in order; the same input gives the same
-    records, ``latency_ns`` aside.
+    """Process every frame of a source that isn't live: one record each, in order; the same input gives the same
+    records, except for ``latency_ns``.
 
-    ``source``: a folder of images or a video file, or what :func:`gripmon.open_source` gave, which the caller closes.
-    ``recorder`` gets what a recording holds; ``past`` is what the monitor went through before and beside the frames;
-    ``warn`` gets a line of text when something beside the frames is wrong.
+    ``source``: a folder of images or a video file, or the result of :func:`gripmon.open_source`, which the caller
+    closes.  ``recorder`` records the replay; ``past``: initial state and commands; ``warn`` is called with a line of
+    text if something other than a frame is wrong.
 
-    Raises :class:`SourceError` for a source that can't be read.  A frame that can't be used is a record with a reason.
+    Raises :class:`SourceError` for a source that can't be read.  An unusable frame gives a record with a reason.
     """
     if isinstance(source, str | Path):
         with open_source(source) as opened:
@@ -110,27 +110,27 @@ def replay(
 
 
 def _repeated(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
-    """Give the monitor a command as it was given then, at the same time; what became of it now."""
+    """Repeat a recorded command at the same time; returns it with its result now."""
     try:
         answer = monitor.command(Command(then.name, then.argument), then.stamp_ns)
-    except Exception as error:  # noqa: BLE001  as the daemon does
+    except Exception as error:  # noqa: BLE001  like the daemon
         return msgspec.structs.replace(then, done=False, text=f"internal error: {in_short(error)}")
     return msgspec.structs.replace(then, done=answer.done, text=answer.text)
 
 
 class Counts:
-    """What became of the frames, in memory that does not grow with them."""
+    """Statistics of the frames, in memory that doesn't grow with them."""
 
     def __init__(self) -> None:
         self.frames = 0
         self.usable = 0
         self._verdicts: Counter[str] = Counter()
-        self._reasons: Counter[str] = Counter()  # why nothing was measured, by what comes before the colon
+        self._reasons: Counter[str] = Counter()  # why nothing was measured, by the text before the colon
         self._first_failure = ""
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
-        """One frame more."""
+        """Count one frame."""
         self.frames += 1
         self.usable += record.source is not Origin.HELD
         self._verdicts[record.verdict] += 1
@@ -155,7 +155,7 @@ class Counts:
         return text
 
     def _median_ms(self) -> float:
-        """To one percent."""
+        """The median latency, ms, to one per cent."""
         below = 0
         for index in sorted(self._latencies):
             below += self._latencies[index]
@@ -165,7 +165,7 @@ class Counts:
 
 
 class FrameReplay:
-    """A wrist camera's replay: :meth:`records` once, then :meth:`summary`."""
+    """A replay of a wrist camera: call :meth:`records` once, then :meth:`summary`."""
 
     def __init__(
         self, source: Source, config: Config, recorded: RecordedRun | None, warn: Callable[[str], None]
@@ -177,13 +177,13 @@ class FrameReplay:
 
     @contextmanager
     def recorded_in(self, path: Path | None) -> Iterator[None]:
-        """Also a recording (None: none): of recorded frames one that shows both runs."""
+        """Also record the replay (None: don't); for recorded frames together with the recorded run."""
         both = None if self._recorded is None or path is None else self._recorded.compared_in(path)
         with both or one_recording(path, self._config) as self._recorder:
             yield
 
     def records(self, step: Callable[[], None]) -> Iterator[FrameRecord]:
-        """One for each frame; ``step`` is called after it."""
+        """One record per frame; ``step`` is called after each."""
         recorded = self._recorded
         past = NOTHING_BEFORE if recorded is None else Past(recorded.state, recorded.source.commands)
         for record in replay(self._source, self._config, self._recorder, past, self._warn):
@@ -194,17 +194,17 @@ class FrameReplay:
             step()
 
     def summary(self) -> list[str]:
-        """What became of the frames, and what differs from a recording."""
+        """A summary of the frames, and of the differences from the recorded run."""
         return [self._counts.summary(), *([] if self._recorded is None else [self._recorded.summary()])]
 
     @property
     def usable(self) -> bool:
-        """Whether any frame was."""
+        """Whether any frame was usable."""
         return self._counts.usable > 0
 
 
 class PulseReplay:
-    """A second camera's, of its table's pulses."""
+    """A replay of a second camera, with the pulses of its table."""
 
     def __init__(self, source: Source, config: SecondConfig) -> None:
         self._source, self._config = source, config
@@ -213,14 +213,14 @@ class PulseReplay:
         self.length = len(source) if isinstance(source, Sized) else None
 
     def recorded_in(self, path: Path | None) -> AbstractContextManager[None]:
-        """A second camera's replay makes none."""
+        """A replay of a second camera can't be recorded."""
         if path is not None:
             right = "gripmon run with source: {kind: folder} and --out records"
             raise InputError(f"is for wrist cameras; {right}", "recording")
         return nullcontext()
 
     def records(self, step: Callable[[], None]) -> Iterator[SpotRecord]:
-        """One for each pulse; ``step`` is called after each frame."""
+        """One record per pulse; ``step`` is called after each frame."""
         for record in self._config.pulsed_watch().replayed(self._frames(step), self._config.pulses):
             yield record
             self._count, self._used = self._count + 1, self._used + record.used
@@ -228,13 +228,13 @@ class PulseReplay:
                 self._faults[record.fault] += 1
 
     def summary(self) -> list[str]:
-        """What became of the pulses."""
+        """A summary of the pulses."""
         why = ", ".join(f"{number} {fault}" for fault, number in self._faults.most_common())
         return [f"{self._count} pulses: {self._used} used{f'; {why}' if why else ''}"]
 
     @property
     def usable(self) -> bool:
-        """Whether any pulse was."""
+        """Whether any pulse was used."""
         return self._used > 0
 
     def _frames(self, step: Callable[[], None]) -> Iterator[Frame]:
@@ -254,9 +254,9 @@ def open_replay(
     camera: str | None = None,
     episode: int | None = None,
 ) -> Iterator[FrameReplay | PulseReplay]:
-    """A folder of images, a video, an episode, or recordings of one run, to be replayed with a configuration (None: the
-    recorded one); ``fps`` as for :func:`gripmon.open_source`.  ``camera`` and ``episode`` say which of several is meant
-    (None: as the configuration's source says).  ``warn`` gets a line for each thing that is odd.
+    """Open a folder of images, a video, an episode, or recordings of one run for a replay with a configuration (None:
+    the recorded one); ``fps`` as for :func:`gripmon.open_source`.  ``camera`` and ``episode`` select one of several
+    (None: as in the configuration's source).  ``warn`` is called with one line for each oddity.
 
     Raises :class:`InputError` and :class:`NoResultError`.
     """
@@ -291,7 +291,7 @@ def open_replay(
 
 
 def _are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are recordings, rather than images or a video; only recordings may be several."""
+    """Whether the paths are recordings, of which there may be several, rather than images or a video."""
     other = next((p for p in paths if not (recordings_below(p) if p.is_dir() else p.suffix.lower() == ".rrd")), None)
     if other is not None and len(paths) > 1:
         raise InputError(f"{other}: isn't an .rrd file; one input, or several .rrd files of one run")
@@ -299,7 +299,7 @@ def _are_recordings(paths: Sequence[Path]) -> bool:
 
 
 def _refuse_empty_folders(paths: Sequence[Path]) -> None:
-    """Before anything else is asked for, which would not help."""
+    """Refuse folders without input, before asking for anything else."""
     for path in paths:
         if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():
             continue
@@ -343,8 +343,8 @@ def _open_input(
 def as_configured(
     settings: EpisodeSettings, config: Config | None, camera: str | None, episode: int | None
 ) -> EpisodeSettings:
-    """The settings of an episode that was named, with the camera and the opening that a configuration's source of that
-    kind says; ``camera`` and ``episode`` replace them.
+    """The settings of an episode with the camera and the opening of the configuration's source, if that is of the same
+    kind; ``camera`` and ``episode`` override them.
     """
     given = None if config is None else config.settings.source
     if isinstance(settings, BagSettings):
@@ -359,7 +359,7 @@ def as_configured(
 
 
 def lens_fault(lens: LensSettings, config: Config) -> str | None:
-    """How the camera calibration that frames bring differs from the configuration's, in words; None: it doesn't."""
+    """How the camera calibration in the input differs from the configuration's, in words; None: it doesn't."""
     try:
         off = compare_cameras(GivenCamera(config.settings.camera, (), None), GivenCamera(lens, (), None))
     except CalibrationError as error:

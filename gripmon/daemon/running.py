@@ -1,7 +1,6 @@
 """The live monitor: newest frame in, transform out, everything supervised, a clean stop.
 
-One thread does all of it; the source reads ahead, Zenoh sends and the
-recording writes in threads and processes of their own.
+One thread runs the loop; the source, Zenoh and the recording have their own threads and processes.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
 from gripmon.record.recorder import Recorder
 
-_UNHURRIED_S = 10.0  # for the recording, when no one asked for a stop
+_UNHURRIED_S = 10.0  # for the recording, if no stop was requested
 _SHORTEST_CLOSE_S = 0.5
 _SWITCH_INTERVAL_S = 0.0005
 
@@ -53,17 +52,17 @@ def run(
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
     **beside: Unpack[Beside],
 ) -> int:
-    """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
+    """Run until the source ends, ``duration_s`` is over, or a signal arrives; then close everything that was passed in.
 
-    In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
-    frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
-    the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
-    from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`); ``outlines``:
-    what snapshots show of the gripper.  The logger ``gripmon`` is left as the caller set it up (see
+    In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates``: a file that gets one JSON line per
+    frame; raises OSError if it can't be opened.  ``jaw``, if given, replaces the frames' own jaw opening.  ``keeper``
+    stores the monitor's state for a restart.  ``reports``: additional values of the state message; ``notices``: alerts
+    from the start-up; ``stop``: a stop request from the start-up (:func:`gripmon.model.stopping.signals_exit`);
+    ``outlines``: the gripper's outlines for snapshots.  The logger ``gripmon`` is left as the caller set it up (see
     :func:`gripmon.daemon.service.log_to_stderr`).
 
-    Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
-    or internal errors persisted; 130 SIGINT.
+    Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame, the source failed, or
+    internal errors persisted; 130 SIGINT.
     """
     stop = stop or StopRequest()
     with _closing(source, publisher, recorder, settings, estimates, stop, beside, jaw, keeper, outlines) as lines:
@@ -87,9 +86,9 @@ def run_second(
     stop: StopRequest | None = None,
     **beside: Unpack[Beside],
 ) -> int:
-    """The same for a second camera: see :class:`SecondCamera`.  ``lines`` is a file that gets one JSON line a pulse.
+    """The same for a second camera: see :class:`SecondCamera`.  ``lines``: a file that gets one JSON line per pulse.
 
-    Returns the exit code: also 3 if there were pulses and none showed its spot.
+    Returns the exit code, which is also 3 if no pulse had a usable spot.
     """
     stop = stop or StopRequest()
     with _closing(source, publisher, recorder, settings, lines, stop, beside) as file:
@@ -112,12 +111,12 @@ def _closing(
     keeper: StateKeeper | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
 ) -> Iterator[EstimatesFile]:
-    """The file for lines; ``beside`` gets what is wrong with all of these to report, and what makes snapshots.
+    """Opens the file for lines, and adds the faults of all these parts and the snapshots to ``beside``.
 
-    Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that.
+    Signals request a stop.  Everything is closed in any case, which a second signal can't interrupt.
     """
     with signals_request(stop), contextlib.ExitStack() as closing:
-        # All of these run, the last one first.
+        # All of these run, in reverse order.
         if keeper is not None:
             closing.callback(keeper.close)
         closing.callback(publisher.close)
@@ -142,10 +141,10 @@ def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
 
 @contextlib.contextmanager
 def _steady_interpreter() -> Iterator[None]:
-    """No pauses that the loop doesn't choose: it collects garbage itself, and other threads give way sooner."""
+    """Avoid unexpected pauses: the loop collects garbage itself, and other threads yield sooner."""
     interval_s, collected = sys.getswitchinterval(), gc.isenabled()
     gc.collect()
-    gc.freeze()  # what start-up has built stays: no later collection walks through it
+    gc.freeze()  # later collections skip the objects created at start-up
     gc.disable()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:

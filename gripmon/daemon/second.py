@@ -1,4 +1,4 @@
-"""The loop of a second camera: frames and a laser's pulses in, a judged spot a pulse out."""
+"""The loop of a second camera: frames and laser pulses in, one judged spot per pulse out."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ class SecondCamera(Loop):
         no_spot_alert_after_s: float | None = None,
         **beside: Unpack[Beside],
     ) -> None:
-        """``table``: all pulses of recorded frames; ``feed``: where they come from otherwise.
+        """``table``: all pulses of recorded frames; ``feed``: the source of pulses otherwise.
 
-        ``no_spot_alert_after_s``: without a spot that is believed for so long there is an alert; None: never.
+        ``no_spot_alert_after_s``: time without an accepted spot after which there is an alert; None: never.
         """
         super().__init__(source, publisher, recorder, settings, stop, **beside)
         self._pulsed = pulsed
@@ -80,8 +80,8 @@ class SecondCamera(Loop):
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
         self._believed_s = self._start_s
         self._pulses = 0
-        self._failure = ""  # of the last pulse: of the code here, not of the camera
-        self._news = False  # a pulse was judged since the last frame, or that has failed
+        self._failure = ""  # internal error of the last pulse
+        self._news = False  # a pulse was judged since the last frame, or judging failed
         self._unused = "no pulse yet"
         self._said_unused: PulseFault | None = None  # in the log
 
@@ -94,7 +94,7 @@ class SecondCamera(Loop):
 
     def _between(self) -> None:
         now_s = time.monotonic()
-        for _ in range(_PULSES_A_TURN):  # so that no one can keep frames waiting by sending pulses
+        for _ in range(_PULSES_A_TURN):  # so that many pulses can't delay frames
             told = None if self._feed is None else self._feed.poll()
             if told is None:
                 break
@@ -110,7 +110,7 @@ class SecondCamera(Loop):
         shown: list[Shown] = []
         try:
             shown, alerts, refused = self._pulsed.frame(frame)
-        except Exception as error:  # noqa: BLE001  said and counted
+        except Exception as error:  # noqa: BLE001  reported and counted
             failure = self._failed(f"frame {frame.seq}: ", error)
         self._judge(shown)
         self._news = self._news or bool(failure)
@@ -124,7 +124,7 @@ class SecondCamera(Loop):
         self._end_of_frame(frame, failure, judged.state)
 
     def _end_of_frame(self, frame: Frame, failure: str, state: State) -> None:
-        """Errors count by pulses: between them a failure is neither over nor one more."""
+        """Errors are counted per pulse: between pulses a failure neither ends nor counts again."""
         over = not failure and self._watch.errors_in_a_row > 0
         if self._news or self._faults or over:
             undelivered = "; ".join(self._faults.values())
@@ -134,7 +134,7 @@ class SecondCamera(Loop):
                 self._alert(alert, state, frame.stamp_ns)
 
     def _judged(self, refused: str, failure: str) -> Judged:
-        """How things stand with this frame."""
+        """The judgement of this frame."""
         if failure:
             return Judged(State.LOST, Verdict.UNKNOWN, usable=not refused, reason=failure)
         gap = self._pulsed.displacement
@@ -149,14 +149,14 @@ class SecondCamera(Loop):
         )
 
     def _judge(self, shown: Iterable[Shown]) -> None:
-        """Judge pulses that are complete, and pass on what became of each."""
+        """Judge complete pulses and pass on the results."""
         for each in shown:
             began_ns = time.monotonic_ns()
             self._pulses += 1
             self._news = True
             try:
                 outcome, self._failure = self._pulsed.judge(each), ""
-            except Exception as error:  # noqa: BLE001  said and counted
+            except Exception as error:  # noqa: BLE001  reported and counted
                 self._failure = self._failed(f"pulse {each.pulse.number}: ", error)
                 outcome = self._pulsed.unjudged(each, PulseFault.INTERNAL, self._failure)
             latency_ns = time.monotonic_ns() - began_ns
@@ -190,7 +190,7 @@ class SecondCamera(Loop):
             self._alert(alert, state, stamp_ns, recorded=recorded)
 
     def _look_for_silence(self, now_s: float) -> None:
-        """A robot that forgot its laser: nothing would ever be noticed again."""
+        """Alert if there are no spots, e.g. because the robot no longer switches its laser on."""
         if self._no_spot_s is None or not self._source.live:
             return
         silence_s = now_s - self._believed_s
@@ -226,7 +226,7 @@ class SecondCamera(Loop):
         return CommandReply(name, done, text, *self._in_force, state)
 
     def _frame_record(self, frame: Frame, judged: Judged) -> FrameRecord:
-        """What a snapshot says of a frame."""
+        """The record of a frame for a snapshot."""
         reference_id, revision = self._in_force
         return FrameRecord(
             seq=frame.seq, stamp_ns=frame.stamp_ns, verdict=judged.verdict, state=judged.state, source=Origin.HELD,

@@ -1,4 +1,4 @@
-"""Answers to ``snapshot``: the loop hands over the newest frame, a thread makes a file of its image."""
+"""Replies to ``snapshot``: the loop passes on the newest frame, and a thread encodes its image."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from gripmon.model.records import (
 _log = logging.getLogger(__name__)
 
 LARGEST_EXACT_BYTES = 32 << 20
-"""Pixels beyond this are sent as JPEG with 8 bits: a PNG would take seconds, and is hardly smaller than they are."""
+"""Larger images are sent as JPEG with 8 bits: a PNG would take seconds, and is hardly smaller than the pixels."""
 
 _LARGEST_FILE_BYTES = 40 << 20
 _JPEG_QUALITY = 95
 _WAITING_MOST = 2
-_NICENESS = 10  # the loop goes first
+_NICENESS = 10  # the loop has priority
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
 class Newest(NamedTuple):
-    """The newest frame, what was made of it, and when (monotonic)."""
+    """The newest frame, its record, and when it was judged (monotonic)."""
 
     frame: Frame
     record: FrameRecord
@@ -58,7 +58,7 @@ class _Job(NamedTuple):
 
 
 class Snapshots:
-    """Completes replies in a thread of its own, which is started by the first; ``outlines`` gives a record's."""
+    """Completes replies in a separate thread, started on demand; ``outlines``: the gripper's outlines for a record."""
 
     def __init__(self, outlines: Callable[[FrameRecord], Outlines] = lambda _: ()) -> None:
         self._outlines = outlines
@@ -66,7 +66,7 @@ class Snapshots:
         self._thread: threading.Thread | None = None
 
     def answer(self, asked: PendingCommand, reply: CommandReply, newest: Newest | None) -> None:
-        """Send the reply with the newest frame and its record, soon; without one it is refused."""
+        """Send the reply with the newest frame and its record, later; refuse if there is no frame."""
         if newest is None:
             asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))
             return
@@ -81,7 +81,7 @@ class Snapshots:
             self._thread.start()
 
     def close(self) -> None:
-        """Complete what is in hand, if that takes no longer than a second."""
+        """Complete pending replies, within a second each for queue and thread."""
         if self._thread is not None:
             with contextlib.suppress(queue.Full):
                 self._jobs.put(None, timeout=CLOSE_WITHIN_S)
@@ -93,7 +93,7 @@ class Snapshots:
         while (job := self._jobs.get()) is not None:
             try:
                 _complete(job, self._outlines(job.newest.record))
-            except Exception as error:  # noqa: BLE001  said to the asker
+            except Exception as error:  # noqa: BLE001  reported to the sender
                 _log.debug("snapshot", exc_info=error)
                 job.asked.answer(CommandError(CommandFault.INTERNAL, in_short(error)))
 
@@ -111,10 +111,10 @@ def _complete(job: _Job, outlines: Outlines) -> None:
 
 
 def encode(image: object) -> tuple[SnapshotImage, bytes] | None:
-    """A file of an image (H, W) or (H, W, 3), BGR, uint8, uint16 or float32 in 0..1; None for what is none of these.
+    """Encode an image (H, W) or (H, W, 3), BGR, uint8, uint16 or float32 in 0..1; None for anything else.
 
-    PNG with the very pixels, floats rounded to 16 bits; JPEG for more than :data:`LARGEST_EXACT_BYTES`, and None if
-    even that is larger than a reply may be.
+    PNG with the exact pixels, floats rounded to 16 bits; JPEG above :data:`LARGEST_EXACT_BYTES`, and None if even that
+    is too large for a reply.
     """
     pixels = _integers(image)
     if pixels is None:

@@ -1,4 +1,4 @@
-"""Everything that a configuration names, opened: a running monitor with its network, source, recording and state."""
+"""Opens everything that a configuration names: a running monitor with its network, source, recording and state."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def run_file(
     view: str | None = None,
     take_over: bool = False,
 ) -> int:
-    """Run the daemon on a configuration file, a wrist camera's or a second camera's; returns the exit code.
+    """Run the daemon on a configuration file of a wrist camera or second camera; returns the exit code.
 
-    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``:
+    ``out``: a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), created if missing.  ``view``:
     "auto", "web", "native" or "server"; ``verbose`` and ``log_json``: see
     :func:`gripmon.daemon.service.log_to_stderr`; the rest as in :func:`run_monitor`.
     """
@@ -94,15 +94,15 @@ def run_monitor(
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
-    ``out`` is a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
-    :func:`gripmon.model.stopping.signals_exit`, in which a program with a terminal calls this.  ``truth_tcp_m``, which
-    a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it goes into the
-    recording.  ``on_network`` is called when the publisher is open, before the camera is.  ``keep_state``: what
-    survives a restart is read from the configuration's state file, unless ``fresh_state``, and kept there; and it is
-    logged when the view can't keep the alert limits.  ``view`` shows it live; ``take_over``: see
+    ``out``: a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
+    :func:`gripmon.model.stopping.signals_exit`, inside which a program with a terminal calls this.  ``truth_tcp_m``, of
+    a simulation: the TCP's true position in the camera frame for a frame's ``seq``, for the recording.  ``on_network``
+    is called when the publisher is open, before the camera is.  ``keep_state``: the state that survives a restart is
+    read from the configuration's state file, unless ``fresh_state``, and written there; and a warning is logged if the
+    view can't meet the alert limits.  ``view``: show it live; ``take_over``: see
     :func:`gripmon.daemon.network.open_network`.
 
-    Raises :class:`InputError` for what can't be opened as configured or written to ``out``.
+    Raises :class:`InputError` for anything that can't be opened as configured or written to ``out``.
     """
     settings = config.settings
     cv2.setNumThreads(1)
@@ -122,8 +122,8 @@ def run_monitor(
         network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         on_network()
-        compiled = warm_up()  # before frames come
-        gc.collect()  # in 0.1 s; of what is kept out of sight here the loop's own start needn't look through anything
+        compiled = warm_up()  # before the first frame
+        gc.collect()  # takes 0.1 s; the loop's own collection then skips the frozen objects
         gc.freeze()
         source = open_configured(config, network.link)
         opened.callback(source.close)
@@ -159,7 +159,7 @@ def run_monitor(
 
 
 def _outlines(config: Config, record: FrameRecord) -> Outlines:
-    from gripmon.daemon.overlay import outlines_of  # what draws isn't loaded before someone asks
+    from gripmon.daemon.overlay import outlines_of  # the drawing code is loaded only when needed
 
     return outlines_of(config.camera, config.gripper, record)
 
@@ -173,7 +173,7 @@ def _run_second(
     *,
     take_over: bool,
 ) -> int:
-    """The same for a second camera, which keeps no state."""
+    """The same for a second camera, which has no state."""
     settings = config.settings
     cv2.setNumThreads(1)
     live = None if view is None else LiveView(settings.view, view, config.path)
@@ -210,7 +210,7 @@ def _run_second(
 
 
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
-    """The file for what survives a restart; None without one."""
+    """The state file; None without one."""
     path = config.state_path
     if path is None:
         return None
@@ -219,13 +219,13 @@ def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     except StateFileError as error:
         raise ConfigError(config.path, "state.file", str(error)) from None
     if kept.configured.revision != config.reference.revision:
-        # The one who knew the revisions so far was set aside, and what follows may fail: a camera that can't be opened.
+        # The file that knew the revisions was set aside, and what follows may fail, e.g. opening the camera.
         kept.write(MonitorState((kept.configured,)))
     return kept
 
 
 def _notices(kept: StateFile | None) -> list[Alert]:
-    """What was found at the start, as alerts."""
+    """Findings at the start, as alerts."""
     texts = () if kept is None else kept.notices
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
 
@@ -233,7 +233,7 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 def _open_recorder(
     config: Config | SecondConfig, out: Path | None, source: Source, live: LiveView | None, **recorded: Any
 ) -> Recorder:
-    """Of either kind of camera; ``recorded`` as :func:`gripmon.record.write.open_recorder` takes it."""
+    """For either kind of camera; ``recorded``: arguments of :func:`gripmon.record.write.open_recorder`."""
     settings, patience_s = config.settings, 0.0 if source.live else RECORDING_PATIENCE_S
     view = None if live is None else live.settings
     try:
@@ -249,10 +249,10 @@ def _open_recorder(
 
 
 class LiveView:
-    """A viewer on the stream that the recording serves."""
+    """A viewer for the stream that the recording serves."""
 
     def __init__(self, settings: ViewSettings, kind: str, config_path: Path) -> None:
-        """Raises :class:`InputError` where it can't be shown."""
+        """Raises :class:`InputError` if it can't be shown."""
         self.settings = settings
         self._native = kind == "native" or (kind == "auto" and has_display())
         self._web = kind == "web" or (kind == "auto" and not has_display())
@@ -264,7 +264,7 @@ class LiveView:
                 raise ConfigError(config_path, f"view.{key}", f"{port} is in use on 127.0.0.1", "another port")
 
     def open(self, opened: contextlib.ExitStack) -> None:
-        """Start the viewer, which shows the stream as soon as there is one; a page ends with ``opened``."""
+        """Start the viewer, which shows the stream as soon as it exists; a web page ends with ``opened``."""
         url = self.settings.stream_url
         if self._web:
             try:
@@ -278,7 +278,7 @@ class LiveView:
             threading.Thread(target=self._open_window, name="viewer", daemon=True).start()
 
     def _open_window(self) -> None:
-        """A viewer that finds no server gives up: it is started when there is one.  The window is the user's: it stays
+        """Start the viewer when there is a server, without which it exits.  The window belongs to the user: it stays
         until it is closed.
         """
         end_s = time.monotonic() + _SERVER_STARTS_S

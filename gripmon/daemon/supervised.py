@@ -1,4 +1,4 @@
-"""What every loop of a daemon has: the source supervised, everything that goes wrong said and survived, a clean end."""
+"""The base of every daemon loop: a supervised source, faults that are reported and survived, a clean end."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 _RESTS_FOR = 3.0
-"""After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
+"""After a command the next one waits this many times its duration: a quarter of the time is for commands."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
@@ -68,10 +68,10 @@ class Beside(TypedDict, total=False):
 
 
 class Loop(ABC):
-    """Runs in the thread that calls :meth:`run`.  What is done with a frame, and what is judged, is the subclass's."""
+    """Runs in the thread that calls :meth:`run`.  Subclasses process and judge the frames."""
 
     verdict_of = "transform"
-    """What the verdict is about, in the log."""
+    """What the verdict is about, for the log."""
 
     def __init__(
         self,
@@ -97,8 +97,8 @@ class Loop(ABC):
         self._newest: Newest | None = None
         self._reports = reports or Reports()
         self._notices = notices
-        self._open_alerts: tuple[OpenAlert, ...] = ()  # of what judges the frames
-        self._proposal_id = ""  # the new reference that waits for an operator
+        self._open_alerts: tuple[OpenAlert, ...] = ()  # of the monitor
+        self._proposal_id = ""  # id of the new reference that waits for an operator
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
@@ -107,13 +107,13 @@ class Loop(ABC):
         self._stop = stop
         self._service = ServiceManager()
         self._source_broke = False
-        self._faults: dict[str, str] = {}  # since the frame before: what could not be delivered, and why
+        self._faults: dict[str, str] = {}  # since the previous frame: what could not be delivered, and why
         self._said_faults: dict[str, str] = {}  # in the log
 
     @property
     @abstractmethod
     def _in_force(self) -> tuple[str, int]:
-        """Id and revision of the calibration that all is judged against."""
+        """Id and revision of the calibration in force."""
 
     @abstractmethod
     def _begin(self) -> None:
@@ -121,18 +121,18 @@ class Loop(ABC):
 
     @abstractmethod
     def _handle(self, frame: Frame) -> None:
-        """Judge a frame, and pass on what is to be said of it."""
+        """Judge a frame and pass on the results."""
 
     @abstractmethod
     def _between(self) -> None:
-        """Before every look at the source; it may not take long."""
+        """Called before every read of the source; must return quickly."""
 
     @abstractmethod
     def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
-        """Do what a command says; it may raise."""
+        """Carry out a command; may raise."""
 
     def _settle(self, answer: CommandReply | None) -> CommandReply | None:
-        """What has to be done before a command is answered (None: it has failed); the answer, perhaps with more."""
+        """Called before a command is answered (None: it failed); returns the answer, possibly extended."""
         return answer
 
     @abstractmethod
@@ -140,9 +140,9 @@ class Loop(ABC):
         """After the last frame, before the last state message."""
 
     def run(self, duration_s: float | None = None) -> int:
-        """Handle frames until the source ends, the time is over, errors persist, or a stop is requested.
+        """Handle frames until the source ends, ``duration_s`` is over, errors persist, or a stop is requested.
 
-        Returns the exit code.  A stop request takes effect after the frame in hand, or half a second at the latest.
+        Returns the exit code.  A stop request takes effect after the current frame, within half a second.
         """
         _log.info("watching %s/%s against %s, revision %d", self._robot, self._camera, *self._in_force)
         self._begin()
@@ -165,7 +165,7 @@ class Loop(ABC):
         return exit_code
 
     def _next_item(self) -> bool:
-        """Wait for the source and handle what it gives; False if there is nothing more to do."""
+        """Wait for the source and handle its item; False if there is nothing more to do."""
         self._obey()
         self._between()
         if not self._source.live and not self._recorder.has_room:
@@ -174,7 +174,7 @@ class Loop(ABC):
             return True
         try:
             item = self._source.read()
-        except Exception as error:  # noqa: BLE001  said below, and the end of the loop
+        except Exception as error:  # noqa: BLE001  reported below, and ends the loop
             self._watch.message = f"the source failed: {in_short(error)}"
             _log.debug("%s", self._watch.message, exc_info=error)
             self._alert(
@@ -199,7 +199,7 @@ class Loop(ABC):
         return not self._watch.gives_up
 
     def _obey(self) -> None:
-        """Carry out one command, if one waits: never so many that frames wait for them."""
+        """Carry out one pending command, if any, but not so many that they delay frames."""
         begun_s = time.monotonic()
         asked = None if self._commands is None or begun_s < self._next_command_s else self._commands.poll()
         if asked is None:
@@ -214,7 +214,7 @@ class Loop(ABC):
         try:
             answer = self._carry_out(command, stamp_ns)
             said = f"{'done' if answer.done else 'refused'}: {answer.text}"
-        except Exception as error:  # noqa: BLE001  said, to the asker, too
+        except Exception as error:  # noqa: BLE001  reported, also to the sender
             said = f"internal error: {in_short(error)}"
             _log.debug("command %s", command.name, exc_info=error)
         _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, said)
@@ -229,10 +229,10 @@ class Loop(ABC):
             self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
 
     def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
-        """Hand something to one receiver, whose failure is no other's; False, said and counted, if it failed."""
+        """Pass something to one receiver, whose failure must not affect others; False if it failed, which is logged."""
         try:
             put(*values, **named)
-        except Exception as error:  # noqa: BLE001  said here, an alert at the end of the frame
+        except Exception as error:  # noqa: BLE001  logged here, an alert at the end of the frame
             self._faults[what] = f"{what} not delivered: {in_short(error)}"
             self._log_once(what, "", self._faults[what], error)
             return False
@@ -240,17 +240,17 @@ class Loop(ABC):
         return True
 
     def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:
-        """Say a fault, but not again until it has changed or was over."""
+        """Log a fault, and again only when it changes or recurs."""
         if self._said_faults.get(what) != text:
             self._said_faults[what] = text
             _log.error("%s%s", where, text)
             _log.debug("%s%s", where, what, exc_info=error)
 
     def _alert(self, alert: Alert, state: State, stamp_ns: int | None = None, *, recorded: bool = False) -> None:
-        """Say it on the network and in the log.
+        """Publish and log an alert.
 
-        ``stamp_ns`` is that of the frame that the alert belongs to, if there is one; ``recorded`` if the frame's record
-        carries it into the recording.
+        ``stamp_ns``: of the alert's frame, if there is one; ``recorded``: the frame's record already has it in the
+        recording.
         """
         about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
         alert = self._with_what_to_type(alert)
@@ -270,21 +270,21 @@ class Loop(ABC):
             self._deliver("alert's recording", self._recorder.alert, message)
 
     def _not_alone(self) -> str:
-        """What to say while other monitors have this name, else empty: no one can tell then whose transform is right,
-        so that none is published.
+        """A message while other monitors have this name, else empty; no transform is published then, since readers
+        can't know which one is right.
         """
         nobody: tuple[str, ...] = ()
         others = self._ask(self._reports.others, nobody)
         return f"{in_words(others)}; nothing is usable until it or this one is stopped" if others else ""
 
     def _what_waits(self) -> str:
-        """What an operator is waited for, and what to type; empty if for nothing."""
+        """What waits for an operator, with the command to type; empty if nothing."""
         if not self._proposal_id:
             return ""
         return f"a new reference waits for an operator: {accepting(self._proposal_id, self._robot, self._camera)}"
 
     def _with_what_to_type(self, alert: Alert) -> Alert:
-        """The command in a proposal's alert: the monitor, whose text it is, doesn't know its robot's name."""
+        """Add the command to a proposal's alert, since the monitor, which wrote it, doesn't know the robot's name."""
         if alert.kind is not AlertKind.PROPOSED or not self._proposal_id or alert.event is AlertEvent.CLEARED:
             return alert
         typed = accepting(self._proposal_id, self._robot, self._camera)
@@ -348,15 +348,15 @@ class Loop(ABC):
         )
 
     def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
-        """What someone reports; one who fails at that is no reason to stop."""
+        """The value of a report, or ``otherwise`` if it fails, which must not stop the loop."""
         try:
             return report()
-        except Exception as error:  # noqa: BLE001  said
+        except Exception as error:  # noqa: BLE001  logged
             self._log_once("report", "", f"a report for the state message fails: {in_short(error)}", error)
             return otherwise
 
     def _keep_house(self) -> None:
-        """Once a state period, right after a frame, when there is time until the next."""
+        """Called once per state period, right after a frame, when there is time before the next."""
         if not gc.isenabled():
             gc.collect()
 

@@ -1,4 +1,4 @@
-"""A whole dataset: every episode and wrist camera measured, on this machine or on a cluster, and put into one table."""
+"""A whole dataset: every episode and wrist camera measured, on this machine or a cluster, into one table."""
 
 from gripmon.daemon.dataset.surveying import Survey, measure_dataset
 

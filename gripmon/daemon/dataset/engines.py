@@ -1,5 +1,5 @@
-"""Where episodes are measured: in processes of this machine, or on a Ray cluster.  Both keep few in flight, so that
-memory doesn't grow with the dataset, and give an answer for each, also for one that kills its worker.
+"""Measures episodes in processes of this machine or on a Ray cluster.  Both keep few in flight, so that memory doesn't
+grow with the dataset, and return a result for each, also for one that kills its worker.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from gripmon.model.errors import InputError, one_line
 from gripmon.model.stopping import end_with_parent
 
 AHEAD = 2
-"""Episodes in flight for each worker: one that is measured, one that waits, so that none stands still."""
+"""Episodes in flight per worker: one being measured and one waiting, so that no worker is idle."""
 WORKER_EPISODES = 50
-"""After so many a worker is replaced: some 3 MB of each stay with it, 0.15 GB until then, for which no cause is known;
-and the 2 s of its start are a hundredth or two of its time.
+"""A worker is replaced after this many: each leaks about 3 MB, 0.15 GB until then, of unknown cause; the 2 s of its
+start are one or two per cent of its time.
 """
 DIED = "the process that measured it died, also when it was alone (out of memory, or a decoder that crashed)"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -32,7 +32,7 @@ _given: tuple[Configs, str] | None = None
 
 
 def _begin(configs: Configs, lens: str) -> None:
-    """In a worker: what all its episodes need."""
+    """Initialise a worker."""
     global _given
     import cv2
 
@@ -58,8 +58,8 @@ def local(
     workers: int,
     work: Callable[[Episode], Measured] = _work,
 ) -> Iterator[Measured]:
-    """In ``workers`` processes, and new ones after :data:`WORKER_EPISODES` for each.  Where one dies, what was in
-    flight is measured again, one by one: the one that kills its worker alone, too, is given up.
+    """Measure in ``workers`` processes, each replaced after :data:`WORKER_EPISODES`.  If one dies, the episodes in
+    flight are measured again one by one; an episode that kills its worker again is given up.
     """
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
@@ -98,10 +98,10 @@ def local(
 
 
 def ray_cluster(configs: Configs, episodes: Sequence[Episode], lens: str, address: str | None) -> Iterator[Measured]:
-    """On the Ray cluster at ``address``, the one that Ray finds, or one of this machine alone.  Ray tries an episode
-    again whose worker died; one that kills three is given up.
+    """Measure on the Ray cluster at ``address`` (None: the one that Ray finds, or this machine).  Ray retries an
+    episode whose worker died; one that kills three workers is given up.
 
-    Raises :class:`InputError` without Ray, or where no cluster answers.
+    Raises :class:`InputError` without Ray, or if no cluster answers.
     """
     try:
         import ray

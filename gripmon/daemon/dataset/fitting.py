@@ -1,4 +1,4 @@
-"""Which of several gripper files an episode shows, or that none does: by the outlines that its frames hold."""
+"""Determines which of several gripper files an episode shows, or none, from the outlines in its frames."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Frame, FrameRecord, MeasurementTrace, Verdict
 
 FRAMES = 24
-"""Of an episode, evenly spread: with 24 the sign test at 1/1000 bears four that disagree, with 10 none."""
+"""Frames of an episode, evenly spread: with 24 the sign test at 1/1000 tolerates four that disagree, with 10 none."""
 _PLACES = 33
-"""Along an outline, evenly."""
+"""Sample points along an outline."""
 _EDGE_PX = 1.0
-"""What lies farther from an edge isn't on it: edges of a sharp image are located to some tenths of a pixel."""
+"""Points farther from an edge aren't on it: edges of a sharp image are located to some tenths of a pixel."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """One gripper file's: ``fault`` why the frames don't show it, None where they may.  ``scores`` (n,): share of the
-    outline that a frame shows, less where edges lie beside it; NaN where nothing was measured.
+    """The fit of one gripper file: ``fault``: why the frames don't show it, None if they may.  ``scores`` (n,):
+    fraction of the outline that is found in a frame, lower if edges are beside it; NaN where nothing was measured.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Fit:
 
 
 def spread(frames: Iterable[Frame]) -> list[Frame]:
-    """About :data:`FRAMES` to twice as many frames with images, evenly spread, of however many there are."""
+    """From :data:`FRAMES` to twice as many frames with images, evenly spread over the episode."""
     kept: list[Frame] = []
     step = 1
     for number, frame in enumerate(frame for frame in frames if frame.image is not None):
@@ -49,11 +49,10 @@ def spread(frames: Iterable[Frame]) -> list[Frame]:
 
 
 def chosen(fits: Sequence[Fit]) -> int | str:
-    """The place of the gripper that fits and beats all others that do; else why none was chosen.
+    """The index of the only gripper that fits and isn't beaten by another; otherwise why none was chosen.
 
-    One beats another if it explains more of its outline in so many frames as chance gives in one case of 1,000 (sign
-    test), by more than its own share differs from frame to frame.  What is beaten by any doesn't fit, also where that
-    one doesn't fit either.
+    One beats another if its score is higher in significantly more frames (sign test at 1/1000), by more than its own
+    score varies from frame to frame.  A gripper that is beaten doesn't fit, even if the other one doesn't fit either.
     """
     beaten = {b: a for a, b in permutations(range(len(fits)), 2) if _beats(fits[a].scores, fits[b].scores)}
     faults = {n: fit.fault for n, fit in enumerate(fits) if fit.fault is not None}
@@ -72,13 +71,13 @@ def _beats(one: Array, other: Array) -> bool:
         return False
     more = (one - other)[both]
     usual = 1.4826 * float(np.median(np.abs(one[both] - np.median(one[both]))))
-    # The sign test: as many or more of them, if each were as likely as not.
+    # The sign test: probability of as many or more by chance.
     chance = float(bdtrc(int((more > 0.0).sum()) - 1, len(more), 0.5)) if (more > 0.0).any() else 1.0
     return bool(chance < CHANCE and np.median(more) > usual)
 
 
 def fit_of(config: Config, frames: Sequence[Frame]) -> Fit:
-    """How a configuration's gripper fits the frames of an episode."""
+    """The fit of a configuration's gripper to the frames of an episode."""
     name, nothing = config.gripper_path.stem, np.full(len(frames), np.nan)
     if (wrong := view_fault(config.view(), config.gripper, config.camera)) is not None:
         return Fit(name, f"{wrong.key} {wrong.wrong}", nothing)
@@ -103,9 +102,9 @@ def fit_of(config: Config, frames: Sequence[Frame]) -> Fit:
 
 
 def _seen(config: Config, record: FrameRecord, trace: MeasurementTrace) -> dict[int, tuple[float, float]]:
-    """Of each outline in the image: the share of it with edge points, and the same less for points beside it.
+    """For each outline in the image: the fraction of it with edge points, and the same reduced for points beside it.
 
-    Lines between two shades of a finger may be too faint to be seen; an outline is seen before most of what passes.
+    Creases between two faces of a finger may be too faint to be detected; outlines are visible on most backgrounds.
     """
     gripper: Gripper = config.gripper
     assert record.cam_T_grip is not None
@@ -118,7 +117,7 @@ def _seen(config: Config, record: FrameRecord, trace: MeasurementTrace) -> dict[
     lines_px = config.camera.project(lines_m.reshape(-1, 3)).reshape(len(edges), _PLACES, 2)
     last_px = np.array([config.camera.width_px, config.camera.height_px]) - 1.0
     lengths_px = np.nan_to_num(np.linalg.norm(np.diff(lines_px, axis=1), axis=2)).sum(axis=1)
-    # The search lines are shared out among the outlines by the roots of their lengths.
+    # The search lines are distributed over the outlines by the square roots of their lengths.
     apart_px = np.sqrt(lengths_px) * np.sqrt(lengths_px).sum() / config.settings.monitor.corners.sampling.samples
     out = {}
     for edge, line_px, reach_px in zip(edges.tolist(), lines_px, apart_px + _EDGE_PX, strict=True):

@@ -1,4 +1,4 @@
-"""One episode through the monitor: its stretches, or why there are none.  Workers run this, and nothing else."""
+"""Runs one episode through the monitor: its stretches, or why there are none.  This is what workers run."""
 
 from __future__ import annotations
 
@@ -34,38 +34,39 @@ from gripmon.model.records import (
 from gripmon.record.table import FrameTable, TableBuilder
 
 PICTURE_WIDTH_PX = 320
-"""Of the thumbnails: some 8 kB each (the fingertips can be told at a glance, 390,000 take 3 GB)."""
+"""Width of thumbnails of about 8 kB, in which fingertips are recognisable; 390,000 take 3 GB."""
 _JPEG_QUALITY = 75
 
 Pictured = tuple[Image, MeasurementTrace]
 Configs = tuple[Config, ...]
-"""One for each gripper file that may be in view, alike in all else."""
+"""One configuration per possible gripper file, otherwise equal."""
 
 
 def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
-    """An episode's stretches, whatever is wrong with it: then ``fault`` says so.
+    """An episode's stretches; ``fault`` says what is wrong with it.  Never raises.
 
-    Of several ``configs`` that counts whose gripper the episode shows; where none is, or several alike, none does.
+    Of several ``configs`` the one is used whose gripper the episode shows; if that is none or ambiguous, there is no
+    result.
 
-    The episode's reference is its own: the monitor gets the command to recalibrate with its first measured frame, and
-    begins again from there; where it isn't recalibrated, the configuration's reference stays.  ``lens``: "file" for the
-    camera calibration that comes with the frames, where one does, "config" for the configuration's in any case.
+    The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
+    starts again from the new reference; if it isn't recalibrated, the configuration's reference stays.  ``lens``:
+    "file" for the camera calibration that comes with the frames, if any; "config" for the configuration's in any case.
     """
     try:
         return _measured(configs, episode, lens)
     except SourceError as error:
         return failed(configs, episode, str(error))
-    except Exception as error:  # noqa: BLE001  one bad episode must not end the others
+    except Exception as error:  # noqa: BLE001  one bad episode must not stop the others
         return failed(configs, episode, in_short(error))
 
 
 def failed(configs: Configs, episode: Episode, fault: str) -> Measured:
-    """The answer for an episode that gives nothing."""
+    """The result for an episode that can't be measured."""
     return Measured(episode.name, _camera(configs[0], episode), episode.key, episode.version, fault=fault)
 
 
 def _camera(config: Config, episode: Episode, source: Source | None = None) -> str:
-    """Topic or feature; of plain images and videos the configuration's name."""
+    """Name of the camera: topic or feature; for plain images and videos that of the configuration."""
     if isinstance(episode.source, FolderSettings | VideoSettings):
         return config.settings.camera_name
     return str(getattr(source, "topic", None) or episode.source.camera or "unknown")
@@ -120,7 +121,7 @@ def _frames(source: Source) -> Iterator[Frame]:
 
 
 class _Run:
-    """A monitor's way through an episode, in memory that grows by a table's row a frame."""
+    """A monitor's run over an episode, with memory for one table row per frame."""
 
     def __init__(self, config: Config) -> None:
         self._monitor, self._builder = Monitor(config), TableBuilder()
@@ -130,7 +131,7 @@ class _Run:
         self._last: Pictured | None = None
 
     def until_renewed(self, frames: Iterator[Frame]) -> ReferenceRecord | None:
-        """Process frames until the monitor, asked with the first measured one, has recalibrated; None: all."""
+        """Process frames until the monitor, commanded with the first measured one, has recalibrated; None: it hasn't."""
         asked, revision = False, self._monitor.reference.revision
         for frame in frames:
             record = self.process(frame)
@@ -158,13 +159,13 @@ class _Run:
         return TableBuilder.join([self._builder])
 
     def pictures(self, stretches: int) -> tuple[bytes, ...]:
-        """JPEGs of the first valid frame, and if it moved of the last."""
+        """JPEGs of the first valid frame and, if the camera moved, of the last."""
         shown = [self._first, self._last] if stretches > 1 else [self._first]
         return tuple(_drawn(*each) for each in shown if each is not None)
 
 
 def _drawn(image: Image, trace: MeasurementTrace) -> bytes:
-    """A small JPEG with the predicted edges (blue) and the edge points that were believed (green)."""
+    """A small JPEG with the predicted edges (blue) and the edge points that were used (green)."""
     import cv2
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""All episodes of a dataset to one table: what was measured before is not measured again."""
+"""All episodes of a dataset into one table; episodes that were measured before are not measured again."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ from gripmon.model.records import to_json
 
 @dataclass(frozen=True)
 class Survey:
-    """What came of it: the files ``written``, how many episodes there are, how many were ``measured`` now, and how many
-    could not be.
-    """
+    """The files ``written``, the number of episodes, how many were ``measured`` now, and how many failed."""
 
     written: Written
     episodes: int
@@ -59,19 +57,19 @@ def measure_dataset(
     """Measure every episode of a folder or URL by every one of ``cameras`` (topics, features), and write the table and
     the report to the folder ``out``.  The dataset is only read.
 
-    ``config`` has the gripper, a camera, a rough reference, and in its source how the state gives the opening.
-    ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: processes (None: as
-    many as there are cores).  ``annotate``: a folder or URL for the results in the dataset's own format, see
-    :class:`gripmon.analyse.dataset_annotations.Annotations`.  ``grippers``: files beside the configuration's; each
-    episode is measured by the one that its frames show, and by none where none, or not one alone, fits
-    (:func:`gripmon.daemon.dataset.fitting.chosen`).  ``step`` is called with their number after each episode.
-    Called again with the same ``out`` it measures what is new, has changed or was interrupted.
+    ``config``: the gripper, a camera, a rough reference, and in its source how the jaw opening follows from the state.
+    ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: number of processes
+    (None: one per core).  ``annotate``: a folder or URL for the results in the dataset's own format, see
+    :class:`gripmon.analyse.dataset_annotations.Annotations`.  ``grippers``: files in addition to the configuration's;
+    each episode is measured with the one that its frames show, and fails if none or several fit
+    (:func:`gripmon.daemon.dataset.fitting.chosen`).  ``step`` is called with the number of episodes after each one.
+    Called again with the same ``out``, it measures what is new, has changed or was interrupted.
 
-    Raises :class:`InputError`: nothing to measure, several cameras of which none is named, an ``out`` that holds
-    another configuration's results, an engine that isn't there.
+    Raises :class:`InputError`: nothing to measure, several cameras without a choice, an ``out`` with results of another
+    configuration, an engine that isn't available.
     """
     config = config if isinstance(config, Config) else load_config(config, check_source=False)
-    # What was taught is of the configuration's own gripper.
+    # The taught model belongs to the configuration's own gripper.
     others = (
         replace(config, gripper=read_gripper(path), gripper_path=path, taught=None) for path in map(Path, grippers)
     )
@@ -115,7 +113,7 @@ def _configured(episode: Episode, config: Config) -> Episode:
 
 
 def _fingerprint(configs: Configs, lens: str) -> str:
-    """Of all that a result depends on beside the episode."""
+    """A hash of everything on which a result depends besides the episode."""
     config = configs[0]
     settings = config.settings
     opening = getattr(settings.source, "opening", None)

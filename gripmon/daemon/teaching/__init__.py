@@ -1,5 +1,5 @@
 """Teaching a robot that has no configuration yet, or only one: from files to a session, from a session to a
-configuration that runs.  It stands here because it knows configurations, which the room ``teach`` does not.
+configuration that runs.  It is here because it needs configurations, which the package ``teach`` doesn't know.
 """
 
 from gripmon.daemon.teaching.inputs import Inputs, outline_session, read_inputs

@@ -1,6 +1,6 @@
-"""What teaching from corners begins with: camera, gripper, reference and images, each checked.
+"""The inputs of teaching from corners: camera, gripper, reference and images, each checked.
 
-Everything here raises :class:`~gripmon.model.errors.InputError` for what can't be used.
+All functions raise :class:`~gripmon.model.errors.InputError` for unusable input.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything but the corners.  ``folder`` is where files go; ``config`` what was given, if it was; ``calibrations``
-    the files of ``gripmon calibrate`` that a configuration names in place of sections, by key.
+    """Everything but the corners.  ``folder``: where files are written; ``config``: the given configuration, if any;
+    ``calibrations``: files of ``gripmon calibrate`` that the configuration names instead of sections, by key.
     """
 
     setup: Setup
@@ -75,9 +75,9 @@ def read_inputs(
     robot: str | None = None,
     camera_name: str | None = None,
 ) -> Inputs:
-    """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what
-    is to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of
-    images, ``source`` where the configuration's frames come from (None: that camera, or the images' folder).
+    """Read and check the input: either ``config``, or ``gripper`` with ``camera`` or ``reference`` and values for the
+    configuration to be written.  ``command``: for the files' provenance; ``live``: a camera instead of images;
+    ``source``: of the configuration's frames (None: that camera, or the images' folder).
     """
     cv2.setNumThreads(1)
     given = None
@@ -125,7 +125,7 @@ def read_inputs(
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file (px)."""
     rough = read_settings(path, RoughCorners)
-    # The file may be the one of calibrate plane --infer, which also names points on edges: they are no corners.
+    # A file for calibrate plane --infer also names points on edges, which are not corners.
     corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
     fault = corners_fault(corners, gripper)
     if fault is not None:
@@ -134,10 +134,10 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
 
 def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
-    """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, to be saved in ``folder``."""
+    """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
     shown, target = read_any(image), None
     if camera is not None:
-        with contextlib.suppress(ConfigError):  # reading the camera says what is wrong
+        with contextlib.suppress(ConfigError):  # read_lens reports what is wrong
             target = read_yaml(camera).get("target")
         lens, _ = read_lens(camera)
         height, width = shown.shape[:2]
@@ -171,7 +171,7 @@ def _gripper(path: Path | None) -> tuple[Gripper, Path]:
 def _calibrations(
     camera_path: Path | None, reference_path: Path | None, gripper: Gripper
 ) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, CameraError | None]:
-    """What teaching begins with, from files; a reference's file holds its camera, too."""
+    """Camera, gripper, settings and reference from files; a reference's file also contains its camera."""
     lens, error = (None, None) if camera_path is None else read_lens(camera_path)
     reference = None
     if reference_path is not None:
@@ -193,8 +193,8 @@ def _calibrations(
 
 
 def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
-    """The camera of a calibration or configuration, or the section ``camera`` of one by itself; with its error, where
-    the file knows one.  :class:`~gripmon.model.errors.InputError`.
+    """The camera of a calibration or configuration, or of a file with only a section ``camera``; with its error, if the
+    file has one.  :class:`~gripmon.model.errors.InputError`.
     """
     if path.is_file() and path.suffix in (".yaml", ".yml"):
         values = read_yaml(path)
@@ -210,7 +210,7 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
 
 
 def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
-    """A file of ``gripmon calibrate plane``, made with this camera, if one was given, and this gripper."""
+    """A file of ``gripmon calibrate plane``, which must be made with this camera (if given) and this gripper."""
     made = read_hand_eye(path)
     fault = mismatch(made, lens or made.camera, gripper)
     if fault is not None:
@@ -218,12 +218,12 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
         wrong = wrong.replace("the configuration has", "the one given is")
         raise InputError(f"{path}: {fault.key}: {wrong}; {fault.right}", "reference")
     digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
-    name = f"config-{digest}"  # as the configuration that names the file will call it
+    name = f"config-{digest}"  # as in the configuration that will name the file
     return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
 
 
 def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
-    """A reference as a configuration has it, in a file by itself: a robot's own hand/eye calibration."""
+    """A file with only a section ``reference``: a robot's own hand/eye calibration."""
     settings = read_settings(path, ReferenceSettings, values)
     transform = Transform(settings.cam_T_grip.translation_m, settings.cam_T_grip.rotation_xyzw)
     digest = hashlib.sha256(to_json(transform)).hexdigest()[:8]
@@ -231,7 +231,7 @@ def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:
-    """Whether this reference sees this gripper."""
+    """Check that the gripper is visible at this reference."""
     transform = reference.cam_T_grip
     settings = ReferenceSettings(
         cam_T_grip=TransformSettings(translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw),
@@ -247,6 +247,6 @@ def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, na
 
 
 def live_settings(device: str, camera: Camera) -> LiveSettings:
-    """A camera that is asked for images of the calibration's size."""
+    """A live camera, with images of the calibration's size requested."""
     where = int(device) if device.isdecimal() else device
     return LiveSettings(device=where, width_px=camera.width_px, height_px=camera.height_px)

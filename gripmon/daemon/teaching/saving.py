@@ -1,4 +1,4 @@
-"""Files of teaching from corners: the taught model, a configuration, the corners; whole, or not at all."""
+"""Files of teaching from corners: the taught model, a configuration, the corners; each whole or not at all."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", 
 
 
 class FileSaving:
-    """Writes beside each other in one folder; what can't be used later is found before anything is written."""
+    """Writes the files into one folder, after checking that they can be used."""
 
     def __init__(self, inputs: Inputs):
         self._inputs = inputs
 
     @property
     def _paths(self) -> dict[str, Path]:
-        """Where each file goes."""
+        """The path of each file."""
         inputs, config = self._inputs, self._inputs.config
         named = None if config is None else config.taught_path
         return {
@@ -97,12 +97,12 @@ class FileSaving:
         return Saved(written=written, notes=tuple(notes), next=follows)
 
     def _names_it_already(self, order: SaveOrder) -> bool:
-        """A configuration that was given is only changed to name the taught model, if it doesn't."""
+        """Whether a given configuration needs no change, which would only be to name the taught model."""
         config = self._inputs.config
         return config is not None and (config.taught_path is not None or not order.taught)
 
     def _pictures(self, pictures: Sequence[Picture]) -> tuple[list[Picture], dict[str, bytes]]:
-        """Live images become files, so that their taught model can be made again."""
+        """Save live images as files, so that the taught model can be made again."""
         out, files = [], {}
         for picture in pictures:
             if picture.path is None:
@@ -173,11 +173,11 @@ class FileSaving:
         return config_text(self._inputs, order, found, TAUGHT if taught else None, self._relative)
 
     def _relative(self, path: Path, to: Path | None = None) -> str:
-        """As a configuration in ``to``, or the folder written to, names it."""
+        """The path relative to ``to``, or to the output folder."""
         return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
 
     def _try_out(self, texts: Mapping[str, str]) -> None:
-        """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
+        """Check in a temporary folder that the configuration is valid; otherwise nothing is written."""
         if "config" not in texts:
             return
         base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
@@ -201,7 +201,7 @@ class FileSaving:
                 raise SavingRefused(f"the configuration would not be sound: {wrong}") from None
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
-        """Each whole or not at all; the configuration last, since it names the others."""
+        """Write each file whole or not at all; the configuration last, since it names the others."""
         words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}
         written: dict[str, str] = {}
         todo = [(Path(path), data, "an image") for path, data in files.items()]
@@ -218,7 +218,7 @@ class FileSaving:
 
 
 def page_session(inputs: Inputs) -> TeachSession:
-    """What the page works on.  Raises :class:`~gripmon.model.errors.InputError` for a camera that can't be."""
+    """The session of the page.  Raises :class:`~gripmon.model.errors.InputError` for a camera that can't be opened."""
     try:
         live = None if inputs.live is None else open_source(live_settings(inputs.live, inputs.setup.camera))
     except SourceError as error:
@@ -228,10 +228,11 @@ def page_session(inputs: Inputs) -> TeachSession:
 
 
 def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[bool], Saved]]:
-    """What the corners in a file give in the one picture, and what writes it: with True over files that are there.
+    """The evaluation of the corners in a file for the single picture, and a function that saves it (True: replace
+    existing files).
 
-    Raises :class:`~gripmon.model.errors.InputError` for corners that can't be, and
-    :class:`~gripmon.model.errors.NoResultError` where nothing can be taught from them.
+    Raises :class:`~gripmon.model.errors.InputError` for invalid corners, and
+    :class:`~gripmon.model.errors.NoResultError` if nothing can be taught from them.
     """
     rough, setup, picture = read_rough(path, inputs.setup.gripper), inputs.setup, inputs.pictures[0]
     if setup.reference is None and len(rough) < FEWEST_PUT:

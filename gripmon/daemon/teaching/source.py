@@ -1,4 +1,4 @@
-"""A camera as a person names it: for a configuration that is written, and to look through it before there is one."""
+"""A camera named by a text: for a configuration to be written, and to open it before there is one."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _RIGHT = (
 
 
 def named_source(text: str, size_px: tuple[int, int] | None = None) -> SourceSettings:
-    """The settings of a source; ``size_px`` is what a live camera is asked for, None for its own.
+    """The settings of a source; ``size_px``: image size requested from a live camera (None: its own).
 
-    ``zenoh:1280x720`` is the monitor's own key for images, ``zenoh:1280x720:KEY`` another one,
+    ``zenoh:1280x720`` is the monitor's own key for images, ``zenoh:1280x720:KEY`` another key,
     ``ros2:1280x720:/camera/image_raw`` a topic.  Raises :class:`~gripmon.io.sources.SourceError`.
     """
     found = _NETWORK.fullmatch(text)
@@ -64,12 +64,12 @@ def _on_network(kind: str, name: str | None) -> NetworkSettings:
     settings = NetworkSettings(
         topic=name or "", format="ros2_compressed" if (name or "").endswith("/compressed") else "ros2_image"
     )
-    network_key(settings, "")  # refuses a name that no topic has
+    network_key(settings, "")  # refuses an invalid topic name
     return settings
 
 
 def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
-    """Look through it.  One on the network is heard as the monitor will hear it, which must not run meanwhile.
+    """Open the source.  One on the network is received as the monitor will receive it, which must not run meanwhile.
 
     Raises :class:`~gripmon.model.errors.InputError`.
     """
@@ -77,7 +77,7 @@ def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
     if not isinstance(settings, NetworkSettings):
         try:
             return OpenedSource(open_source(settings))
-        except SourceError as error:  # it names the key of a configuration
+        except SourceError as error:  # the error names a configuration key
             raise SourceError(f"{str(error).removeprefix('path: ').partition(';')[0]}; {_RIGHT}") from None
     found = _NETWORK.fullmatch(text)
     assert found is not None, "named_source has seen that it is of this form"
@@ -85,7 +85,7 @@ def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
 
 
 class _Networked(OpenedSource):
-    """With the session that it comes by."""
+    """A camera on the network, with its own session."""
 
     def __init__(self, settings: NetworkSettings, size_px: tuple[int, int], keys: Keys) -> None:
         self._link = Link(PublishSettings())

@@ -1,4 +1,4 @@
-"""A camera and where the gripper stands before it, from files or roughly by numbers."""
+"""A camera and the gripper's pose, from files or roughly from numbers."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gripmon.teach.mounts import Mount, towards
 def read_view(
     camera_path: Path | None, reference_path: Path | None, rough: tuple[float, float] | None
 ) -> tuple[Camera | None, Array | None]:
-    """Camera and ``cam_T_grip`` (4, 4), None for what wasn't given; a reference's file holds its camera, too.
+    """Camera and ``cam_T_grip`` (4, 4), None if not given; a reference's file also contains its camera.
 
-    ``rough``: distance of the TCP (m) in the image's middle and tilt of the optical axis against the gripper's z
-    (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
+    ``rough``: distance (m) of the TCP, which is in the middle of the image, and tilt of the optical axis from the
+    gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
     lens = None if camera_path is None else read_lens(camera_path)[0]
     cam_T_grip = None

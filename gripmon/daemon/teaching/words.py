@@ -1,4 +1,4 @@
-"""What corners put by hand give, as lines for a person."""
+"""The evaluation of corners placed by hand, as lines of text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gripmon.teach.session import Evaluation
 
 
 def in_words(found: Evaluation) -> list[str]:
-    """What was seen, and what to expect, for a person at a terminal."""
+    """The measured corners and the expected accuracy, for a terminal."""
     snapped = found.snapped
     width = max(len(corner.name) for corner in snapped.corners)
     lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]

@@ -1,7 +1,7 @@
 """The configuration that teaching writes: complete, with a comment at every key, from the settings' own descriptions.
 
-Written line by line: a YAML library that keeps comments (ruamel.yaml) would be one more dependency, and the lines that
-stand behind a #, as what holds anyway, it can't write.
+Written line by line: a YAML library that keeps comments (ruamel.yaml) would be one more dependency, and can't write
+defaults as commented-out lines.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", 
 def config_text(
     inputs: Inputs, order: SaveOrder, found: Evaluation, taught: str | None, folder: Callable[[Path], str]
 ) -> str:
-    """A whole file; ``folder`` names a path as the file does, ``taught`` is the taught model's name (None: none)."""
+    """The whole file; ``folder`` makes a path relative to it; ``taught``: name of the taught model (None: none)."""
     source = inputs.source
     assert source is not None and found.reference is not None
     parts = [
@@ -74,7 +74,7 @@ def _camera(inputs: Inputs, folder: Callable[[Path], str]) -> list[str]:
 
 
 def with_taught(path: Path, taught: str) -> str:
-    """A configuration's own text with a line more, which names the taught model."""
+    """A configuration's text with an additional line that names the taught model."""
     text = path.read_text(encoding="utf-8-sig")
     return (
         f"{text.rstrip()}\n\ntaught: {yaml_value(taught)}  # what the edges really look like; relative to this file\n"
@@ -82,7 +82,7 @@ def with_taught(path: Path, taught: str) -> str:
 
 
 def name_taught(config: Config, taught: Path) -> Config:
-    """Write the line that names a taught model into a configuration, unless one is there; the configuration with it.
+    """Add the line that names a taught model to a configuration, unless there is one; returns the new configuration.
 
     Raises :class:`~gripmon.model.errors.InputError` where it can't be written.
     """
@@ -140,7 +140,7 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
 
 
 def _in_table(inputs: Inputs) -> bool:
-    """Whether the images' own table has their openings: one given for all of them is fixed."""
+    """Whether the images' own table has their openings; an opening given for all of them is fixed."""
     try:
         for picture in inputs.pictures:
             assert picture.path is not None
@@ -154,7 +154,7 @@ def _in_table(inputs: Inputs) -> bool:
 
 
 def _defaults() -> str:
-    """What holds anyway, behind # signs."""
+    """The defaults, commented out."""
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
     ]
