@@ -122,14 +122,14 @@ def test_the_age_is_what_the_monitor_needed_the_way_and_the_time_since():
     assert got.usable and got.age_s == pytest.approx(0.01 + 0.1 + 0.05, abs=0.002)
     got = reading(heard(sent(98 * S, 100 * S), after(99 * S, 0, 0)))
     assert got.why is Unusable.STALE and got.transform is None
-    assert got.reason == "the newest transform is 2.01 s old, allowed are 0.2 s"
+    assert got.reason == "the newest transform is 2.01 s old, at most 0.2 s is allowed"
 
 
 def test_of_unknown_age_is_not_usable_until_the_monitor_answers():
     inbox = heard(sent(99_999 * MS, 100 * S))
     got = reading(inbox)
     assert got.why is Unusable.AGE_UNKNOWN and got.transform is None and got.age_s == math.inf
-    assert got.reason.endswith("is not known: the monitor has not answered yet what its clock shows")
+    assert got.reason.endswith("is not known: the monitor has not sent its clock yet")
     assert not inbox.age_known
     inbox.answered(clock(100_001 * MS), 100 * S, 100_002 * MS)
     assert inbox.age_known and reading(inbox).usable

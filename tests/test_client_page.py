@@ -66,7 +66,7 @@ def test_a_controller_moves_by_the_monitor_and_stops_when_it_is_killed(example: 
         controller.join(WAIT_S)
     assert not controller.is_alive()
     assert arm.done[-1] == "the monitor is gone" or re.fullmatch(
-        r"the newest transform is .* s old, allowed are .* s", str(arm.done[-1])
+        r"the newest transform is .* s old, at most .* s is allowed", str(arm.done[-1])
     )
 
 

@@ -72,7 +72,7 @@ def test_a_stopped_monitors_transform_is_stale_and_usable_again(endpoint: str):
         readings = iter(client)
         monitor.send_signal(signal.SIGSTOP)
         stale = refused(client, Unusable.STALE)
-        assert stale.age_s > 1.0 and stale.reason.endswith("s old, allowed are 1 s")
+        assert stale.age_s > 1.0 and stale.reason.endswith("s old, at most 1 s is allowed")
         assert next(reading for reading in readings if not reading.usable).why is Unusable.STALE
         monitor.send_signal(signal.SIGCONT)
         assert usable(client).seq > stale.seq

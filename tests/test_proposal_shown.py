@@ -55,7 +55,7 @@ def test_its_alert_says_what_to_type_until_it_is_cleared():
     bench = Bench(range(6), Proposing(lambda seq: {"alerts": alerts.get(seq, ())}))
     bench.run()
     texts = [alert.text for alert in bench.network.alerts]
-    assert texts == [f"{about.text}; to let it in: {COMMAND}", other.text, over.text]
+    assert texts == [f"{about.text}; to accept it: {COMMAND}", other.text, over.text]
     assert bench.network.transforms[2].alerts == (about, other), "the monitor's own, as a replay has it"
 
 

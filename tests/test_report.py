@@ -76,7 +76,7 @@ def test_a_step_and_its_return_end_the_affected_time():
     assert old.start_ns == START_NS + 200 * PERIOD_NS
     # A median over nine frames follows within half of them.
     assert abs(old.end_ns - (START_NS + 400 * PERIOD_NS)) <= 5 * PERIOD_NS
-    assert "not so any more" in recording.summary
+    assert "It has moved back" in recording.summary
 
 
 def test_a_creep_begins_where_it_left_its_noise_and_lasts_until_it_rests():

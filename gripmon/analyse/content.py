@@ -71,7 +71,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     at_seq: Annotated[
         int | None, _is("of a motion the first picture that shows it, of all else the first one in it")
     ] = None
-    after_seq: Annotated[int | None, _is("frame of the picture after: the first that was believed, if any was")] = None
+    after_seq: Annotated[int | None, _is("frame of the picture after: the first valid one, if there is one")] = None
     story: Annotated[tuple[Moment, ...], _is("its alerts, in order")] = ()
     look: Annotated[
         LookNote | msgspec.UnsetType,
@@ -91,7 +91,7 @@ class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):
         ),
     ]
     start_ns: Annotated[int, _is("for a motion its change point")]
-    limit_ns: Annotated[int | None, _is("when a motion went past the limit; null: it is none")] = None
+    limit_ns: Annotated[int | None, _is("when a motion exceeded the limit; null: it is no motion")] = None
     end_ns: int
     ended_by: Annotated[str, _is("recalibration, return, measured_again, or end_of_recording")]
     reference_id: str

@@ -113,9 +113,9 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     measured = f"when last measured, at {last}"
     if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
         near = millimetres(off.size_m, off.sigma_m)
-        return f"It is not so any more: {measured}, the camera was back where it began, to within {near}."
+        return f"It has moved back: {measured}, the camera was where it began, to within {near}."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
-    text = f"It is still so: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    text = f"It is still displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     now = report.at_end_against_reference
     if len(report.references) < 2 or now is None:
         return f"{text}, and there is no new reference."

@@ -71,8 +71,8 @@ class Asker:
             return _answer(another, monitor, request.id)
         # A router's access rules silently drop what they don't allow.
         raise NotCarriedOut(
-            f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
-            "may not let you send any",
+            f"{monitor} doesn't answer; it may be configured to take no commands (publish.commands), or the router's "
+            "rules may not allow you to send any",
             None,
             request.id,
         )

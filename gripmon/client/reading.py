@@ -225,13 +225,16 @@ def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, w
         text = f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
         return Unusable.CLOCKS, text
     if age_s == math.inf:
-        why = "the monitor has not answered yet what its clock shows"
+        why = "the monitor has not sent its clock yet"
         if entry.sent is None:
-            why = "a monitor of an older version doesn't tell; update it, or let the clocks agree and set clocks_agree"
-        return Unusable.AGE_UNKNOWN, f"how long the transform was on its way is not known: {why}"
+            why = "a monitor of this version doesn't send it; update it, or synchronise the clocks and set clocks_agree"
+        return Unusable.AGE_UNKNOWN, f"the transform's delay is not known: {why}"
     if age_s > policy.max_age_s:
         since = f"; what came since can't be read: {heard.unreadable}" if heard.unreadable else ""
-        return Unusable.STALE, f"the newest transform is {age_s:.3g} s old, allowed are {policy.max_age_s:g} s{since}"
+        return (
+            Unusable.STALE,
+            f"the newest transform is {age_s:.3g} s old, at most {policy.max_age_s:g} s is allowed{since}",
+        )
     return None
 
 
@@ -241,7 +244,8 @@ def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
         return Unusable.SUSPECT, f"the transform is suspect: {record.reason or record.state}"
     allowed_m = policy.max_sigma_m
     if allowed_m is not None and (sigma_m := _largest_sigma_m(record.covariance)) > allowed_m:
-        text = f"the transform is certain to {1e3 * sigma_m:.3g} mm, allowed are {1e3 * allowed_m:g} mm"
+        sigma = f"the transform has a standard deviation of {1e3 * sigma_m:.3g} mm"
+        text = f"{sigma}, at most {1e3 * allowed_m:g} mm is allowed"
         return Unusable.UNCERTAIN, text
     allowed_m = policy.max_protection_m
     if allowed_m is None:

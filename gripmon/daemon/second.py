@@ -217,7 +217,7 @@ class SecondCamera(Loop):
             return self._reply(name, True, "acknowledged: " + ", ".join(alert.alert_id for alert in seen))
         if name is CommandName.RESET:
             self._tell(self._pulsed.reset(), self._pulsed.state)
-            return self._reply(name, True, f"{self._pulsed.reference_id} is believed again; what was seen is forgotten")
+            return self._reply(name, True, f"{self._pulsed.reference_id} is trusted again; earlier spots are discarded")
         return self._reply(name, False, _NOT_HERE)
 
     def _reply(self, name: CommandName, done: bool, text: str, *, whole: bool = False) -> CommandReply:

@@ -288,7 +288,7 @@ class Loop(ABC):
         if alert.kind is not AlertKind.PROPOSED or not self._proposal_id or alert.event is AlertEvent.CLEARED:
             return alert
         typed = accepting(self._proposal_id, self._robot, self._camera)
-        return msgspec.structs.replace(alert, text=f"{alert.text}; to let it in: {typed}")
+        return msgspec.structs.replace(alert, text=f"{alert.text}; to accept it: {typed}")
 
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""

@@ -139,7 +139,7 @@ _STATES: list[_Column] = [
     *_shift_columns("of the TCP against the reference"),
     ("sigma_m", _DOUBLE, "m", "largest standard deviation of the TCP along a camera axis"),
     ("protection_m", _DOUBLE, "m", "bound on the TCP's position error, of the last transform"),
-    ("alert_limit_m", _DOUBLE, "m", "error of the TCP's position that the task bears, as configured"),
+    ("alert_limit_m", _DOUBLE, "m", "position error of the TCP that the task tolerates, as configured"),
     ("open_alerts", pa.int32(), "1", "alerts raised and not cleared"),
     ("version", _TEXT, "", "of gripmon"),
     *_RUN,

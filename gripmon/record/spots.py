@@ -198,7 +198,7 @@ def spot_blueprint(scene: Scene) -> rrb.Blueprint:
     judged = rrb.Vertical(
         cell,
         plot("off", "off/**", "Spot less predicted (px), band of one standard deviation", legend=False),
-        plot("gaps", "gaps/**", "Disagreement of the three ways (mm)"),
+        plot("gaps", "gaps/**", "Disagreement of the three residual tests (mm)"),
         rrb.Tabs(
             plot("test", "test/moved", "Probability that something moved", legend=False),
             plot("test", "test/square", "Normalised square", legend=False),

@@ -342,7 +342,7 @@ def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, 
         raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW} alone"))
     if not 0.0 < limit_m <= _LARGEST_LIMIT_M:
         wrong = f"{policy.suspect_sigma_m:g} stands for {_NEW}: {limit_m:g}, which is not within 0 and 1"
-        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task bears (m)"))
+        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task tolerates (m)"))
     if say:
         _log.warning(
             "%s: %s.%s: %g is deprecated; write %s: %g, which it stands for",

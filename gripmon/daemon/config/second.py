@@ -118,7 +118,7 @@ def _fault_between(settings: SecondSettings) -> Fault | None:
     if recorded and pulses is None:
         return Fault("laser.pulses", "is missing", "a table of the recorded pulses: stamp_ns, until_ns, base_T_ee")
     if not recorded and pulses is not None:
-        right = "leave it out: the robot's program tells each pulse on the key …/pulse"
+        right = "leave it out: the robot's program reports each pulse on the key …/pulse"
         return Fault("laser.pulses", "has no effect with a live camera", right)
     if not recorded and not settings.publish.enabled:
         right = "publish.enabled: true, for the pulses come over the network"

@@ -131,7 +131,7 @@ class _Run:
         self._last: Pictured | None = None
 
     def until_renewed(self, frames: Iterator[Frame]) -> ReferenceRecord | None:
-        """Process frames until the monitor, commanded with the first measured one, has recalibrated; None: it hasn't."""
+        """Process frames until the monitor, commanded at the first measured one, recalibrates; None: it hasn't."""
         asked, revision = False, self._monitor.reference.revision
         for frame in frames:
             record = self.process(frame)

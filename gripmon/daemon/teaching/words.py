@@ -26,7 +26,7 @@ def in_words(found: Evaluation) -> list[str]:
         by = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
         lines.append(f"reference by {by}, TCP to {sigmas} mm: less exact than with a plate (gripmon calibrate plane)")
         if found.pose.rival:
-            rival = "another pose explains these corners as well; a corner outside of their plane would tell"
+            rival = "another pose explains these corners as well; a corner outside of their plane would decide"
             lines.append(f"note: {rival}")
     expected = found.expected
     if expected is not None:

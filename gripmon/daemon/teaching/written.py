@@ -101,7 +101,7 @@ def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> 
     lines = ["reference:"]
     if measured_here is not None:
         seen = f"{len(measured_here.corners)} corners of" if measured_here.corners else "the edges in"
-        lines.append(f"  # measured from {seen} one image: a plate (gripmon calibrate plane) tells it more exactly")
+        lines.append(f"  # measured from {seen} one image; a plate (gripmon calibrate plane) is more accurate")
     lines += [
         f"  id: {yaml_value(reference.reference_id)}  # name of this calibration in messages",
         f"  cam_T_grip:{meaning}",
@@ -134,7 +134,7 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
         f"  source: fixed  # {_JAW_SOURCES}",
     ]
     if opening_m is not None:
-        how = "as given" if known else "as the image showed it; better what the robot says"
+        how = "as given" if known else "as measured in the image; the robot's own value is better"
         lines.append(f"  opening_m: {yaml_value(round(opening_m, 7))}  # jaw opening, {how} (m)")
     return "\n".join(lines)
 

@@ -64,7 +64,9 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     ] = None
     alert_limit_m: Annotated[
         float | None,
-        Meta(description="error of the TCP's position that the task bears, as configured, m; null for second cameras"),
+        Meta(
+            description="position error of the TCP that the task tolerates, as configured, m; null for second cameras"
+        ),
     ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
     transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
