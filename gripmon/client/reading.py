@@ -231,10 +231,8 @@ def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, w
         return Unusable.AGE_UNKNOWN, f"the transform's delay is not known: {why}"
     if age_s > policy.max_age_s:
         since = f"; what came since can't be read: {heard.unreadable}" if heard.unreadable else ""
-        return (
-            Unusable.STALE,
-            f"the newest transform is {age_s:.3g} s old, at most {policy.max_age_s:g} s is allowed{since}",
-        )
+        text = f"the newest transform is {age_s:.3g} s old, at most {policy.max_age_s:g} s is allowed{since}"
+        return Unusable.STALE, text
     return None
 
 
