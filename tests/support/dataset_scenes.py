@@ -76,25 +76,25 @@ def episode(config: Config, number: int, mounting: int, *, moves: bool = False, 
     return shots, Truth(mounting, first, last, at_s if moves else None)
 
 
-def make_lerobot(folder: Path, plan: list[tuple[int, bool]], seed: int = 0) -> tuple[Path, list[Truth]]:
+def make_lerobot(folder: Path, plan: list[tuple[int, bool]]) -> tuple[Path, list[Truth]]:
     """``folder/set`` and ``folder/wrist.yaml``, an episode for each (mounting, whether it moves): the configuration,
     and the truth of each.
     """
     path = folder / "lerobot.yaml"
     config = write_config(path, OF_LEROBOT)
-    made = [episode(config, i, mounting, moves=moves, seed=seed) for i, (mounting, moves) in enumerate(plan)]
+    made = [episode(config, i, mounting, moves=moves, seed=0) for i, (mounting, moves) in enumerate(plan)]
     write_lerobot(folder / "set", [shots for shots, _ in made], fps=FPS, codec="libx264")
     return path, [truth for _, truth in made]
 
 
-def make_bags(folder: Path, plan: list[tuple[int, bool]], seed: int = 1) -> tuple[Path, list[Truth]]:
+def make_bags(folder: Path, plan: list[tuple[int, bool]]) -> tuple[Path, list[Truth]]:
     """Likewise ``folder/bags`` with an MCAP file for each."""
     path = folder / "bags.yaml"
     config = write_config(path, OF_BAGS)
     (folder / "bags").mkdir()
     truths = []
     for i, (mounting, moves) in enumerate(plan):
-        shots, truth = episode(config, i, mounting, moves=moves, seed=seed)
+        shots, truth = episode(config, i, mounting, moves=moves, seed=1)
         write_mcap(folder / "bags" / f"run{i}.mcap", shots)
         truths.append(truth)
     return path, truths

@@ -25,9 +25,9 @@ def _tool() -> ModuleType:
     return module
 
 
-def picture_of(url: str, wait_s: float, width_px: int = 1000, height_px: int = 700) -> np.ndarray:
+def picture_of(url: str, wait_s: float) -> np.ndarray:
     """What a person sees there after a while, BGR."""
-    png = _tool().screenshot(f"{url}&renderer=webgl", width_px, height_px, wait_s, None)
+    png = _tool().screenshot(f"{url}&renderer=webgl", 1000, 700, wait_s, None)
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     return picture

@@ -37,9 +37,9 @@ def scene(seed=1, **options):
     return sampled(paper_setup(rng), rng, **options)
 
 
-def numeric(function, count, step=STEP):
+def numeric(function, count):
     """Central differences of a function of a small change (count,), stacked behind."""
-    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(count)]
+    columns = [(function(STEP * e) - function(-STEP * e)) / (2.0 * STEP) for e in np.eye(count)]
     return np.stack(columns, axis=-1)
 
 

@@ -124,7 +124,7 @@ def frame_record(seq: int = 7, **changes: object) -> FrameRecord:
     return FrameRecord(**(values | changes))  # type: ignore[arg-type]
 
 
-def state_record(seq: int = 7, message: str = "") -> StateRecord:
+def state_record(seq: int = 7) -> StateRecord:
     return StateRecord(
         robot="arm",
         camera="wrist",
@@ -141,7 +141,7 @@ def state_record(seq: int = 7, message: str = "") -> StateRecord:
         uptime_s=1.0,
         camera_connected=True,
         recording_dropped=0,
-        message=message,
+        message="",
         version="0",
     )
 
@@ -165,11 +165,11 @@ DEFAULT_PORT = 7447
 _held_port: list[IO[str]] = []
 
 
-def wait_for_default_port(deadline_s: float = 600.0) -> None:
+def wait_for_default_port() -> None:
     """Until no other program listens where a configuration that no one has edited will, and no other test is about to:
     it is this process's until :func:`give_default_port_back`.  Skips the test if it doesn't become free.
     """
-    deadline = time.monotonic() + deadline_s
+    deadline = time.monotonic() + 600.0
     if not _held_port:
         lock = (Path(tempfile.gettempdir()) / f"gripmon-tests-{DEFAULT_PORT}.lock").open("w")
         while not _locked(lock):

@@ -84,6 +84,6 @@ def simulated(scenario: Scenario, seed: int = 1, lens: LensSettings = PAPER_LENS
     return Simulator(make_camera(lens), box_gripper(), nominal_cam_T_grip(), scenario, seed)
 
 
-def corners_px(camera: Camera, gripper: Gripper, cam_T_grip: np.ndarray, jaw_opening_m: float = 0.034) -> np.ndarray:
-    points = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
+def corners_px(camera: Camera, gripper: Gripper, cam_T_grip: np.ndarray) -> np.ndarray:
+    points = gripper.points_grip_m(0.034)[gripper.corner_points]
     return camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])

@@ -49,17 +49,15 @@ class Faces:
 def standing(
     target: Target,
     *,
-    cam_T_grip: np.ndarray | None = None,
     turn_rad: float = 0.3,
     shift_m: tuple[float, float] = (0.0, 0.0),
     lens: LensSettings = PAPER_LENS,
-    jaw_opening_m: float = OPENING_M,
     look: Look = LOOK,
     grip_T_standing: np.ndarray | None = None,
     seed: int = 0,
 ) -> Image:
     """The gripper stands on the plate, turned and shifted; ``grip_T_standing`` is by what it doesn't."""
-    cam_T_grip = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
+    cam_T_grip = nominal_cam_T_grip()
     middle = {"circles": lambda t: (t.columns - 1, t.rows - 1, t.spacing_m)}.get(
         target.__struct_config__.tag, lambda t: (t.columns - 1, t.rows - 1, t.square_m)
     )(target)
@@ -69,16 +67,14 @@ def standing(
     centre = 0.5 * middle[2] * np.array(middle[:2]) + (middle[2] if isinstance(target, Charuco) else 0.0) * 0.5
     standing_T_plate[:2, 3] = np.array(shift_m) - standing_T_plate[:2, :2] @ centre
     lifted = np.eye(4) if grip_T_standing is None else grip_T_standing
-    faces = Faces(sharp_gripper(), cam_T_grip, jaw_opening_m)
+    faces = Faces(sharp_gripper(), cam_T_grip, OPENING_M)
     return render(lens, cam_T_grip @ lifted @ standing_T_plate, target, look, solid=faces, seed=seed)
 
 
-def true_corners(
-    cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS, jaw_opening_m: float = OPENING_M
-) -> dict[str, np.ndarray]:
+def true_corners(cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS) -> dict[str, np.ndarray]:
     """Pixels of all corners by name."""
     gripper = sharp_gripper()
-    points = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
+    points = gripper.points_grip_m(OPENING_M)[gripper.corner_points]
     uv = make_camera(lens).project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
     return dict(zip(gripper.corner_ids, uv, strict=True))
 
@@ -86,17 +82,15 @@ def true_corners(
 _OUTLINE = {"inner_near": "in_near", "inner_far": "in_far", "outer_near": "out_near"}
 
 
-def outline_pixels(
-    cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS, jaw_opening_m: float = OPENING_M
-) -> dict[str, np.ndarray]:
+def outline_pixels(cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS) -> dict[str, np.ndarray]:
     """Pixels of the two fingertips' outlines in view, by the names for a gripper that isn't known; the true corners'
     names are those of :func:`true_name`.
     """
     gripper, camera = sharp_gripper(), make_camera(lens)
-    points_m = gripper.points_grip_m(jaw_opening_m)
+    points_m = gripper.points_grip_m(OPENING_M)
     out = {}
     for finger in ("left", "right"):
-        true = true_corners(cam_T_grip, lens, jaw_opening_m)
+        true = true_corners(cam_T_grip, lens)
         out |= {f"{finger}_{name}": true[true_name(f"{finger}_{name}")] for name in _OUTLINE}
         for name, foot in (("rise_far", "in_far"), ("rise_near", "out_near")):
             point = points_m[gripper.point_ids.index(f"{finger[0].upper()}_{foot}")] - [0.0, 0.0, 0.025]

@@ -36,10 +36,10 @@ def true_uv(settings: LensSettings, cam_T_plate: Array, plate_m: Array) -> Array
     return make_camera(settings).project(plate_m @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3])
 
 
-def fingers(settings: LensSettings, reach: float = 0.3, height: float = 0.35) -> list[Cover]:
+def fingers(settings: LensSettings, reach: float = 0.3) -> list[Cover]:
     """Two fingers from the left and the right border, each over this part of the image's width."""
     w, h = settings.width_px, settings.height_px
-    top, bottom = (0.5 - 0.5 * height) * h, (0.5 + 0.5 * height) * h
+    top, bottom = 0.325 * h, 0.675 * h
     left = np.array([[-5, top - 9], [reach * w, top], [reach * w + 4, bottom], [-5, bottom + 6]])
     right = np.array([[w + 5, top + 4], [(1 - reach) * w, top], [(1 - reach) * w - 6, bottom], [w + 5, bottom]])
     return [(left, 115.0), (right, 85.0)]

@@ -158,7 +158,6 @@ def write_run(directory: Path) -> Run:
 def write_rrd(
     path: Path,
     texts: Sequence[str | bytes] = (),
-    seqs: Sequence[int] | None = None,
     application: str = "gripmon",
     recording_id: str = "made",
     **static: str | bytes,
@@ -169,7 +168,7 @@ def write_rrd(
         for entity, text in static.items():
             stream.log(entity, rr.AnyValues(json=_text(text)), static=True)
         if texts:
-            index = rr.TimeColumn("frame", sequence=list(range(len(texts)) if seqs is None else seqs))
+            index = rr.TimeColumn("frame", sequence=list(range(len(texts))))
             stream.send_columns("record", [index], rr.AnyValues.columns(json=[_text(t) for t in texts]))
         stream.log("elsewhere", rr.TextLog("something"))
         stream.flush()

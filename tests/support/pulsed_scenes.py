@@ -133,7 +133,7 @@ def _rounded(image: Array) -> Image:
     return out
 
 
-def write_folder(cell: Cell, folder: Path, pulses: int, moved_from: int | None = None, *, start_ns: int = 0) -> None:
+def write_folder(cell: Cell, folder: Path, pulses: int, moved_from: int | None = None) -> None:
     """``images/`` with stamps and ``pulses.csv``: before each pulse a dark frame, within it three, of which the outer
     ones lie in the margin.
     """
@@ -141,7 +141,7 @@ def write_folder(cell: Cell, folder: Path, pulses: int, moved_from: int | None =
     images.mkdir()
     rng = np.random.default_rng(7)
     rows = []
-    begins_ns = start_ns + PERIOD_NS * (1 + np.arange(pulses))
+    begins_ns = PERIOD_NS * (1 + np.arange(pulses))
     for k in range(pulses):
         uv = cell.uv_px(k, MOVED if moved_from is not None and k >= moved_from else None)
         for offset_ns, image in ((-100_000_000, dark(rng)), (100_000_000, lit(uv, rng)), (140_000_000, lit(uv, rng))):

@@ -84,7 +84,7 @@ class Run:
         return None
 
 
-def records(shifts_m: np.ndarray, seed: int = 0, start_ns: int = START_NS, first_seq: int = 0) -> list[FrameRecord]:
+def records(shifts_m: np.ndarray, seed: int = 0, start_ns: int = START_NS) -> list[FrameRecord]:
     """A frame for each row of ``shifts_m`` (n, 3), of the TCP against the reference, with noise; NaN: not measured."""
     reference = from_record(REFERENCE.cam_T_grip)
     rng = np.random.default_rng(seed)
@@ -97,9 +97,7 @@ def records(shifts_m: np.ndarray, seed: int = 0, start_ns: int = START_NS, first
         turn = exp_rotation(rng.normal(size=3) * NOISE_RAD)
         cam_T_grip = make_transform(turn @ reference[:3, :3], reference[:3, 3] + seen)
         drift = Drift(float(np.linalg.norm(seen)), rotation_angle(turn), tuple(seen.tolist()))
-        made = msgspec.structs.replace(
-            shown[i % _DIFFERENT], seq=first_seq + i, cam_T_grip=to_record(cam_T_grip), drift=drift
-        )
+        made = msgspec.structs.replace(shown[i % _DIFFERENT], seq=i, cam_T_grip=to_record(cam_T_grip), drift=drift)
         if np.isnan(shift_m).any():
             made = msgspec.structs.replace(
                 made, cam_T_grip=None, covariance=None, drift=None, protection=None, verdict=Verdict.UNKNOWN,
@@ -127,10 +125,10 @@ def said(run: list[FrameRecord], i: int, **changes: object) -> None:
     run[i] = msgspec.structs.replace(run[i], alerts=(*run[i].alerts, alert))
 
 
-def stepped(n: int = 500, at: int = 250, by_m: tuple[float, float, float] = (0.0, 3e-3, 0.0), **changes: object) -> Run:
+def stepped(n: int = 500, at: int = 250, **changes: object) -> Run:
     """A camera that is knocked at one frame, which is noticed three frames later."""
     shifts_m = np.zeros((n, 3))
-    shifts_m[at:] = by_m
+    shifts_m[at:] = (0.0, 3e-3, 0.0)
     made = records(shifts_m)
     said(made, at + 3)
     return Run(made, **changes)

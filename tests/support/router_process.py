@@ -59,8 +59,8 @@ def plain_config(folder: Path, endpoint: str) -> Path:
 
 
 @contextmanager
-def running(config: Path, endpoint: str, cwd: Path = ROOT) -> Iterator[RouterProcess]:
-    router = RouterProcess(config, endpoint, cwd)
+def running(config: Path, endpoint: str) -> Iterator[RouterProcess]:
+    router = RouterProcess(config, endpoint, ROOT)
     router.start()
     try:
         yield router

@@ -36,10 +36,9 @@ class NoisyMeter(ForecastMeter):
         gross: float = 0.0,
         lens: LensSettings = PAPER_LENS,
         gripper: Gripper | None = None,
-        seed: int = 1,
     ) -> None:
         super().__init__(make_camera(lens), gripper or box_gripper(), INDEPENDENT, jaw_sigma_m)
-        self.gross, self.rng = gross, np.random.default_rng(seed)
+        self.gross, self.rng = gross, np.random.default_rng(1)
 
     def _look(self, image: Image, prediction: Prediction) -> Edgels:
         edgels = super()._look(image, prediction)

@@ -29,12 +29,12 @@ _C, _R = np.meshgrid(np.arange(9) * 0.02, np.arange(7) * 0.02)
 PLATE_M: Array = np.stack([_C.ravel(), _R.ravel(), np.zeros(63)], axis=1)
 
 
-def poses(rng: np.random.Generator, count: int, distance_m: float = 0.2, tilt_rad: float = 0.6) -> list[Array]:
+def poses(rng: np.random.Generator, count: int, distance_m: float = 0.2) -> list[Array]:
     """``cam_T_plate`` of a plate held to all sides."""
     out = []
     for _ in range(count):
         T = np.eye(4)
-        T[:3, :3] = exp_rotation(np.array([*rng.uniform(-tilt_rad, tilt_rad, 2), rng.uniform(-0.3, 0.3)]))
+        T[:3, :3] = exp_rotation(np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-0.3, 0.3)]))
         centre = rng.uniform([-0.05, -0.035, 0.8], [0.05, 0.035, 1.2]) * [1.0, 1.0, distance_m]
         T[:3, 3] = centre - T[:3, :3] @ PLATE_M.mean(axis=0)
         out.append(T)

@@ -47,20 +47,18 @@ def scene(level_dn: float = TABLE_DN, opening_m: float = OPENING_M) -> Scenario:
 
 
 @lru_cache(maxsize=64)
-def _image(width_m: float, scenario: Scenario, pose_bytes: bytes, index: int) -> Image:
+def _image(width_m: float, scenario: Scenario, pose_bytes: bytes) -> Image:
     pose = np.frombuffer(pose_bytes).reshape(4, 4)
     gripper = bevelled(width_m) if width_m else box_gripper()
-    image = Simulator(CAMERA, gripper, pose, scenario, 1).render(index)
+    image = Simulator(CAMERA, gripper, pose, scenario, 1).render(0)
     image.flags.writeable = False
     return image
 
 
-def image_of(
-    width_m: float, scenario: Scenario | None = None, cam_T_grip: np.ndarray | None = None, index: int = 0
-) -> Image:
+def image_of(width_m: float, scenario: Scenario | None = None, cam_T_grip: np.ndarray | None = None) -> Image:
     """A picture of fingers with bevels of that width."""
     pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
-    return _image(width_m, scenario or scene(), np.ascontiguousarray(pose).tobytes(), index)
+    return _image(width_m, scenario or scene(), np.ascontiguousarray(pose).tobytes())
 
 
 def reference(

@@ -182,7 +182,7 @@ def _share(what: NDArray[np.bool_]) -> float | None:
     return float(what.mean()) if len(what) else None
 
 
-def worst(lines: list[dict[str, Any]], count: int = WORST) -> list[dict[str, Any]]:
+def worst(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The worst frames, one of each scene: by how far a valid one misled, then by the errors of the bounded ones."""
     found = []
     frames = collect(lines)
@@ -209,7 +209,7 @@ def worst(lines: list[dict[str, Any]], count: int = WORST) -> list[dict[str, Any
                 "misleading": int((frames.lies | frames.unbounded)[own].sum()),
             }
         )
-    return sorted(found, key=lambda item: -item["badness"])[:count]
+    return sorted(found, key=lambda item: -item["badness"])[:WORST]
 
 
 def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:

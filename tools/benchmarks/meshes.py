@@ -58,26 +58,26 @@ def bevelled_fingers(bevel_m: float) -> list[trimesh.Trimesh]:
     return out
 
 
-def rounded_profile(radius_m: float, width_m: float = 0.016, length_m: float = 0.04, parts: int = 48) -> np.ndarray:
+def rounded_profile(radius_m: float) -> np.ndarray:
     """Of a finger whose tip's two edges are rounded: (n, 2), the tip at z = 0."""
-    turn = np.linspace(0.0, 0.5 * np.pi, parts + 1)
-    arc = radius_m * np.column_stack([np.cos(turn) - 1.0, np.sin(turn) - 1.0]) + [0.5 * width_m, 0.0]
+    turn = np.linspace(0.0, 0.5 * np.pi, 49)
+    arc = radius_m * np.column_stack([np.cos(turn) - 1.0, np.sin(turn) - 1.0]) + [0.008, 0.0]
     mirrored = arc[::-1] * [-1.0, 1.0]
-    out = np.concatenate([[[0.5 * width_m, -length_m]], arc, mirrored, [[-0.5 * width_m, -length_m]]])
+    out = np.concatenate([[[0.008, -0.04]], arc, mirrored, [[-0.008, -0.04]]])
     return out[np.linalg.norm(out - np.roll(out, 1, axis=0), axis=1) > 1e-9]
 
 
-def rounded_fingers(radius_m: float, parts: int = 48) -> list[trimesh.Trimesh]:
+def rounded_fingers(radius_m: float) -> list[trimesh.Trimesh]:
     """Two fingers of 10 x 16 x 40 mm, 34 mm apart, their tips rounded about x."""
-    profile = rounded_profile(radius_m, parts=parts)
+    profile = rounded_profile(radius_m)
     return [finger_mesh(profile, x) for x in ((-0.027, -0.017), (0.017, 0.027))]
 
 
-def curved_fingers(parts: int = 96, bend_m: float = 0.06) -> list[trimesh.Trimesh]:
-    """Two fingers of 8 x 14 mm that bend inwards on an arc of radius ``bend_m`` over 40 mm, so that they aren't convex:
+def curved_fingers() -> list[trimesh.Trimesh]:
+    """Two fingers of 8 x 14 mm that bend inwards on an arc of radius 60 mm over 40 mm, so that they aren't convex:
     rings of four corners, 30 mm apart at the tips.
     """
-    out = []
+    out, parts, bend_m = [], 96, 0.06
     for side in (-1.0, 1.0):
         turn = np.linspace(0.0, 0.04 / bend_m, parts + 1)
         # From the tip backwards, bending outwards.
@@ -102,14 +102,12 @@ def curved_fingers(parts: int = 96, bend_m: float = 0.06) -> list[trimesh.Trimes
     return out
 
 
-def write_meshes(
-    meshes: Sequence[trimesh.Trimesh], folder: Path, scale: float = 1000.0, ending: str = "stl"
-) -> list[Path]:
+def write_meshes(meshes: Sequence[trimesh.Trimesh], folder: Path, ending: str = "stl") -> list[Path]:
     """One file a finger, in millimetres."""
     paths = []
     for k, mesh in enumerate(meshes):
         path = folder / f"finger{k}.{ending}"
-        mesh.copy().apply_scale(scale).export(path)
+        mesh.copy().apply_scale(1000.0).export(path)
         paths.append(path)
     return paths
 

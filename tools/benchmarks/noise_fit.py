@@ -146,13 +146,13 @@ def level_freedom(series: Series) -> float:
     return 200.0 if kurtosis <= 3.0 else round(min(4.0 + 6.0 / (kurtosis - 3.0), 200.0), 1)
 
 
-def _bursts(z: Array, block: int = 32) -> float:
+def _bursts(z: Array) -> float:
     """Spread of the logarithm of the frame-to-frame changes' size from block to block within a scene."""
-    steps = np.diff(z, axis=1)
+    steps, block = np.diff(z, axis=1), 32
     blocks = steps.shape[1] // block
     squares = mean(steps[:, : blocks * block].reshape(len(z), blocks, block * 6) ** 2, (2,))
     logs = 0.5 * np.log(squares)
-    # A block of so many changes scatters by itself.
+    # The scatter of a block of this many changes.
     own = 0.5 / (block * 6 / 2.0)
     within = float(np.nanvar(logs - np.nanmean(logs, axis=1, keepdims=True)))
     return round(float(np.sqrt(max(within - own, 0.0))), 4)

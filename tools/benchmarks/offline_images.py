@@ -79,9 +79,7 @@ class Setting:
         return made
 
 
-def views(
-    lens: LensSettings, target: Chequerboard, count: int, rng: np.random.Generator, noise_dn: float = 1.5
-) -> list[NDArray[np.uint8]]:
+def views(lens: LensSettings, target: Chequerboard, count: int, rng: np.random.Generator) -> list[NDArray[np.uint8]]:
     """Images of a plate held before a camera, tilted to all sides, whole in every view."""
     images: list[NDArray[np.uint8]] = []
     camera = make_camera(lens)
@@ -100,6 +98,6 @@ def views(
             if not ((uv > 4.0) & (uv < np.array([lens.width_px, lens.height_px]) - 5.0)).all():
                 continue
         light = Plate(target, cam_T_plate, Print(margin=np.inf)).light(lens, Sensor().psf_sigma_px)
-        noisy = light + rng.normal(0.0, noise_dn, light.shape)
+        noisy = light + rng.normal(0.0, 1.5, light.shape)
         images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
     return images

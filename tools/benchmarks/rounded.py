@@ -50,9 +50,9 @@ def facetted_m(facet_m: float) -> Array:
     return np.array([[-half - back, -back], [-half, 0.0], [half, 0.0], [half + back, -back]])
 
 
-def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004, step_m: float = 2e-4) -> Gripper:
-    """For the simulator: prisms with a facet each ``step_m``; their vertices lie on the rounded outline."""
-    return solids(outline_m(width_m, radius_m, step_m))
+def rounded_solids(width_m: float = 0.012, radius_m: float = 0.004) -> Gripper:
+    """For the simulator: prisms with a facet each 0.2 mm; their vertices lie on the rounded outline."""
+    return solids(outline_m(width_m, radius_m, 2e-4))
 
 
 def solids(tip: Array) -> Gripper:

@@ -70,7 +70,6 @@ class Figures:
     along_m: Array
     worse_m: Array
     grasped: int
-    grasp_s: Array
     conduct: tuple[Conduct, ...]
     stopped_by_range: int
 
@@ -90,9 +89,6 @@ def _of(runs: Sequence[Run], source: str) -> Figures:
     truth_m = np.array([run.tracks[TRUTH].distance_m[-1] for run in runs])
     final_m = np.array([track.distance_m[-1] for track in tracks])
     off_m = np.array([track.off_m[-1] for track in tracks])
-    closed = [
-        run.time_s[track.grasped.index(True)] for run, track in zip(runs, tracks, strict=True) if track.grasped[-1]
-    ]
     return Figures(
         row=runs[0].row.name,
         source=source,
@@ -100,8 +96,7 @@ def _of(runs: Sequence[Run], source: str) -> Figures:
         across_m=np.hypot(off_m[:, 0], off_m[:, 1]),
         along_m=np.abs(off_m[:, 2]),
         worse_m=final_m - truth_m,
-        grasped=len(closed),
-        grasp_s=np.array(closed),
+        grasped=sum(track.grasped[-1] for track in tracks),
         conduct=tuple(conduct(run, track) for run, track in zip(runs, tracks, strict=True)),
         stopped_by_range=sum(track.stopped_by_range for track in tracks),
     )
