@@ -173,9 +173,9 @@ def test_a_failed_monitor_is_exit_code_3(monkeypatch, capsys: pytest.CaptureFixt
     from servoing.feed import FeedError
 
     def run(*_args, **_named):
-        raise FeedError("the monitor has said nothing for 90 s")
+        raise FeedError("the monitor has sent nothing for 90 s")
 
     monkeypatch.setattr(runs, "run", run)
     monkeypatch.setattr(sys, "argv", ["servo", "--runs", "1"])
     assert command.main() == 3
-    assert capsys.readouterr().err.splitlines()[-1] == "servo: the monitor has said nothing for 90 s"
+    assert capsys.readouterr().err.splitlines()[-1] == "servo: the monitor has sent nothing for 90 s"

@@ -53,7 +53,7 @@ def main() -> int:
     for benchmark in _BENCHMARKS:
         benchmark.add_parser(commands)
     arguments = parser.parse_args()
-    # One thread for everybody that is compared.  Has to come before NumPy is imported.
+    # One thread for all that are compared; must be set before NumPy is imported.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
     code: int = arguments.handler(arguments)

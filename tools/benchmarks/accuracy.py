@@ -136,7 +136,7 @@ def _in_processes(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
 
 
 def _prepare() -> None:
-    """One thread for everybody, and everything imported and run once before anything is timed."""
+    """One thread for all, and everything imported and run once before anything is timed."""
     import cv2
 
     from benchmarks import pairs, series  # noqa: F401 - so that a checkout that changes meanwhile does no harm

@@ -86,7 +86,7 @@ def cells(f: dict[str, Any], limit_um: list[float] | None) -> list[str]:
 
 
 def summary(results: dict[str, Any]) -> list[str]:
-    """What is said of all rows together, and of repeatability."""
+    """The summary of all rows together, and of repeatability."""
     lines = []
     for way, f in results["together"].items():
         lines.append(

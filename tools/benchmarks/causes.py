@@ -18,7 +18,7 @@ noisy or are missing, the camera freezes or is replaced, its clock or its frame 
 Grippers of four shapes, three cameras with lenses of their own, poses, openings, still and moving backgrounds and how
 the opening is reported (exact, noisy, not at all) are random, and no trial is left out.  What the monitor's alerts name
 in the end counts: the right cause, and the finger that is bent; another one (wrong, also beside the right one); or
-unknown.  Where there is no alert at all nothing was noticed: right where nothing happened.  Takes some hours."""
+unknown.  Without any alert nothing was detected, which is right if nothing happened.  Takes some hours."""
 
 RIGHT_OR_UNKNOWN, WRONG = 0.95, 0.01
 """To reach."""
@@ -28,7 +28,7 @@ VERDICTS = ("right", "unknown", "silent", "wrong")
 
 @dataclass(frozen=True)
 class Outcome:
-    """One trial: its number, what went wrong, what was told in the end and how it was weighed; ``verdict``: right,
+    """One trial: its number, what went wrong, the cause reported in the end and its probability; ``verdict``: right,
     unknown, silent (no alert) or wrong; ``misled``: some alert named a wrong cause for a while.
     """
 
@@ -122,7 +122,7 @@ def as_text(machine: dict[str, Any], seed: int, outcomes: list[Outcome]) -> str:
     lines = [
         f"gripmon {machine['commit']}, {machine['date']}",
         f"{machine['cpu']}, {machine['cpus']} cores, {machine['system']}",
-        f"seed {seed}; what went wrong (rows), what was told in the end (columns), shares of the trials",
+        f"seed {seed}; what went wrong (rows), cause reported in the end (columns), fractions of the trials",
         "",
         _row("", *(column.replace("_", " ")[:13] for column in columns), *VERDICTS, "misled"),
     ]

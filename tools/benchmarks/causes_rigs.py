@@ -21,7 +21,7 @@ WELL, AFTER = 24, 24
 """Frames before and after it."""
 
 START_SIGMA = np.array([1e-4] * 3 + [1e-3] * 3)
-"""By how much the reference is wrong, each axis, m and rad; the monitor is told."""
+"""By how much the reference is wrong, per axis, m and rad; the monitor knows this."""
 
 JAW_NOISE_M = 3e-5
 _BORDER_PX = 14.0
@@ -30,7 +30,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Rig:
-    """What is watched: the reference is ``start_cam_T_grip``; ``jaw_sigma_m`` what is told about the opening."""
+    """What is watched: the reference is ``start_cam_T_grip``; ``jaw_sigma_m``: the setting for the opening."""
 
     camera_settings: LensSettings
     gripper: Gripper

@@ -18,7 +18,7 @@ from gripmon.monitor import Monitor, MonitorSettings
 
 @dataclass(frozen=True)
 class Told:
-    """``last``: what the alerts that were open in the end said, ``ever``: all that any said since it went wrong, each
+    """``last``: causes in the alerts open at the end, ``ever``: in any alert since it went wrong, each
     a cause and a finger.  ``text`` and ``causes`` (cause, finger, probability) of the alert that named one, or of the
     last.
     """

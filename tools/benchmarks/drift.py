@@ -29,7 +29,7 @@ need to be for all frames.  At last the noise changes from quiet to working half
 The other parts of the same decisions have benchmarks of their own: causes, recalibration, smoothing."""
 
 REQUIRED = {0.1: 3, 0.05: 10}
-"""A step of so many mm must be noticed within so many frames."""
+"""A step of this many mm must be detected within this many frames."""
 
 STEPS_MM = (0.02, 0.05, 0.1, 0.5, 4.5)
 CREEPS_MM_PER_MIN = (0.01, 0.1)
@@ -188,7 +188,7 @@ def _delays(
 
 
 def _change(seed: int, tick: Callable[[int], Any]) -> dict[str, int]:
-    """Alarms in so many frames of quiet, and in as many of working noise that the same charts meet next."""
+    """Alarms in this many frames of quiet, and in as many of working noise that follow for the same charts."""
     import numpy as np
 
     from benchmarks.drift_streams import Ours, count_alarms

@@ -19,7 +19,7 @@ FRAMES_PER_DAY = 86_400.0 * FRAMES_PER_S
 ALERT_FRAMES = 60
 CHUNK = 256
 BLOCK_FRAMES = 1024
-"""The largest statistic of so many frames is one value for the tail."""
+"""The largest statistic of this many frames is one value for the tail."""
 
 
 class Chart(Protocol):

@@ -201,7 +201,7 @@ def _in_processes(tasks: list[tuple[str, int]], plan: Plan) -> Iterator[tuple[tu
 
 
 def _prepare() -> None:
-    """One thread for everybody; everything imported before a checkout that changes meanwhile does harm."""
+    """One thread for all; import everything now, in case the checkout changes meanwhile."""
     import cv2
 
     from benchmarks import integrity_runs  # noqa: F401

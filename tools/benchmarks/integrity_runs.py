@@ -73,7 +73,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Watched:
-    """A sequence and what the monitor is told before it."""
+    """A sequence and what the monitor knows before it."""
 
     camera: Camera
     gripper: Gripper

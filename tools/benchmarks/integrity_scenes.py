@@ -37,7 +37,7 @@ _JAW_NOISE_M = 3e-5
 
 @dataclass(frozen=True)
 class IntegrityScene:
-    """A simulated sequence and what the monitor is told before it.
+    """A simulated sequence and what the monitor knows before it.
 
     The sequence begins at frame ``first`` of the simulator; ``jaw_sigma_m`` None: the product's default.
     """

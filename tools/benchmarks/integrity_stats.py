@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 BACK_FRAMES = 3
-"""Within so many frames after the view is free the transform has to be valid."""
+"""Within this many frames after the view is free the transform must be valid."""
 LEVEL_OVER_ERROR = 12.0
 NEES_RANGE = (4.5, 7.5)
 AVAILABLE = (0.99, 0.95, 0.80)

@@ -147,7 +147,9 @@ def draw(rng: np.random.Generator, count: int, size: tuple[float, float] = (0.0,
 
 
 def scene(rig: str, background: str, seed: list[int], count: int, kind: str) -> Scene:
-    """A scene with so many jumps: within what is promised (kind ""), "beyond", or with the gripper "absent"."""
+    """A scene with the given number of jumps: within what is promised (kind ""), "beyond", or with the gripper
+    "absent".
+    """
     rng = np.random.default_rng(seed)
     xis = draw(rng, count, (1.0, 2.0) if kind == "beyond" else (0.0, 1.0))
     return Scene(rigs()[rig], background, xis, rng, absent=kind == "absent")

@@ -45,7 +45,7 @@ BEFORE = 4
 """Frames before the knock."""
 
 REFERENCE_SIGMA_M, REFERENCE_SIGMA_RAD = 1e-4, 1e-3
-"""By how much the reference before the knock is wrong, each axis; the monitor is told."""
+"""By how much the reference before the knock is wrong, per axis; the monitor knows this."""
 
 JAWS = ("rests", "moves", "moves, noise", "moves, offset", "rests, offset", "unreported")
 JAW_SHARES = (0.35, 0.25, 0.1, 0.1, 0.1, 0.1)
@@ -60,7 +60,7 @@ _NOISE_M, _OFFSET_M = 3e-5, 2e-4
 @dataclass(frozen=True)
 class Knock:
     """One trial: what was drawn, in words, and the simulator that shows it.  ``start_cam_T_grip``: the reference that
-    the monitor is given.  ``jaw_sigma_m`` what it is told of the reported opening, None for the product's default.
+    the monitor is given.  ``jaw_sigma_m``: its setting for the reported opening, None for the default.
     """
 
     number: int
@@ -173,7 +173,7 @@ def _background(rng: np.random.Generator, name: str, still: bool) -> Background:
 
 
 def _jaw(rng: np.random.Generator, gripper: Gripper, jaw: str, opening_m: float) -> tuple[JawScript, float | None]:
-    """The jaw's script, and what the monitor is told of the report's error."""
+    """The jaw's script, and the monitor's settings for the report's error."""
     if jaw == "none":
         return JawScript(), None
     knots: tuple[tuple[float, float], ...] = ((0.0, opening_m),)

@@ -136,7 +136,7 @@ def _bound(problem: SpotProblem, truth: LaserSetup, noise_px: float, good: NDArr
 def _reference(
     setup: LaserSetup, rng: np.random.Generator, poses: int, noise_px: float
 ) -> dict[str, tuple[float, float] | None]:
-    """Dornaika and Horaud's method on so many poses of the ten points, in the camera's view."""
+    """Dornaika and Horaud's method on this many poses of the ten points, in the camera's view."""
     truth = setup.cam_T_base
     matrix = np.array([[543.0, 0.0, 320.0], [0.0, 543.0, 240.0], [0.0, 0.0, 1.0]])
     first = Rotation.random(rng=rng).as_matrix()

@@ -207,7 +207,7 @@ def _replayed(path: Path, count: int) -> _Replayed:
 
 
 def write_folder(ring: scene.Ring, folder: Path, count: int) -> None:
-    """So many frames of a ring as PNG with their time stamps; the same image is one file on the disk."""
+    """This many frames of a ring as PNG with their time stamps; the same image is one file on disk."""
     folder.mkdir()
     table, files = ["file,stamp_ns,jaw_opening_m"], {}
     for seq in range(count):

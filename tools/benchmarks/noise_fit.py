@@ -52,8 +52,8 @@ class _Moments:
 def fit(
     regime: str, series: Series, level_dof: float, provenance: dict[str, Any], tail_scenes: int = 200
 ) -> NoiseModel:
-    """All numbers of a regime; levels are Student's with so many degrees of freedom, and tails are compared on so many
-    simulated scenes.
+    """All numbers of a regime; levels are Student's with this many degrees of freedom, and tails are compared on this
+    many simulated scenes.
     """
     z, factors = whitened(series)
     measured = statistics(z)

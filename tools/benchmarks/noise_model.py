@@ -229,7 +229,7 @@ class _Scenes:
             return values
         state = self._passing.get(name)
         if state is None:
-            # As if the first values had held for ever.
+            # As if the first values had held forever.
             left = np.arange(len(self._kernel) - 1, 0, -1) / len(self._kernel)
             state = left.reshape(-1, *[1] * (values.ndim - 1)) * values[0]
         out, self._passing[name] = lfilter(self._kernel, [1.0], values, axis=0, zi=state)

@@ -146,7 +146,7 @@ def _revealed_table(revealed: list[Revealed]) -> str:
 
     lines = [
         (
-            "a gripper that doesn't stand on the plate: part of the images in which it is told (probability below "
+            "a gripper that doesn't stand on the plate: fraction of images in which it is detected (p below "
             "0.001); power: of the best test, by all edges and by the corners alone"
         ),
         (

@@ -61,7 +61,7 @@ class Errors:
 
 @dataclass
 class Revealed:
-    """What doesn't coincide, at one image noise, seen by one way: ``count`` trials of which so many were told of, by
+    """What doesn't coincide, at one image noise, seen by one way: ``count`` trials of which this many were detected, by
     the residuals or by the tilt and gap that the gripper's own edges give, no plate considered; ``apart`` (n, 3) those,
     rad, rad, m; ``shift_mm`` (n,) the TCP's error that follows.
 
@@ -123,8 +123,8 @@ def solve(way: str, setting: Setting, image: Image, sight: Sighting, rng: np.ran
 
 
 def revealed(count: int, seed: int, progress: Callable[[], object] = lambda: None) -> list[Revealed]:
-    """A gripper that doesn't stand on the plate, at several noises of the image: what is told.  Beside tilt and gap one
-    that does stand: how often that is doubted.
+    """A gripper that doesn't stand on the plate, at several noises of the image: what is detected.  Besides tilt and
+    gap one that does stand: how often that is doubted.
     """
     kinds: dict[str, tuple[tuple[float, float], float]] = {
         "coincides": ((0.0, 0.0), 0.0),
@@ -178,7 +178,7 @@ def _by_corners(one: Coincidence) -> Coincidence:
 
 
 def _power(one: Coincidence, true_apart: Array) -> float:
-    """0 where tilt and gap can't be told."""
+    """0 where tilt and gap can't be determined."""
     if one.apart_covariance is None:
         return 0.0
     away = float(true_apart @ np.linalg.solve(one.apart_covariance, true_apart))

@@ -55,7 +55,7 @@ def _draw_apart(panel: Any, revealed: list[Revealed]) -> None:
         rows = [row for row in revealed if row.what == kind and row.count]
         told = [100.0 * max(row.by_apart, row.by_residuals) / row.count for row in rows]
         panel.plot([row.noise_dn for row in rows], told, "o-", color=colour, label=kind)
-    panel.set(xscale="log", xlabel="noise of the image (DN)", ylabel="told of (% of the images)", ylim=(-3, 103))
+    panel.set(xscale="log", xlabel="noise of the image (DN)", ylabel="detected (% of the images)", ylim=(-3, 103))
     noises = sorted({row.noise_dn for row in revealed})
     panel.set_xticks(noises, labels=[f"{noise:g}" for noise in noises])
     panel.minorticks_off()

@@ -25,14 +25,14 @@ RIGHT_M = 5e-5
 """Error of an accepted TCP up to which it is right."""
 
 AFTER, LOST_FOR = 66, 15
-"""Frames after the knock that are looked at, at most; fewer once so many in a row don't show the gripper."""
+"""Frames after the knock that are looked at, at most; fewer once this many in a row don't show the gripper."""
 
 ANSWERS = ("accepted", "person", "refused", "gripper", "unsettled", "lost", "needless")
 _MEANINGS = {
     "accepted": "a new reference, taken by the monitor itself",
     "person": "a new reference, put to an operator",
     "refused": "no new reference, and why",
-    "gripper": "no new reference: the fingers or the jaw are said to have moved",
+    "gripper": "no new reference: the fingers or the jaw are reported to have moved",
     "unsettled": "past the limit, but no still frames in a row",
     "lost": "the gripper isn't found, or only now and then",
     "needless": "not past the limit",

@@ -78,7 +78,7 @@ def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, A
 
 
 def _judge(ring: scene.Ring, count: int) -> _Part:
-    """What a monitor makes of so many frames; an image every sixth frame, which is 10 a second."""
+    """A monitor's records of this many frames; an image every sixth frame, which is 10 per second."""
     height_px, width_px = ring.images.shape[1:]
     config = scene.config_for((width_px, height_px))
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)

@@ -22,7 +22,7 @@ _FRAMES = 100_000  # no one gets that far
 
 @dataclass(frozen=True)
 class Plan:
-    """So many kills, each at a random moment of the span, counted from the first frame."""
+    """This many kills, each at a random moment of the span, counted from the first frame."""
 
     size: tuple[int, int] = (768, 576)
     ring: int = 30

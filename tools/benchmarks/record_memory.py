@@ -30,7 +30,9 @@ _LIGHT = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Frames, in hours at 60 a second; a look every so many frames; ``judged`` are made by a monitor and repeated."""
+    """Frames, in hours at 60 a second; ``look_every``: frames between two samples; ``judged`` are made by a monitor and
+    repeated.
+    """
 
     size: tuple[int, int] = (384, 288)
     ring: int = 30

@@ -1,7 +1,7 @@
 """A daemon that records, in a process of its own: RING DIRECTORY FRAMES.
 
 Says ``recording PID`` (of its recording process) on standard output, then the number of each frame whose transform has
-been published; what it has said, it has delivered, whatever becomes of it.
+been published; what it has printed has been delivered, whatever happens to it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, Sta
 
 
 class _Said:
-    """A publisher whose receiver is whoever reads our output."""
+    """A publisher that writes to standard output."""
 
     def transform(self, record: FrameRecord) -> None:
         os.write(1, b"%d\n" % record.seq)

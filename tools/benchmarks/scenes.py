@@ -39,7 +39,7 @@ CAMERA = PaperLens(
 """That of the self-viewing paper, and of what was measured with others."""
 
 START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
-"""By how much a scene's reference is wrong, each axis; the monitor is told."""
+"""By how much a scene's reference is wrong, per axis; the monitor knows this."""
 MOVED_M, MOVED_RAD = 3e-4, 3e-3
 """By how much the camera has moved since teaching, each axis."""
 TEACHING_IMAGES = 4
@@ -63,7 +63,7 @@ class Shot:
 class Sequence(ABC):
     """What a monitor and its peers look at: frames with truth, and what they may know before the first.
 
-    ``jaw_sigma_m`` is what the monitor is told about the reported opening, None for the product's default; ``taught``
+    ``jaw_sigma_m``: the monitor's setting for the reported opening, None for the default; ``taught``
     what it was taught about the gripper's edges.
     """
 

@@ -1,7 +1,7 @@
 """Where the time of a frame goes: the product's functions, wrapped in stop watches for one run of its own.
 
 A function's time counts without that of wrapped functions that it calls, so the stages add up to the whole.  Only the
-thread that makes the watches is timed: what runs beside the frames is no one's stage.
+thread that makes the watches is timed: what runs beside the frames belongs to no stage.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ class TagTracker:
         self._detect = _Aruco() if detector == "aruco" else _AprilTags()
 
     def cam_T_grip(self, image: NDArray[np.uint8], jaw_opening_m: float, least: int = 2) -> Array | None:
-        """The pose (4, 4); None unless so many tags are found."""
+        """The pose (4, 4); None unless this many tags are found."""
         found = self._detect(image)
         points_m = self._tags.black_points_grip_m(jaw_opening_m)
         numbers = sorted(set(found) & set(points_m))

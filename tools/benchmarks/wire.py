@@ -128,7 +128,7 @@ def as_text(results: dict[str, Any]) -> str:
             f"  away for {turn['router_away_s']:.2f} s; first transform {back} after it listened again; "
             f"lost {turn['lost']}, of them {turn['lost_while_away']} while it was away"
         )
-    lines.append("  (before 0: processes that found it before it said so)")
+    lines.append("  (before 0: processes that found it before it reported so)")
     lines += ["", *_slow_rows(results["slow"])]
     lines += ["", "to be reached"]
     lines += [f"  {what:70s} {value:>8s}  {'met' if met else 'NOT MET'}" for what, value, met in verdicts(results)]

@@ -66,7 +66,7 @@ class Crowd:
 
 
 class RouterProcess:
-    """``gripmon router``; ``up_ns`` is when it last said that it listens, by the clock that all processes share."""
+    """``gripmon router``; ``up_ns`` is when it last reported that it listens, by the clock that all processes share."""
 
     def __init__(self, folder: Path, *, shared_memory: bool = True) -> None:
         """The shipped configuration for one machine; without ``shared_memory`` it talks as to other machines."""

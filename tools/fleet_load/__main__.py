@@ -19,7 +19,7 @@ monitor costs router and readers. Then the same with gripmon watch in place of t
 transforms, and where no one wants them they aren't even sent.
 
 The monitors are real where this is about the network: each has a session, a publisher and messages as
-gripmon run has. They process no images: one record, measured on a picture of the demo, is said again with
+gripmon run has. They process no images: one record, measured on a picture of the demo, is published again with
 other numbers and stamps; fifty whole monitors would need the processors of fifty robots. Nor do they use
 shared memory, as robots elsewhere can't."""
 

@@ -25,7 +25,7 @@ SETTLED_S, SETTLED_M, SETTLED_RAD = 0.5, 2e-5, 1e-3
 
 @dataclass(frozen=True)
 class Given:
-    """What a controller is told with a frame: ``cam_T_grip`` (4, 4) or None, how sure it is, from which reference."""
+    """What a controller receives with a frame: ``cam_T_grip`` (4, 4) or None, its uncertainty, and its reference."""
 
     cam_T_grip: Array | None
     verdict: Verdict
@@ -37,7 +37,7 @@ class Given:
 def given_by(reading: Reading, age_s: float, *, smoothed: bool) -> Given:
     """What the monitor's client has read, as the controller takes it; what the client refuses is unknown.
 
-    Where there is no average, the frame's own transform stands in for it.
+    Without an average, the frame's own transform is used.
     """
     average = reading.smoothed if smoothed else None
     pose = reading.transform if average is None else Transform(average.translation_m, average.rotation_xyzw)

@@ -80,7 +80,7 @@ class Feed:
                 if ended and silent_s > _UNDER_WAY_S:
                     break
                 if silent_s > _SILENCE_S:
-                    raise FeedError(f"the monitor has said nothing for {_SILENCE_S:g} s") from None
+                    raise FeedError(f"the monitor has sent nothing for {_SILENCE_S:g} s") from None
                 continue
             heard_s = time.monotonic()
             if reading.seq <= newest:

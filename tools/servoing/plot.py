@@ -1,4 +1,4 @@
-"""A picture: distance over time of the four arms, and what the monitor said meanwhile."""
+"""A picture: distance over time of the four arms, and the monitor's verdicts."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def as_text(machine: dict[str, Any], runs: Sequence[Run], every: Sequence[Figure
         )
     if missed > _TOO_MANY * (missed + seen):
         lines.append(
-            "  so many frames are missing that this machine is what was measured; without --realtime none is left out"
+            "  too many frames are missing, so that this measures the machine; without --realtime none is skipped"
         )
     return "\n".join(lines)
 
