@@ -307,7 +307,7 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         Meta(
             gt=0.0,
             le=3600.0,
-            description="time after the arrival of a pulse's end in which its frames may still come (s)",
+            description="time after a pulse's end, counted from its report, in which its frames may still arrive (s)",
         ),
     ] = 10.0
 
