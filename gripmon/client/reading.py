@@ -227,7 +227,7 @@ def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, w
     if age_s == math.inf:
         why = "the monitor has not sent its clock yet"
         if entry.sent is None:
-            why = "a monitor of this version doesn't send it; update it, or synchronise the clocks and set clocks_agree"
+            why = "a monitor of an older version sends none; update it, or synchronise the clocks and set clocks_agree"
         return Unusable.AGE_UNKNOWN, f"the transform's delay is not known: {why}"
     if age_s > policy.max_age_s:
         since = f"; what came since can't be read: {heard.unreadable}" if heard.unreadable else ""
@@ -253,4 +253,4 @@ def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
     bound_m = record.protection.position_m
     if bound_m <= allowed_m:
         return None
-    return Unusable.UNPROTECTED, f"the TCP may be {1e3 * bound_m:.3g} mm off, allowed are {1e3 * allowed_m:g} mm"
+    return Unusable.UNPROTECTED, f"the TCP may be {1e3 * bound_m:.3g} mm off, at most {1e3 * allowed_m:g} mm is allowed"
