@@ -18,8 +18,8 @@ from support.plates import Look, fingers, pose, render
 from gripmon.calibrate.bundle import lens_vector
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.cli import main
-from gripmon.daemon.calibrations import target_of
 from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.targets import target_of
 from gripmon.model.camera import BrownConradyLens, PaperLens
 from gripmon.model.errors import InputError
 from gripmon.model.targets import parse_target

@@ -26,7 +26,7 @@ from gripmon.calibrate.documents import (
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.calibrated import read_camera
-from gripmon.daemon.config.yaml_file import as_yaml
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.judge.statefile import Calibration, Owner, pack
 from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.model.geometry import perturb, to_record
@@ -292,6 +292,17 @@ def test_bad_input_is_one_clear_line(
     assert code == 2 and said in error and not out
     assert error.startswith("usage:") or error.count("\n") == 1
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_the_plate_in_another_size_is_refused(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    of_a_plate = read_yaml(made / "hand_eye.yaml")
+    of_a_plate["provenance"]["command"] = "gripmon calibrate plane a.png --target circles:12x10:0.016:0.008"
+    (tmp_path / "hand_eye.yaml").write_text(as_yaml(of_a_plate))
+    images = made / "plate.png", "--config", made / "config.yaml", "--target", "circles:12x10:0.008:0.004"
+    code, out, said = gripmon(capsys, "verify", tmp_path / "hand_eye.yaml", *images)
+    assert code == 2 and not out and said.count("\n") == 1
+    assert "hand_eye.yaml was made with circles:12x10:0.016:0.008, the same pattern in another size" in said
+    assert gripmon(capsys, "verify", tmp_path / "hand_eye.yaml", *images, "--other-target")[0] == 0
 
 
 def test_images_that_show_nothing_fail_with_the_reason(made: Path, capsys: pytest.CaptureFixture[str]):

@@ -72,6 +72,7 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+TWICE = "circles:12x10:0.016:0.008"
 KNOWN = ["--camera", "camera.yaml", "--target", TARGET, "--gripper", "gripper.yaml", "--jaw-opening", str(OPENING_M)]
 INFER = ["--camera", "camera.yaml", "--target", TARGET, "--infer", "--gripper-out", "new.yaml"]
 
@@ -152,6 +153,8 @@ def test_a_gripper_that_isnt_known_and_a_configuration_that_needs_no_editing(
     assert plane("p1.png", "--config", "arm.yaml", "--target", TARGET, "--out", "he2.yaml") == 0
     assert "jaw opening taken as 0.034 m" in capsys.readouterr().out
     check_truth(hand_eye(here / "he2.yaml"))
+    assert plane("p1.png", "--config", "arm.yaml", "--target", TWICE, "--out", "he3.yaml") == 2
+    assert f"the camera was calibrated with {TARGET}" in capsys.readouterr().err
     # The camera's file counts there, too.
     assert np.sqrt(hand_eye(here / "he2.yaml").covariance[14]) > 0.9 * 0.115 * 0.2 / 962.0
 
@@ -169,6 +172,29 @@ def test_rough_corners_of_their_own_for_each_image(here: Path):
     found = hand_eye(here / "he.yaml")
     assert found.residuals.corners == 8
     assert found.warnings[0].startswith("p1.png: two corners only (L_in_near, R_in_far)")
+
+
+@pytest.mark.parametrize("options", [KNOWN, INFER])
+def test_the_camera_s_target_in_another_size_is_refused(
+    here: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+):
+    """No image contradicts it: an inferred gripper would silently have twice the size."""
+    wrong = [TWICE if word == TARGET else word for word in options]
+    corners = ["--corners", "rough.yaml" if options is KNOWN else "outline.yaml"]
+    assert plane("p0.png", *wrong, *corners, "--out", "he.yaml") == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"--target {TWICE}: the camera was calibrated with {TARGET}, the same pattern in another si")
+    assert "--other-target" in said and said.count("\n") == 1
+    assert not (here / "he.yaml").exists() and not (here / "new.yaml").exists()
+
+
+def test_another_target_of_the_same_pattern_is_taken_where_it_is_confirmed(here: Path):
+    inferred = [TWICE if word == TARGET else word for word in INFER]
+    said = ["--other-target", "--corners", "outline.yaml", "--out", "he.yaml"]
+    assert plane("p0.png", *inferred, *said) == 0
+    found = hand_eye(here / "he.yaml")
+    assert np.allclose(found.cam_T_grip.translation_m, 2.0 * TRUE[:3, 3], atol=1e-4)
+    assert "--other-target" in found.provenance.command
 
 
 def test_another_jaw_opening_is_warned_of(here: Path, capsys: pytest.CaptureFixture[str]):

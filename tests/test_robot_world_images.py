@@ -74,6 +74,10 @@ def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
     for target in ("chequerboard:8x6:0.03", "circles:8x8:0.008:0.004"):  # the same after half a turn
         assert main([*command, "--target", target, "--out", str(tmp_path / "no.yaml")]) == 2
         assert "doesn't tell which way up" in capsys.readouterr().err
+    twice = [*command, "--target", "charuco:8x6:0.06:0.044", "--out", str(tmp_path / "no.yaml")]
+    assert main(twice) == 2
+    assert f"the camera was calibrated with {TARGET}, the same pattern in another size" in capsys.readouterr().err
+    assert main([*twice, "--other-target"]) == 3, "these images show nothing"
     assert not (tmp_path / "no.yaml").exists()
 
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens
 from gripmon.model.geometry import perturb, skew
@@ -443,11 +444,21 @@ def lens_vector(camera: LensSettings) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class GivenCamera:
-    """A camera with the covariance of those of its ``parameters`` that aren't exact, named as in its file."""
+    """A camera with the covariance of those of its ``parameters`` that aren't exact, named as in its file; ``target``:
+    what it was calibrated with, if that is known.
+    """
 
     lens: LensSettings
     parameters: tuple[str, ...] = ()
     covariance: Array | None = None
+    target: str | None = None
+
+    @classmethod
+    def calibrated(cls, found: CameraCalibration) -> GivenCamera:
+        """The camera of a calibration."""
+        count = len(found.parameters)
+        covariance = np.reshape(np.array(found.covariance), (count, count))
+        return cls(found.camera, found.parameters, covariance, found.target)
 
     @property
     def model(self) -> LensModel:

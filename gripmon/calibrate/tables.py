@@ -24,7 +24,7 @@ from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_x
 from gripmon.model.images import check_size, image_in
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.records import Array, Image
-from gripmon.model.targets import Chequerboard, Target, TargetError, name_of, tells_its_turn
+from gripmon.model.targets import Chequerboard, Target, TargetError, name_of, refuse_other_size, tells_its_turn
 
 Row = Mapping[str, Any]
 
@@ -239,8 +239,11 @@ def read_arm_poses(
 ) -> ArmPoses:
     """All rows of all tables; rows that name images need the ``camera`` that took them and the ``target``.
 
-    :class:`~gripmon.model.errors.InputError` for wrong tables, :class:`CalibrationError` if no image shows the target.
+    :class:`~gripmon.model.errors.InputError` for wrong tables, also for a ``target`` of the pattern of the camera's in
+    another size; :class:`CalibrationError` if no image shows it.
     """
+    if camera is not None and target is not None:
+        refuse_other_size(target, camera.target)
     found = _Found()
     for path in tables:
         rows, places = rows_of(path)

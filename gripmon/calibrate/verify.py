@@ -36,8 +36,8 @@ _SEED = 7
 @dataclass(frozen=True, slots=True)
 class Calibrated:
     """A calibration to compare, with its ``name``: a ``lens`` with the covariance of its ``parameters``, a
-    ``cam_T_grip`` with ``covariance`` (36), or both; ``kind`` is where it comes from, ``notes`` describe its origin for
-    people, ``pose_notes`` add to the transform's.
+    ``cam_T_grip`` with ``covariance`` (36), or both; ``kind`` is where it comes from, ``target`` what it was
+    made with, if that is known, ``notes`` describe its origin for people, ``pose_notes`` add to the transform's.
     """
 
     name: str
@@ -49,6 +49,7 @@ class Calibrated:
     covariance: tuple[float, ...] = ()
     gripper: CalibratedGripper | None = None
     jaw_opening_m: float | None = None
+    target: str | None = None
     notes: tuple[str, ...] = ()
     pose_notes: tuple[str, ...] = ()
 

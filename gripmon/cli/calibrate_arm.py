@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
@@ -55,6 +56,7 @@ _ROBOT_WORLD_OPTIONS = """
 DATA...               table of poses: .csv, .yaml or .json
 --camera CAMERA.yaml  for images: a file of gripmon calibrate intrinsics
 --target TARGET       for images: as in gripmon calibrate intrinsics
+--other-target        it is another target than the camera's, of the same pattern in another size
 --eye-in-hand         the camera is on the hand, the target stands
 --out FILE.yaml       file to write
 --force               replace files that are there
@@ -169,12 +171,15 @@ def robot_world(arguments: Arguments) -> None:
     from gripmon.calibrate.api import calibrate_robot_world
     from gripmon.calibrate.documents import robot_world_document
     from gripmon.calibrate.tables import read_arm_poses
-    from gripmon.daemon.calibrations import read_given_camera, target_of
+    from gripmon.daemon.calibrations import read_given_camera
+    from gripmon.daemon.targets import target_of
     from gripmon.model.provenance import provenance_of
 
     arguments.check_outputs("out")
     target = None if arguments.target is None else target_of(arguments.target)
     camera = None if arguments.camera is None else read_given_camera(arguments.camera)
+    if camera is not None and arguments.other_target:
+        camera = replace(camera, target=None)
     poses = read_arm_poses(arguments.data, camera, target, progress_bar)
     note(poses.unseen)
     found = calibrate_robot_world(

@@ -53,7 +53,7 @@ def intrinsics(arguments: Arguments) -> None:
     import cv2
 
     from gripmon.calibrate.api import calibrate_intrinsics, draw_maps
-    from gripmon.daemon.calibrations import target_of
+    from gripmon.daemon.targets import target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, jaw_opening, jaw_range, note, progress_bar
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 _OPTIONS = """
 IMAGE...                image file, or folder with images
 --target TARGET         the plate; see gripmon calibrate intrinsics
+--other-target          it is another plate than the camera's, of the same pattern in another size
 --camera FILE.yaml      file of gripmon calibrate intrinsics
 --config CONFIG         configuration (YAML) whose camera, gripper, and rough calibration are used
 --gripper FILE.yaml     gripper file
@@ -68,7 +70,8 @@ def plane(arguments: Arguments) -> None:
     """
     import cv2
 
-    from gripmon.daemon.calibrations import is_target_file, plane_inputs, target_of
+    from gripmon.daemon.calibrations import plane_inputs
+    from gripmon.daemon.targets import is_target_file, target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
     from gripmon.model.targets import name_of
@@ -81,8 +84,9 @@ def plane(arguments: Arguments) -> None:
         arguments.camera, arguments.gripper, arguments.config, arguments.corners or (), arguments.jaw_opening,
         infer=arguments.infer,
     )  # fmt: skip
+    camera = replace(given.camera, target=None) if arguments.other_target else given.camera
     found = calibrate_plane(
-        paths, given.camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
+        paths, camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
         cam_T_grip=given.cam_T_grip, progress=progress_bar,
     )  # fmt: skip
     note(f"not used: {reason}" for reason in found.not_used)

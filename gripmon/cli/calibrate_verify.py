@@ -23,6 +23,7 @@ A                    calibration
 B...                 the other calibration, or images (files, folders)
 --config CONFIG      with images: the configuration with gripper and monitor
 --target TARGET      with images: the plate that the gripper stands on
+--other-target       it is another plate than the calibration's, of the same pattern in another size
 --jaw-opening M      in the images (m); default: the calibration's, else the configuration's
 --level P            say 'different' of equal ones so often (default: 0.01)
 --tolerance-mm MM    shift of the TCP that doesn't matter, however significant
@@ -88,14 +89,19 @@ def verify(arguments: Arguments) -> int:
 
 def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[str, ...]]:
     """The other calibration, or what images show; and what is doubtful about it."""
-    from gripmon.daemon.calibrations import measure_again, read_calibrated, target_of
+    from gripmon.daemon.calibrations import measure_again, read_calibrated
+    from gripmon.daemon.targets import target_of
     from gripmon.model.images import IMAGE_SUFFIXES
 
     names: list[str] = arguments.b
     if any(Path(n).is_dir() or Path(n).suffix.lower() in IMAGE_SUFFIXES for n in names):
         target = None if arguments.target is None else target_of(arguments.target)
-        return measure_again(first, names, arguments.config, target, jaw_opening_m=arguments.jaw_opening)
-    arguments.refuse(("config", "target", "jaw_opening"), "has a meaning only with images; leave it out")
+        return measure_again(
+            first, names, arguments.config, target, other_target=arguments.other_target,
+            jaw_opening_m=arguments.jaw_opening,
+        )  # fmt: skip
+    of_images = "config", "target", "other_target", "jaw_opening"
+    arguments.refuse(of_images, "has a meaning only with images; leave it out")
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(Path(names[0])), ()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import read_camera, read_hand_eye
 from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_settings, read_yaml
+from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
 from gripmon.model.camera import LensSettings, make_camera
@@ -30,7 +30,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.images import LARGEST_BYTES, image_paths
 from gripmon.model.provenance import Provenance, provenance_of
 from gripmon.model.records import Array, FrameRecord
-from gripmon.model.targets import Target, TargetError, checked, parse_target
+from gripmon.model.targets import Target, refuse_other_size
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
@@ -83,8 +83,9 @@ def _camera(path: Path) -> Calibrated:
     if found.residuals is not None:
         notes.append(f"rms {found.residuals.rms_px:.3f} px over {found.residuals.points} points")
     return Calibrated(
-        str(path), "a camera calibration", found.camera, found.parameters, found.covariance, notes=tuple(notes)
-    )
+        str(path), "a camera calibration", found.camera, found.parameters, found.covariance, target=found.target,
+        notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _plain(camera: LensSettings) -> dict[str, float]:
@@ -106,6 +107,7 @@ def _hand_eye(path: Path) -> Calibrated:
         covariance=found.covariance,
         gripper=found.gripper,
         jaw_opening_m=found.jaw_opening_m,
+        target=target_of_command(found.provenance.command),
         notes=_origin(found.provenance),
         pose_notes=(
             *_uncertainty(found.covariance),
@@ -186,8 +188,7 @@ def read_given_camera(path: Path) -> GivenCamera:
         make_camera(found.camera)
     except ValueError as error:
         raise InputError(f"{path}: camera.{error}") from None
-    count = len(found.parameters)
-    return GivenCamera(found.camera, found.parameters, np.reshape(found.covariance, (count, count)))
+    return GivenCamera.calibrated(found)
 
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
@@ -201,48 +202,6 @@ def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[f
     except CalibrationError as error:
         raise InputError(f"{path}: {error}") from None
     return rough
-
-
-def is_target_file(text: str) -> bool:
-    """Whether the text is a file name instead of a target's description."""
-    return text.lower().endswith((".yaml", ".yml"))
-
-
-def target_of(text: str) -> Target:
-    """A target as given on a command line: a description, or the file of a calibration made with it.
-
-    Raises :class:`~gripmon.model.targets.TargetError`, one line.
-    """
-    if not is_target_file(text):
-        return parse_target(text)
-    right = "a file of gripmon calibrate intrinsics or plane, or one with the line target: circles:8x8:0.008:0.004"
-    try:
-        values = read_yaml(Path(text))
-    except InputError as error:
-        raise TargetError(str(error)) from None
-    described = values.get("target")
-    if described is None:
-        described = _target_of_command(values.get("provenance"))
-    if described is None and "kind" in values:
-        described = values
-    if isinstance(described, dict):
-        return checked(described, text, right)
-    if not isinstance(described, str) or is_target_file(described):
-        raise TargetError(f"{text}: names no target; {right}")
-    try:
-        return parse_target(described)
-    except TargetError as error:
-        raise TargetError(f"{text}: {error}") from None
-
-
-def _target_of_command(provenance: object) -> str | None:
-    """The target in the command of a file's provenance."""
-    command = provenance.get("command") if isinstance(provenance, dict) else None
-    try:
-        words = shlex.split(command) if isinstance(command, str) else []
-    except ValueError:
-        return None
-    return words[words.index("--target") + 1] if "--target" in words[:-1] else None
 
 
 def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> None:
@@ -340,12 +299,18 @@ def measure_again(
     config_file: Path | None,
     target: Target | None = None,
     *,
+    other_target: bool = False,
     jaw_opening_m: float | None = None,
 ) -> tuple[Calibrated, tuple[str, ...]]:
     """The hand/eye calibration from images (files, folders), to compare with the ``first`` one: on the plate if there
     is a ``target``, otherwise as the configuration's monitor measures it.  And warnings about it.
+    ``other_target``: it may have the pattern of the one that the calibrations were made with in another size.
     """
     config = _same_config(first, config_file)
+    if target is not None and not other_target:
+        named = (read_calibrated(path) for path in reversed(config.calibrated.paths.values()))  # the reference first
+        made = next((each for each in (first, *named) if each.target is not None), first)
+        refuse_other_size(target, made.target, f"{made.name} was made with")
     opening_m = _opening(first, config, jaw_opening_m)
     paths = image_paths(images)
     assert first.cam_T_grip is not None

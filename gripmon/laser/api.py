@@ -143,10 +143,7 @@ def _spots(found: Sequence[Sequence[Spot]], *, looked: bool) -> Spots:
 
 def _prior(calibration: CameraCalibration) -> GivenCamera | None:
     """The prior that a camera's calibration gives for its lens; None if it has no covariance."""
-    count = len(calibration.parameters)
-    given = GivenCamera(
-        calibration.camera, calibration.parameters, np.reshape(np.array(calibration.covariance), (count, count))
-    )
+    given = GivenCamera.calibrated(calibration)
     try:
         return given if given.free.size else None
     except CalibrationError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
@@ -15,6 +16,8 @@ FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9}
 """Minimum number of points in a view."""
 _WIDEST = 2.0
 """Largest square, m: a larger number was meant in millimetres."""
+_AS_WRITTEN = 1e-5
+"""Relative; lengths are written to six digits."""
 
 
 class TargetError(InputError):
@@ -115,6 +118,24 @@ def name_of(target: Target) -> str:
     if isinstance(target, CircleGrid):
         return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
     return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
+
+
+def refuse_other_size(target: Target, recorded: str | None, made: str = "the camera was calibrated with") -> None:
+    """Raise :class:`TargetError` if the target ``recorded`` in a file (as :func:`name_of` writes it; None: none is) has
+    the same pattern in another size: no image contradicts a wrong size, and what is measured scales with it.
+    """
+    try:
+        known = None if recorded is None else parse_target(recorded)
+    except TargetError:  # a person's own words
+        return
+    if known is None or type(known) is not type(target):
+        return
+    if (known.columns, known.rows) != (target.columns, target.rows):
+        return
+    lengths = [name for name in known.__struct_fields__ if name.endswith("_m")]
+    if not all(math.isclose(getattr(target, n), getattr(known, n), rel_tol=_AS_WRITTEN) for n in lengths):
+        wrong = f"{made} {name_of(known)}, the same pattern in another size"
+        raise TargetError(f"{name_of(target)}: {wrong}; that one, or --other-target if it is really another target")
 
 
 def tells_its_turn(target: Target) -> bool:

@@ -31,7 +31,7 @@ from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
-from gripmon.model.targets import Target, TargetError, parse_target
+from gripmon.model.targets import Target, TargetError, parse_target, refuse_other_size
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.drawing import draw_on_plate
@@ -253,10 +253,12 @@ def calibrate_plane(
 
     Where to look for the gripper: rough ``corners`` (name: (u, v) in px; for all images or for each), or a rough
     calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, named as in
-    :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.
+    :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.  A camera
+    that was calibrated with the same pattern in another size is refused, unless its own ``target`` is None.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
+    refuse_other_size(target, given.target)
     method = (
         UnknownGripper(given, target)
         if gripper is None
@@ -285,8 +287,7 @@ def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamer
     if isinstance(camera, GivenCamera):
         return camera
     if isinstance(camera, CameraCalibration):
-        count = len(camera.parameters)
-        return GivenCamera(camera.camera, camera.parameters, np.reshape(camera.covariance, (count, count)))
+        return GivenCamera.calibrated(camera)
     return GivenCamera(camera)
 
 
