@@ -272,7 +272,8 @@ def test_files_that_are_no_configuration(tmp_path: Path, content: bytes | None, 
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=said):
         load_config(path)
-    with pytest.raises(ConfigError, match="directory"):
+    inside = "is a folder; the path of a YAML file" if content is None else f"the configuration in it, {path}"
+    with pytest.raises(ConfigError, match=inside):
         load_config(tmp_path)
 
 

@@ -81,8 +81,11 @@ def test_files_and_sections_say_the_same(folder: Path):
     [
         (ARM, lambda v: v.update(camera="none.yaml"), "arm.yaml: camera: there is no file"),
         (ARM, lambda v: v.update(reference="none.yaml"), "a file of gripmon calibrate plane, its path"),
-        (ARM, lambda v: v.update(camera="hand_eye.yaml"), "hand_eye.yaml: schema: is 'gripmon.hand_eye"),
-        (ARM, lambda v: v.update(reference="gripper.yaml"), "schema: is missing; this looks like a gripper file; "),
+        (ARM, lambda v: v.update(camera="hand_eye.yaml"), "hand_eye.yaml: is a file of gripmon calibrate plane; "),
+        (ARM, lambda v: v.update(gripper="camera.yaml"), "is a file of gripmon calibrate intrinsics; a gripper file"),
+        (ARM, lambda v: v.update(taught="gripper.yaml"), "gripper.yaml: is a gripper file; a taught model"),
+        (CAM, lambda v: v.update(schema="gripmon.camera_calibration/2"), "schema: is 'gripmon.camera_calibration/2'; "),
+        (ARM, lambda v: v.update(reference="gripper.yaml"), "gripper.yaml: is a gripper file; a file of gripmon "),
         (CAM, lambda v: v.update(covariance=[1.0, 2.0]), "camera.yaml: covariance: has 2 values for 1 parameters"),
         (CAM, lambda v: v["camera"].update(fx_px=-1.0), "camera.yaml: camera.fx_px: "),
         (CAM, lambda v: v["camera"].update(focal=9.0), "camera.yaml: camera.focal: unknown key"),

@@ -39,7 +39,7 @@ def laser(**more: object) -> dict[str, object]:
         ({"laser": {}}, "laser.calibration: is missing; text: file of gripmon calibrate laser"),
         ({"laser": {"calibration": "none.yaml"}}, "laser.calibration: there is no file"),
         ({"laser": {"calibration": "images"}}, "laser.calibration: there is no file"),
-        ({"laser": {"calibration": "second.yaml"}}, "second.yaml: schema: is missing; a file with schema: gripmon.las"),
+        ({"laser": {"calibration": "second.yaml"}}, "second.yaml: schema: is missing; schema: gripmon.laser_cal"),
         ({"gripper": "fingers.yaml"}, "gripper: stands beside laser; laser for a second camera, or gripper for a"),
         ({"camera": {"model": "paper"}}, "camera: stands beside laser"),
         ({"laser": laser(pulse="a")}, "laser.pulse: unknown key, did you mean 'pulses'?"),

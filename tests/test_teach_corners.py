@@ -348,6 +348,8 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *given, "--corners", bad], "corners.nose: the gripper has no such corner; one of L_in_near"),
         ([image, *given, "--corners", tmp_path / "flat.yaml"], "corners.L_in_near: has 1 values"),
         ([image, *given, "--corners", tmp_path / "none.yaml"], "there is no such file"),
+        ([image, *given, "--corners", gripper], "is a gripper file; a file with corners"),
+        ([image, "--page", "--camera", camera, "--gripper", rough], "is a file with corners; a gripper file"),
         ([image, "--gripper", gripper], "teach: --config is missing"),
         ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera: goes with --page"),
         ([], "no image"),

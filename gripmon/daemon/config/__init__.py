@@ -30,7 +30,7 @@ from gripmon.daemon.config.checks import (
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_configuration, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import read_configuration, read_settings
 from gripmon.io.ros2.names import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -208,7 +208,7 @@ def _gripper(path: Path, gripper_path: Path) -> Gripper:
 def read_gripper(gripper_path: Path) -> Gripper:
     """Read and check a gripper file.  Raises :class:`ConfigError`."""
     try:
-        model = to_settings(read_yaml(gripper_path), GripperModel)
+        model = read_settings(gripper_path, GripperModel)
         # Checked first: points in millimetres break most other rules, too.
         for name, point in model.points.items():
             if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:

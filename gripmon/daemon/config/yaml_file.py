@@ -23,7 +23,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ConfigError(path, "", "there is no such file", "the path of a YAML file") from None
     except IsADirectoryError:
-        raise ConfigError(path, "", "is a directory", "the path of a YAML file") from None
+        raise ConfigError(path, "", "is a folder", "the path of a YAML file") from None
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", f"is not text (byte {error.start} is not UTF-8)", "a YAML file") from None
     except OSError as error:
@@ -41,10 +41,15 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = None) -> _T:
-    """The content of a YAML file (or ``values``, if already read) as a settings type.  :class:`ConfigError`."""
+    """The content of a YAML file (or ``values``, if already read) as a settings type.  :class:`ConfigError`, which
+    names the type of any other gripmon file.
+    """
+    values = read_yaml(path) if values is None else values
     try:
-        return to_settings(read_yaml(path) if values is None else values, kind)
+        return to_settings(values, kind)
     except SettingsError as error:
+        if other := _other_kind(values, kind):
+            raise ConfigError(path, "", *other) from None
         raise ConfigError.of(path, error.fault) from None
 
 
@@ -69,6 +74,9 @@ def read_configuration(path: Path) -> dict[str, Any]:
     """The mapping in a configuration of a wrist camera or a second camera.  :class:`ConfigError`, which names the type
     of any other gripmon file.
     """
+    inside = path / "config.yaml"  # as gripmon teach and setup name it
+    if inside.is_file():
+        raise ConfigError(path, "", "is a folder", f"the configuration in it, {inside}")
     values = read_yaml(path)
     kind = kind_of(values)
     if kind is not None and kind != "a configuration":
@@ -84,20 +92,25 @@ def kind_of(values: dict[str, Any]) -> str | None:
     return known or next((what for key, what in _LOOKS_LIKE.items() if key in values), None)
 
 
+def _other_kind(values: dict[str, Any], wanted: type) -> tuple[str, str] | None:
+    """What is wrong and what would be right, where this is another file of ours than one without ``schema``."""
+    given, config = kind_of(values), getattr(wanted, "__struct_config__", None)
+    if given is None or config is None or config.tag is not None:
+        return None
+    mark = next((key for key in _LOOKS_LIKE if key in wanted.__struct_fields__), None)  # type: ignore[attr-defined]
+    return None if mark is None or mark in values else (f"is {given}", _LOOKS_LIKE[mark])
+
+
 def read_document(path: Path, kind: type[_T]) -> _T:
     """The content of a file with a ``schema`` as that type.  :class:`ConfigError`."""
     values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
-    schema = values.get("schema")
-    if schema is None:
-        looks = f"; this looks like {kind_of(values)}" if kind_of(values) else ""
-        raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
-    if schema != tag:
-        words = [_SCHEMAS.get(str(name).partition("/")[0]) for name in (schema, tag)]
-        wrong, right = (
-            f"{name}, {what}" if what else name for name, what in zip((repr(schema), tag), words, strict=True)
-        )
-        raise ConfigError(path, "schema", f"is {wrong}", right)
-    return read_settings(path, kind, values)
+    schema, given, wanted = values.get("schema"), kind_of(values), _SCHEMAS[tag.partition("/")[0]]
+    if schema == tag:
+        return read_settings(path, kind, values)
+    if given not in (None, wanted):
+        raise ConfigError(path, "", f"is {given}", wanted)
+    wrong = "is missing" if schema is None else f"is {schema!r}"
+    raise ConfigError(path, "schema", wrong, f"schema: {tag}, {wanted}")
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
