@@ -130,12 +130,16 @@ class Project:
         if step is None:
             names = ", ".join(BY_NAME)
             raise InputError(f"{name}: is not a step; one of {names}", "step")
+        state = self._state(step)
+        if step.kind != "capture" and state.progress == "waits":
+            missing = self._missing(step)
+            if missing is None:
+                raise InputError(state.note)
+            there_is = "there is no" if Path(missing[0]).suffix else "there are no images in"
+            raise InputError(f"{name}: {there_is} {missing[0]} yet; first --step {missing[1].name}")
         if step.kind in ("page", "run"):
-            state = self._state(step)
             command = f"cd {shlex.quote(str(self.folder))} && {state.command}"
-            raise InputError(
-                state.note if state.progress == "waits" else f"{name}: has a command of its own; {command}"
-            )
+            raise InputError(f"{name}: has a command of its own; {command}")
         if step.kind == "form":
             return self.do(name)
         capture = self.capture(name)
@@ -173,9 +177,9 @@ class Project:
         if not needs_doing:
             by = "intrinsics_by" if step.name == "plate" else "reference_by"
             return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
-        for name in needed(step, self.values):
-            if not self._there(name):
-                return "waits", f"first: {self._maker(name)} ({name})"
+        missing = self._missing(step)
+        if missing is not None:
+            return "waits", f"first: {missing[1].title} ({missing[0]})"
         if step.kind == "capture":
             count = self._count(step.name)
             return ("done" if count else "ready"), f"{count} image{'' if count == 1 else 's'}"
@@ -207,11 +211,14 @@ class Project:
             return int(path.is_dir())
         return sum(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir()) if path.is_dir() else 0
 
-    def _maker(self, name: str) -> str:
-        """The step that writes a file."""
+    def _missing(self, step: Step) -> tuple[str, Step] | None:
+        """The first file that a step needs and that isn't there, and the step that writes it."""
+        name = next((name for name in needed(step, self.values) if not self._there(name)), None)
+        if name is None:
+            return None
         inferred = name == "gripper.yaml" and self.values["gripper"] == steps.INFERRED
-        makers = [step for step in STEPS if name in written(step, self.values)]
-        return makers[-1 if inferred else 0].title
+        makers = [each for each in STEPS if name in written(each, self.values)]
+        return name, makers[-1 if inferred else 0]
 
     def _said(self, step: Step) -> str:
         return "|".join(self.values[field.name] for field in step.fields)

@@ -180,7 +180,7 @@ def _check(frame: str, approach: str | None, unit: str | None, length_m: float |
             f"{length_m:g}: is measured from the tips backwards, along z; not with the CAD's own frame", "length"
         )
     if unit is not None and unit not in UNITS_M:
-        raise InputError(f"'{unit}' is not an unit; one of {', '.join(UNITS_M)}", "unit")
+        raise InputError(f"'{unit}' is not a unit; one of {', '.join(UNITS_M)}", "unit")
     if not 0.0 <= bevel_m <= WIDEST_BEVEL_M:
         raise InputError(f"{bevel_m:g} m: is no width of a bevel; 0 to {WIDEST_BEVEL_M:g} m", "bevel")
 
