@@ -331,6 +331,10 @@ def test_bash_completes_commands_options_and_choices(tmp_path: Path, capsys: pyt
     assert {"--config", "--recording", "--fps"} <= completed("replay", "--")
     assert completed("send", "re") == {"recalibrate", "reject", "reset"}
     assert "--print-completion" not in completed("--"), "it is not advertised"
+    (tmp_path / "arm1").mkdir()
+    (tmp_path / "arm1.yaml").touch()
+    for words in (["run"], ["teach", "a.png", "--camera"], ["calibrate", "plane", "a.png", "--target"]):
+        assert completed(*words, f"{tmp_path}/arm") == {f"{tmp_path}/arm1", f"{tmp_path}/arm1.yaml"}, words
     with pytest.raises(SystemExit) as refused:
         main(["--print-completion", "tcsh"])
     assert refused.value.code == 2

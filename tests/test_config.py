@@ -277,6 +277,14 @@ def test_files_that_are_no_configuration(tmp_path: Path, content: bytes | None, 
         load_config(tmp_path)
 
 
+def test_a_shipped_configuration_is_named_as_in_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=f"^configs/demo.yaml: there is no .* {builtin_config('demo.yaml')}$"):
+        load_config("configs/demo.yaml")
+    with pytest.raises(ConfigError, match="there is no such file; the path of a YAML file"):
+        load_config("configs/other.yaml")
+
+
 def test_covariance_comes_from_the_sigmas_or_as_it_is(folder: Path):
     path = edited(folder, "^  cam_T_grip:", "  position_sigma_m: 0.002\n  rotation_sigma_rad: 0.01\n  cam_T_grip:")
     matrix = np.array(load_config(path).reference.covariance).reshape(6, 6)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from typing import Any
 
 from gripmon import __version__
 from gripmon.cli import (
@@ -71,8 +72,9 @@ trusted, and publishes it over Zenoh."""
 _EPILOG = """\
 first steps:
   gripmon demo                                   everything at work on a simulated camera, 20 s
-  gripmon check configs/live_camera.yaml         is my configuration sound?
-  gripmon run configs/live_camera.yaml           the daemon
+  gripmon setup arm1                             from your camera to a running monitor, on one page
+  gripmon check arm1/config.yaml                 is a configuration sound?
+  gripmon run arm1/config.yaml                   the daemon
 
 exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what
 would be right); 3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
@@ -129,15 +131,28 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 class _PrintCompletion(argparse.Action):
-    """Print what a shell needs to complete commands, options and choices: source <(gripmon --print-completion bash)."""
+    """Print what a shell needs to complete commands, options, choices and files:
+    source <(gripmon --print-completion bash).
+    """
 
     def __call__(
         self, parser: argparse.ArgumentParser, _namespace: object, value: object, _option: str | None = None
     ) -> None:
         import shtab
 
+        _complete_files(parser, shtab.FILE)
         print(shtab.complete(parser, str(value)))
         parser.exit()
+
+
+def _complete_files(parser: argparse.ArgumentParser, files: Any) -> None:
+    """Let every value be completed as a file's name: with a completion of a command's own, a shell's doesn't count."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                _complete_files(each, files)
+        elif action.choices is None and action.nargs != 0:
+            action.complete = files  # type: ignore[attr-defined]
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import gripmon
 from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.daemon.config.checks import (
@@ -30,7 +29,7 @@ from gripmon.daemon.config.checks import (
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import read_configuration, read_settings
+from gripmon.daemon.config.yaml_file import builtin_config, read_configuration, read_settings
 from gripmon.io.ros2.names import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -180,15 +179,6 @@ def check_network(config: Config | SecondConfig) -> Joining | None:
         return joined(config.settings, config.camera, config.directory)
     except SettingsError as error:
         raise ConfigError.of(config.path, error.fault) from None
-
-
-def builtin_config(name: str) -> Path:
-    """The path of a file in ``configs/``, in a checkout or in an installed wheel (inside the package)."""
-    package = Path(gripmon.__file__).resolve().parent
-    for folder in (package / "configs", package.parent / "configs"):
-        if (folder / name).is_file():
-            return folder / name
-    raise FileNotFoundError(f"{name} is not among the installed configuration files")
 
 
 def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Camera:

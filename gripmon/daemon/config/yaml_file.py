@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,6 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import yaml
 
+import gripmon
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
 from gripmon.model.yaml_text import Loader, YamlFault, parse_yaml
 
@@ -70,6 +72,15 @@ _NAMED_UNDER = {
 """Keys of a configuration."""
 
 
+def builtin_config(name: str) -> Path:
+    """The path of a file in ``configs/``, in a checkout or in an installed wheel (there it lies in the package)."""
+    package = Path(gripmon.__file__).resolve().parent
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"{name} is not among the installed configuration files")
+
+
 def read_configuration(path: Path) -> dict[str, Any]:
     """The mapping in a configuration of a wrist camera or a second camera.  :class:`ConfigError`, which names the type
     of any other gripmon file.
@@ -77,6 +88,10 @@ def read_configuration(path: Path) -> dict[str, Any]:
     inside = path / "config.yaml"  # as gripmon teach and setup name it
     if inside.is_file():
         raise ConfigError(path, "", "is a folder", f"the configuration in it, {inside}")
+    if path.parts[:1] == ("configs",) and not path.exists():  # as examples name them, in a checkout
+        with contextlib.suppress(FileNotFoundError):
+            shipped = builtin_config(str(path.relative_to("configs")))
+            raise ConfigError(path, "", "there is no such file", f"the one that comes with gripmon is {shipped}")
     values = read_yaml(path)
     kind = kind_of(values)
     if kind is not None and kind != "a configuration":

@@ -105,7 +105,7 @@ class Project:
         """What a step's images come from.  Raises :class:`InputError`."""
         text = self.values.get(f"{step}_source") or self.values["source"]
         if not text:
-            raise InputError("no camera is named; step 1, or a folder with images")
+            raise InputError("no camera is named; step 1 (--source SOURCE), or a folder with images")
         return open_named(text, self.values["robot"], self.values["camera_name"])
 
     def do(self, name: str) -> list[Line]:
