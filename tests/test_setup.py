@@ -392,6 +392,10 @@ def test_a_project_that_cant_be_read_or_written(tmp_path: Path, capsys: pytest.C
     assert main(["setup", str(tmp_path / "file"), "--step", "camera"]) == 2
     assert main(["setup", str(tmp_path), "--step", "nose"]) == 2
     assert "is not a step; one of camera, target" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["setup", "--help"])
+    names = ", ".join(step.name for step in STEPS[:-1]) + f" or {STEPS[-1].name}"
+    assert names in " ".join(capsys.readouterr().out.split())
     (tmp_path / "config.yaml").write_text("")
     assert main(["setup", str(tmp_path), "--step", "run"]) == 2
     assert "gripmon run config.yaml --out run" in capsys.readouterr().err

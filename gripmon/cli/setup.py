@@ -13,7 +13,8 @@ _OPTIONS = f"""
 [DIR]            folder of the set-up; made if it is missing (default: this one)
 --source SOURCE  the camera: 0, /dev/video0, a URL, a folder of images, zenoh:WIDTHxHEIGHT[:KEY] or
                  ros2:WIDTHxHEIGHT:TOPIC; with --step plate, standing or teaching: where its images come from
---step NAME      without a page: carry out this step with what was said in the folder
+--step NAME      without a page: carry out this step with what was said in the folder (setup.yaml); camera, target,
+                 plate, intrinsics, gripper, standing, corners, reference, teaching, teach, check or run
 {PORT_OPTIONS.strip()}
 """
 
