@@ -6,6 +6,7 @@ learned look doesn't contradict: mounts are knocked rarely, objects hide fingers
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,6 +31,10 @@ PROOF_EVERY_FRAMES = 4
 """Frames from one look at the fingers' ends to the next, while the gripper is where it was and the last look proved
 it.
 """
+
+
+KNOCK_ODDS = 1.0
+"""Odds from which the fingers' look speaks against a pose that claims a knock, which is rare: even ones."""
 
 
 class _Candidate(NamedTuple):
@@ -67,6 +72,7 @@ class Integrity:
         self._learn_from: tuple[Image, Array, float, float] | None = None
         self._frames = 0
         self._elsewhere = 0
+        self._slid_until_s = -math.inf
         self._believed = False
         self._ends_seen = False
 
@@ -159,34 +165,35 @@ class Integrity:
         if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
             self._ends_seen = trust.proven
-        here = _Candidate(measurement, cam_T_grip, covariance, trust)
-        if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
-            return self._conclude(frame, here, now_s)
-        here = self._slid_back(frame, here, now_s)
+        here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, trust), now_s)
         measurement, cam_T_grip, _, trust = here
-        if not trust.displaced:
+        if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
             strictly = weigh(measurement, cam_T_grip, ends, now_s)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
+            proven = proven and self._slide_m(frame, measurement, cam_T_grip, KNOCK_ODDS) is None
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
-        """A displaced pose, corrected where the fingers' look shows that it has slid along them, because something else
-        was taken for their ends.  If the gripper isn't measured there either: the same pose, bounded without the ends.
+        """A candidate, corrected where the fingers' look shows that it has slid along them, because something else was
+        taken for their ends: also at the expected place, if a knock brought it there.  If the gripper isn't measured
+        where the look has it either: the same pose, bounded without the ends.
         """
-        slide_m = self._slide_m(frame, here)
-        if slide_m is None:
-            return here
         weigher, (measurement, cam_T_grip, _, trust) = self._weigher, here
-        slid_T = cam_T_grip.copy()
-        slid_T[:3, 3] += cam_T_grip[:3, :3] @ slide_m
-        again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
-        if again is None or self._slide_m(frame, again) is not None:
-            return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
-        return again
+        slide_m = self._slide_m(frame, measurement, cam_T_grip)
+        if slide_m is not None:
+            self._slid_until_s = now_s + self._policy.hold_s
+            slid_T = cam_T_grip.copy()
+            slid_T[:3, 3] += cam_T_grip[:3, :3] @ slide_m
+            again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
+            if again is not None and self._slide_m(frame, again.measurement, again.cam_T_grip) is None:
+                return again
+        elif trust.displaced or now_s >= self._slid_until_s:
+            return here
+        return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
 
     def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
         """How far the edges show from where the gripper is expected, px."""
@@ -223,10 +230,12 @@ class Integrity:
         beside them look like ends elsewhere.  None where that is excluded, or too little of the sides is seen.
         """
         weigher = self._weigher
+        if now_s < self._slid_until_s:
+            return None
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
-        return there
+        return there if self._slide_m(frame, there.measurement, there.cam_T_grip) is None else None
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
         """The measurement at a pose (4, 4), of edges within the standard deviations (6,) of it; None where no edge is
@@ -250,27 +259,38 @@ class Integrity:
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px)
+        knocked = moved and beside_px >= ONE_EDGE_PX
         settles = trust.proven and (moved or not trust.displaced)
         unproven = self._weigher.anchor is not None and not settles
         if settles:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
+            if knocked:
+                self._slid_until_s = -math.inf
             if frame.image is not None and not moved:
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        at = measurement, cam_T_grip, covariance, trust.protection
-        knocked = moved and beside_px >= ONE_EDGE_PX
+        protection = trust.protection
+        if trust.displaced and not (moved or trust.ambiguous):
+            # Until another frame says so, too, it may as well be where it was.
+            away = perturbation_between(cam_T_grip, self._weigher.expected[0])
+            protection = reaching(protection, away, "the fingers stand elsewhere, or the mount was knocked just now")
+        at = measurement, cam_T_grip, covariance, protection
         return Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
         """Whether the mount was knocked; the edges show ``beside_px`` from the old place.  Knocks are so rare that one
         frame doesn't suffice, unless the motion is as small as a creep.  Further frames have to prove the new place
-        before the old one is proven again or something else explains the motion; the mount may ring meanwhile.
+        before the old one is proven again or something else explains the motion; the mount may ring meanwhile.  Before
+        the fingers' look is known they prove nothing: that a mark was taken for the ends is less rare than a knock.
         """
         if not trust.proven:
             return False
         self._elsewhere = self._elsewhere + 1 if trust.displaced and not trust.ambiguous else 0
-        return self._elsewhere >= (1 if beside_px < ONE_EDGE_PX else self._policy.confirm_frames)
+        if beside_px < ONE_EDGE_PX:
+            return self._elsewhere >= 1
+        unknown = self._weigher.anchor is not None and self._strips.awaited
+        return self._elsewhere >= self._policy.confirm_frames and not unknown
 
     def _by_anchor(self, frame: Frame, measurement: Measurement, trust: Trust, now_s: float) -> Standing:
         """Publish the pose under the most probable hypothesis, by the anchor and the edges that it keeps: the frame
@@ -278,8 +298,9 @@ class Integrity:
         """
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
-        seen = self._look_supports(frame, measurement, cam_T_grip)
-        trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
+        slid = now_s < self._slid_until_s
+        seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
+        trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
         at = measurement, cam_T_grip, covariance, trust.protection
         return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
@@ -292,14 +313,15 @@ class Integrity:
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
-    def _slide_m(self, frame: Frame, here: _Candidate) -> Array | None:
-        """(3,) motion along the fingers, gripper frame, by which their look is seen beside a candidate's pose; None
-        where it isn't.
+    def _slide_m(
+        self, frame: Frame, measurement: Measurement, cam_T_grip: Array, risk: float = LOOK_ODDS
+    ) -> Array | None:
+        """(3,) motion along the fingers, gripper frame, by which their look is seen beside a pose (4, 4), at odds of
+        one to ``risk``; None where it isn't.
         """
         if frame.image is None:
             return None
-        opening_m = here.measurement.jaw_opening_m
-        return self._strips.slide_m(frame.image, here.cam_T_grip, opening_m, LOOK_ODDS)
+        return self._strips.slide_m(frame.image, cam_T_grip, measurement.jaw_opening_m, risk)
 
     def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
         """Whether the gripper's look is seen at a pose (4, 4)."""

@@ -38,8 +38,8 @@ SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
-SMALLEST_SLIDE_PX = 3
-"""Slides up to this are none: edges are fitted ten times better, and neighbouring ones look alike."""
+SMALLEST_SLIDE_PX = 2
+"""Slides up to this are none: edges of an image that are nearer to each other are one, and fitted ten times better."""
 
 EXPLAINED_CORRELATION = 0.87
 """Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
@@ -60,6 +60,7 @@ class FingerStrips:
         self.frames = 0
         self._learnt_s = -math.inf
         self._laid_out_at_m: float | None = None
+        self._nothing = False
         self._points_grip_m: Array = np.zeros((0, 0, 3))
 
     @property
@@ -67,13 +68,19 @@ class FingerStrips:
         """Whether it may judge."""
         return self.frames >= FEWEST_FRAMES and bool(self._mean.any())
 
+    @property
+    def awaited(self) -> bool:
+        """Whether more frames have to be learned before it may judge; False where the fingers have no strips."""
+        return self.frames < FEWEST_FRAMES and not self._nothing
+
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> None:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s."""
         if self.frames >= FEWEST_FRAMES and now_s - self._learnt_s < RELEARN_S:
             return
         if not len(self._points_grip_m):
             self._lay_out(cam_T_grip, jaw_opening_m)
-        if not len(self._points_grip_m):
+        self._nothing = not len(self._points_grip_m)
+        if self._nothing:
             return
         strips = self._read(image, cam_T_grip, jaw_opening_m)[:, REACH_PX : REACH_PX + LENGTH_PX]
         self.frames += 1
@@ -91,10 +98,14 @@ class FingerStrips:
         np.clip(strips, -most, most, out=strips)
         learnt = np.clip(self._mean, -most, most)
         # Gain and brightness are free: light changes.
+        own = float(np.square(learnt).sum())
+        there = strips[:, REACH_PX : REACH_PX + LENGTH_PX] * self._within
+        if float((there * learnt).sum()) > EXPLAINED_CORRELATION * math.sqrt(float(np.square(there).sum()) * own):
+            return None
         energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
-        alike = product / np.sqrt(np.maximum(energy, least) * float(np.square(learnt).sum()) + 1e-12)
+        alike = product / np.sqrt(np.maximum(energy, least) * own + 1e-12)
         unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED_CORRELATION))
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - SMALLEST_SLIDE_PX : REACH_PX + SMALLEST_SLIDE_PX + 1] = 1.0
