@@ -255,7 +255,7 @@ def test_a_knock_is_followed():
     knock = Bump(at_s=1.02, ring_fraction=0.0, translation_m=(0.001, 0.0015, 0.001))
     watched, _ = seen(0.004, Scenario(name="knock", duration_s=2.0, fps=FPS, mount=(knock,)))
     assert_no_valid_frame_is_beyond_its_bound(watched)
-    assert valid(watched)[31:].mean() > 0.9 and np.nanmax(errors_m(watched)[30:]) < 3e-4
+    assert valid(watched)[32:].mean() > 0.9 and np.nanmax(errors_m(watched)[30:]) < 3e-4
 
 
 @pytest.mark.parametrize("radius_m", [0.002, 0.004])

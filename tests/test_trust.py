@@ -101,9 +101,9 @@ def knocked_behind_a_bar(size_m: float) -> Scenario:
 # --- motions along the fingers ---
 
 
-@pytest.mark.parametrize(("size_m", "within"), [(1e-3, 3), (-1e-3, 3), (-3e-3, 3), (-5e-3, 3), (3e-3, 6), (5e-3, 8)])
+@pytest.mark.parametrize(("size_m", "within"), [(1e-3, 4), (-1e-3, 3), (-3e-3, 3), (-5e-3, 3), (3e-3, 6), (5e-3, 8)])
 def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_away(size_m: float, within: int):
-    """Valid again within three frames; towards the background, where the fingers' own long edges lie beside the place
+    """Valid again within three or four frames; towards the background, where the fingers' own long edges lie beside the place
     that they left, within six, or eight where a search is needed: its result counts 0.1 s later.
     """
     seen = watched(scene(28, mount=(along_fingers(size_m, BEGINS_S),)))
@@ -127,13 +127,6 @@ def test_a_knock_along_the_axis_just_after_the_jaw_has_moved_is_no_grasp(size_m:
     assert not reported or valid(seen)[after].all()
 
 
-NEVER_FOUND = pytest.mark.xfail(
-    reason="after some doubtful frames nothing is searched for, and a proof needs four corners in one frame: a gripper "
-    "that was knocked by some millimetres behind a bar stays suspect for long after the bar has gone",
-    strict=True,
-)
-
-
 @pytest.mark.parametrize("size_m", [-3e-3, -1e-3, 1e-3, 3e-3])
 def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_followed(size_m: float):
     """The mount is knocked while a bar hides the tips: no one can know by how much, until they are seen."""
@@ -144,9 +137,7 @@ def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_follo
     assert max(shift_m) < 2e-4 and bounds_m(seen)[25:37].min() > 3e-3
 
 
-@pytest.mark.parametrize(
-    "size_m", [pytest.param(-3e-3, marks=NEVER_FOUND), 1e-3, pytest.param(3e-3, marks=NEVER_FOUND)]
-)
+@pytest.mark.parametrize("size_m", [-3e-3, 1e-3, 3e-3])
 def test_when_the_tips_are_seen_again_the_motion_is_followed(size_m: float):
     seen = watched(knocked_behind_a_bar(size_m))
     assert valid(seen)[40:].all() and errors_m(seen)[40:].max() < 2e-4
@@ -250,16 +241,15 @@ def test_a_knock_across_lined_fingers_before_a_background_like_them_misleads_in_
     assert_nothing_misleads(watched(Scenario(name="lines", fps=15.0, duration_s=24 / 15.0, **sections)))  # type: ignore[arg-type]
 
 
-@pytest.mark.xfail(
-    reason="where the border of a tone comes to lie where the tips were, nothing asks whether the fingers have slid: "
-    "asking in the frames whose ends are looked at mended a quarter of such frames, at a tenth of a frame's time",
-    strict=True,
-)
-def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_misleads_in_no_frame():
-    border = FingerMark(from_tip_m=(1.8e-3, 21.8e-3), across=(-2.0, 2.0), gain=0.4)
+@pytest.mark.parametrize("from_tip_m", [1.2e-3, 1.8e-3, 5e-3])
+def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_misleads_in_no_frame(from_tip_m: float):
+    """The border comes to lie where the tips were: but for what the fingers show, nothing has moved."""
+    border = FingerMark(from_tip_m=(from_tip_m, from_tip_m + 0.02), across=(-2.0, 2.0), gain=0.4)
     plain = Background(kind="plain", contrast=0.0, level_dn=180.0, boxes=0, cables=0, motion="still")
-    knock = along_fingers(1.8e-3, BEGINS_S)
-    assert_nothing_misleads(watched(scene(28, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,)))))
+    knock = along_fingers(from_tip_m, BEGINS_S)
+    seen = watched(scene(28, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,))))
+    assert_nothing_misleads(seen)
+    assert valid(seen)[2 : BEGINS + 1].all() and valid(seen)[-4:].all() and errors_m(seen)[-4:].max() < 2e-4
 
 
 # --- references ---
@@ -410,11 +400,11 @@ def test_one_frame_is_no_knock_nor_are_two_with_the_old_place_between_them():
 
 
 def knock_followed(trial: pytest.MonkeyPatch, **instead: Callable[..., object]) -> bool:
-    """Whether a knock in free view is followed at last, with methods of the verdict replaced."""
+    """Whether a knock in free view is valid at last where it is, with methods of the verdict replaced."""
     for name, method in instead.items():
         trial.setattr(Integrity, name, method)
     seen = watched(scene(28, mount=(along_fingers(3e-3, BEGINS_S),)))
-    return bool(errors_m(seen)[-1] < 1e-3)
+    return bool(valid(seen)[-1] and errors_m(seen)[-1] < 1e-3)
 
 
 def test_a_knock_that_the_look_contradicts_is_not_followed(monkeypatch: pytest.MonkeyPatch):

@@ -33,10 +33,6 @@ it.
 """
 
 
-KNOCK_ODDS = 1.0
-"""Odds from which the fingers' look speaks against a pose that claims a knock, which is rare: even ones."""
-
-
 class _Candidate(NamedTuple):
     """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), and its worth."""
 
@@ -173,7 +169,8 @@ class Integrity:
             ends = self._tracker.ends(frame, measurement, strict=True)
             strictly = weigh(measurement, cam_T_grip, ends, now_s)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
-            proven = proven and self._slide_m(frame, measurement, cam_T_grip, KNOCK_ODDS) is None
+            # A knock is rare: even odds speak against it.
+            proven = proven and self._slide_m(frame, measurement, cam_T_grip, risk=1.0) is None
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
