@@ -116,8 +116,8 @@ def _motion(
     if found.p_value >= CHANCE:
         return None
     x, y, z = found.position_m.tolist()
-    told = [alert for stamp_ns, alert in alerts if point.earliest_ns <= stamp_ns <= int(table.stamp_ns[end - 1])]
-    causes = [str(alert.cause) for alert in told if alert.tcp_shift_m is not None and str(alert.cause) != "unknown"]
+    around = [alert for stamp_ns, alert in alerts if point.earliest_ns <= stamp_ns <= int(table.stamp_ns[end - 1])]
+    causes = [str(alert.cause) for alert in around if alert.tcp_shift_m is not None and str(alert.cause) != "unknown"]
     return Motion(
         point.stamp_ns,
         point.earliest_ns,

@@ -120,7 +120,7 @@ class Daemon(Loop):
             self._log_once("monitor", f"frame {frame.seq}: ", failure, error)
             self._make_reference_known()
             return frame, unmeasured_record(frame, self._reference, failure), failure
-        self._said_faults.pop("monitor", None)
+        self._logged_faults.pop("monitor", None)
         self._make_reference_known()
         return frame, record, ""
 
@@ -168,10 +168,10 @@ class Daemon(Loop):
         if self._reference_due:
             self._reference_due = not self._deliver("reference", self._publisher.reference, self._reference)
 
-    def _keep_house(self) -> None:
+    def _housekeeping(self) -> None:
         self._estimates.flush()
         if (now_s := time.monotonic()) >= self._next_keeping_s:
             # Only for the last transform: where to search first after a restart.
             self._next_keeping_s = now_s + KEEP_LAST_EVERY_S
             self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
-        super()._keep_house()
+        super()._housekeeping()

@@ -78,12 +78,12 @@ class SecondCamera(Loop):
         self._table, self._feed = table, feed
         self._no_spot_s = no_spot_alert_after_s
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
-        self._believed_s = self._start_s
+        self._accepted_s = self._start_s
         self._pulses = 0
         self._failure = ""  # internal error of the last pulse
         self._news = False  # a pulse was judged since the last frame, or judging failed
         self._unused = "no pulse yet"
-        self._said_unused: PulseFault | None = None  # in the log
+        self._logged_unused: PulseFault | None = None  # in the log
 
     @property
     def _in_force(self) -> tuple[str, int]:
@@ -95,10 +95,10 @@ class SecondCamera(Loop):
     def _between(self) -> None:
         now_s = time.monotonic()
         for _ in range(_PULSES_A_TURN):  # so that many pulses can't delay frames
-            told = None if self._feed is None else self._feed.poll()
-            if told is None:
+            report = None if self._feed is None else self._feed.poll()
+            if report is None:
                 break
-            self._judge(self._pulsed.matcher.pulse(told, now_s))
+            self._judge(self._pulsed.matcher.pulse(report, now_s))
         self._judge(self._pulsed.matcher.tick(now_s))
         self._look_for_silence(now_s)
         self._gather_alerts()
@@ -115,7 +115,7 @@ class SecondCamera(Loop):
         self._judge(shown)
         self._news = self._news or bool(failure)
         failure = failure or self._failure
-        self._tell(alerts, self._pulsed.state, frame.stamp_ns)
+        self._alert_all(alerts, self._pulsed.state, frame.stamp_ns)
         self._gather_alerts()
         judged = self._judged(refused, failure)
         self._newest = Newest(frame, self._frame_record(frame, judged), time.monotonic())
@@ -165,16 +165,16 @@ class SecondCamera(Loop):
     def _pass_on(self, outcome: Outcome) -> None:
         record = outcome.record
         several = self._not_alone()
-        said = msgspec.structs.replace(record, verdict=Verdict.UNKNOWN, reason=several) if several else record
-        self._deliver("spot", self._publisher.spot, said)
-        self._tell(record.alerts, record.state, record.stamp_ns, recorded=True)
+        published = msgspec.structs.replace(record, verdict=Verdict.UNKNOWN, reason=several) if several else record
+        self._deliver("spot", self._publisher.spot, published)
+        self._alert_all(record.alerts, record.state, record.stamp_ns, recorded=True)
         if record.used:
-            self._believed_s, self._unused = time.monotonic(), ""
+            self._accepted_s, self._unused = time.monotonic(), ""
         else:
             self._unused = f"the last pulse is not used: {record.reason}"
-            if record.fault is not self._said_unused:
+            if record.fault is not self._logged_unused:
                 _log.info("pulse %d is not used: %s", record.pulse, record.reason)
-        self._said_unused = record.fault
+        self._logged_unused = record.fault
         self._deliver("recording", self._recorder.spot, record, outcome.image)
         self._deliver("lines", self._lines.write, record)
 
@@ -183,7 +183,7 @@ class SecondCamera(Loop):
         self._log_once("judgement", where, failure, error)
         return failure
 
-    def _tell(
+    def _alert_all(
         self, alerts: Iterable[Alert], state: State, stamp_ns: int | None = None, *, recorded: bool = False
     ) -> None:
         for alert in alerts:
@@ -193,13 +193,13 @@ class SecondCamera(Loop):
         """Alert if there are no spots, e.g. because the robot no longer switches its laser on."""
         if self._no_spot_s is None or not self._source.live:
             return
-        silence_s = now_s - self._believed_s
+        silence_s = now_s - self._accepted_s
         if silence_s < self._no_spot_s:
-            self._tell(self._alerts.absent(_NO_SPOT, "spots are seen again", now_s), self._pulsed.state)
+            self._alert_all(self._alerts.absent(_NO_SPOT, "spots are seen again", now_s), self._pulsed.state)
             return
         text = f"no spot that could be judged for {silence_s:.0f} s: {self._unused or 'no pulse was reported'}"
         alert = Alert(AlertKind.STREAM, Cause.UNKNOWN, Severity.WARNING, text)
-        self._tell(self._alerts.present(_NO_SPOT, alert, now_s, time.time_ns()), self._pulsed.state)
+        self._alert_all(self._alerts.present(_NO_SPOT, alert, now_s, time.time_ns()), self._pulsed.state)
 
     def _gather_alerts(self) -> None:
         self._open_alerts = (*self._pulsed.open_alerts, *self._alerts.open)
@@ -210,13 +210,13 @@ class SecondCamera(Loop):
             return self._reply(name, True, f"{self._pulsed.state}, {self._pulsed.reference_id} in force", whole=True)
         if name is CommandName.ACKNOWLEDGE:
             seen = (*self._pulsed.acknowledge(argument), *self._alerts.acknowledge(argument))
-            self._tell(seen, self._pulsed.state)
+            self._alert_all(seen, self._pulsed.state)
             if not seen:
                 which = f"no open alert {argument}" if argument else "no open alert"
                 return self._reply(name, False, f"{which} that isn't acknowledged")
             return self._reply(name, True, "acknowledged: " + ", ".join(alert.alert_id for alert in seen))
         if name is CommandName.RESET:
-            self._tell(self._pulsed.reset(), self._pulsed.state)
+            self._alert_all(self._pulsed.reset(), self._pulsed.state)
             return self._reply(name, True, f"{self._pulsed.reference_id} is trusted again; earlier spots are discarded")
         return self._reply(name, False, _NOT_HERE)
 
@@ -239,9 +239,9 @@ class SecondCamera(Loop):
         self._judge(self._pulsed.matcher.finish())
         self._gather_alerts()
 
-    def _keep_house(self) -> None:
+    def _housekeeping(self) -> None:
         self._lines.flush()
-        super()._keep_house()
+        super()._housekeeping()
 
     def _code_at_the_end(self) -> int:
         code = super()._code_at_the_end()

@@ -100,13 +100,13 @@ class Snapshots:
 
 def _complete(job: _Job, outlines: Outlines) -> None:
     frame, record, judged_s = job.newest
-    image, data, said = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
+    image, data, summary = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
     if (encoded := encode(frame.image)) is not None:
         image, data = encoded
-        said = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
+        summary = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
     age_s = job.asked_s - judged_s
     snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image, outlines)
-    text = f"frame {frame.seq}, {age_s:.2f} s old, {record.state}, transform {record.verdict}: {said}"
+    text = f"frame {frame.seq}, {age_s:.2f} s old, {record.state}, transform {record.verdict}: {summary}"
     job.asked.answer(msgspec.structs.replace(job.reply, text=text, snapshot=snapshot), data)
 
 

@@ -102,13 +102,13 @@ class Loop(ABC):
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
-        self._said: StateRecord | None = None
+        self._last_state: StateRecord | None = None
         self._next_state_s = self._next_command_s = self._start_s
         self._stop = stop
         self._service = ServiceManager()
         self._source_broke = False
         self._faults: dict[str, str] = {}  # since the previous frame: what could not be delivered, and why
-        self._said_faults: dict[str, str] = {}  # in the log
+        self._logged_faults: dict[str, str] = {}  # in the log
 
     @property
     @abstractmethod
@@ -149,7 +149,7 @@ class Loop(ABC):
         for notice in self._notices:
             self._alert(notice, self._watch.state)
         end_s = self._start_s + duration_s if duration_s is not None else math.inf
-        self._say_state(time.monotonic())
+        self._publish_state(time.monotonic())
         self._service.ready()
         while self._stop.exit_code is None and time.monotonic() < end_s and self._next_item():
             pass
@@ -158,7 +158,7 @@ class Loop(ABC):
         watch.stopped()
         self._service.stopping()
         self._finish()
-        self._say_state(time.monotonic())
+        self._publish_state(time.monotonic())
         _log.info(
             "stopped after %d frames, %d refused, %d dropped", watch.frames, watch.frames_refused, self._source.dropped
         )
@@ -166,11 +166,11 @@ class Loop(ABC):
 
     def _next_item(self) -> bool:
         """Wait for the source and handle its item; False if there is nothing more to do."""
-        self._obey()
+        self._handle_command()
         self._between()
         if not self._source.live and not self._recorder.has_room:
             time.sleep(ROOM_POLL_S)
-            self._say_state(time.monotonic())
+            self._publish_state(time.monotonic())
             return True
         try:
             item = self._source.read()
@@ -195,10 +195,10 @@ class Loop(ABC):
         alerts += watch.others(self._not_alone(), now_s, stamp_ns)
         for alert in alerts:
             self._alert(alert, watch.state)
-        self._say_state(time.monotonic())
+        self._publish_state(time.monotonic())
         return not self._watch.gives_up
 
-    def _obey(self) -> None:
+    def _handle_command(self) -> None:
         """Carry out one pending command, if any, but not so many that they delay frames."""
         begun_s = time.monotonic()
         asked = None if self._commands is None or begun_s < self._next_command_s else self._commands.poll()
@@ -213,20 +213,20 @@ class Loop(ABC):
         stamp_ns = time.time_ns()
         try:
             answer = self._carry_out(command, stamp_ns)
-            said = f"{'done' if answer.done else 'refused'}: {answer.text}"
+            result = f"{'done' if answer.done else 'refused'}: {answer.text}"
         except Exception as error:  # noqa: BLE001  reported, also to the sender
-            said = f"internal error: {in_short(error)}"
+            result = f"internal error: {in_short(error)}"
             _log.debug("command %s", command.name, exc_info=error)
-        _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, said)
-        text = said if answer is None else answer.text
+        _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, result)
+        text = result if answer is None else answer.text
         carried_out = answer is not None and answer.done
-        told = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
-        self._deliver("command's recording", self._recorder.command, told)
+        recorded = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
+        self._deliver("command's recording", self._recorder.command, recorded)
         answer = self._settle(answer)
         if answer and answer.done and command.name is CommandName.SNAPSHOT:
             self._deliver("answer", self._snapshots.answer, asked, answer, self._newest)
         else:
-            self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
+            self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, result))
 
     def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
         """Pass something to one receiver, whose failure must not affect others; False if it failed, which is logged."""
@@ -236,13 +236,13 @@ class Loop(ABC):
             self._faults[what] = f"{what} not delivered: {in_short(error)}"
             self._log_once(what, "", self._faults[what], error)
             return False
-        self._said_faults.pop(what, None)
+        self._logged_faults.pop(what, None)
         return True
 
     def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:
         """Log a fault, and again only when it changes or recurs."""
-        if self._said_faults.get(what) != text:
-            self._said_faults[what] = text
+        if self._logged_faults.get(what) != text:
+            self._logged_faults[what] = text
             _log.error("%s%s", where, text)
             _log.debug("%s%s", where, what, exc_info=error)
 
@@ -253,7 +253,7 @@ class Loop(ABC):
         recording.
         """
         about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
-        alert = self._with_what_to_type(alert)
+        alert = self._with_command(alert)
         _log.log(_LEVELS[alert.severity], "%s: %s", about, alert.text)
         message = AlertRecord(
             robot=self._robot,
@@ -273,48 +273,48 @@ class Loop(ABC):
         """A message while other monitors have this name, else empty; no transform is published then, since readers
         can't know which one is right.
         """
-        nobody: tuple[str, ...] = ()
-        others = self._ask(self._reports.others, nobody)
+        none: tuple[str, ...] = ()
+        others = self._ask(self._reports.others, none)
         return f"{in_words(others)}; nothing is usable until it or this one is stopped" if others else ""
 
-    def _what_waits(self) -> str:
+    def _pending_proposal(self) -> str:
         """What waits for an operator, with the command to type; empty if nothing."""
         if not self._proposal_id:
             return ""
         return f"a new reference waits for an operator: {accepting(self._proposal_id, self._robot, self._camera)}"
 
-    def _with_what_to_type(self, alert: Alert) -> Alert:
+    def _with_command(self, alert: Alert) -> Alert:
         """Add the command to a proposal's alert, since the monitor, which wrote it, doesn't know the robot's name."""
         if alert.kind is not AlertKind.PROPOSED or not self._proposal_id or alert.event is AlertEvent.CLEARED:
             return alert
         typed = accepting(self._proposal_id, self._robot, self._camera)
         return msgspec.structs.replace(alert, text=f"{alert.text}; to accept it: {typed}")
 
-    def _say_state(self, now_s: float) -> None:
+    def _publish_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
-        watch, said = self._watch, self._said
+        watch, last = self._watch, self._last_state
         self._service.alive(now_s)
-        several, waits = self._not_alone(), self._what_waits()
+        several, waits = self._not_alone(), self._pending_proposal()
         verdict = Verdict.UNKNOWN if several else watch.verdict
         reported = (self._ask(fault, None) for fault in self._reports.faults)
         message = "; ".join(fault for fault in (watch.message, several, waits, watch.undelivered, *reported) if fault)
         now = (watch.state, verdict, self._source.connected, message, self._in_force[1])
         due = now_s >= self._next_state_s
-        if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
+        if last and not due and now == (last.state, last.verdict, last.camera_connected, last.message, last.revision):
             return
-        if waits and (said is None or said.proposal_id != self._proposal_id):
+        if waits and (last is None or last.proposal_id != self._proposal_id):
             _log.warning("%s (or reject)", waits)
-        if said is None or (watch.state, verdict) != (said.state, said.verdict):
-            said_more = f" ({message})" if message else ""
-            line = f"state {watch.state}, {self.verdict_of} {verdict}{said_more}"
+        if last is None or (watch.state, verdict) != (last.state, last.verdict):
+            because = f" ({message})" if message else ""
+            line = f"state {watch.state}, {self.verdict_of} {verdict}{because}"
             _log.info("%s", line)
             self._service.status(line)
-        self._said = self._state_record(verdict, message, now_s, alone=not several)
-        self._deliver("state", self._publisher.state, self._said)
-        self._deliver("state's recording", self._recorder.state, self._said)
+        self._last_state = self._state_record(verdict, message, now_s, alone=not several)
+        self._deliver("state", self._publisher.state, self._last_state)
+        self._deliver("state's recording", self._recorder.state, self._last_state)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
-            self._keep_house()
+            self._housekeeping()
 
     def _state_record(self, verdict: Verdict, message: str, now_s: float, *, alone: bool) -> StateRecord:
         watch, reports = self._watch, self._reports
@@ -355,7 +355,7 @@ class Loop(ABC):
             self._log_once("report", "", f"a report for the state message fails: {in_short(error)}", error)
             return otherwise
 
-    def _keep_house(self) -> None:
+    def _housekeeping(self) -> None:
         """Called once per state period, right after a frame, when there is time before the next."""
         if not gc.isenabled():
             gc.collect()

@@ -276,13 +276,13 @@ class Drops:
         """``allowed_share``: fraction of dropped frames that raises the alert; half of it clears the alert."""
         self._allowed = allowed_share
         self._counts: deque[tuple[float, int, int]] = deque()  # time, frames handled, frames dropped
-        self._said = ""
+        self._text = ""
 
     def look(self, handled: int, dropped: int, now_s: float) -> str:
         """What is wrong and what to change, from the counts since the start; empty if nothing."""
         counts = self._counts
         if counts and now_s - counts[-1][0] < _LOOK_EVERY_S:
-            return self._said
+            return self._text
         counts.append((now_s, handled, dropped))
         while len(counts) > 1 and now_s - counts[1][0] >= OVER_S:
             counts.popleft()
@@ -291,9 +291,9 @@ class Drops:
         few, lost = handled - handled_before, dropped - dropped_before
         if elapsed_s >= OVER_S:
             share = lost / max(1, few + lost)
-            allowed = self._allowed / 2.0 if self._said else self._allowed
-            self._said = _in_words(few / elapsed_s, (few + lost) / elapsed_s, share) if share > allowed else ""
-        return self._said
+            allowed = self._allowed / 2.0 if self._text else self._allowed
+            self._text = _in_words(few / elapsed_s, (few + lost) / elapsed_s, share) if share > allowed else ""
+        return self._text
 
 
 def _in_words(handled_per_s: float, came_per_s: float, share: float) -> str:

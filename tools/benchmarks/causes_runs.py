@@ -49,11 +49,11 @@ def run(trial: Trial) -> Told:
                 ever.add((alert.cause, alert.part))
             newest[alert.alert_id or alert.kind] = alert
     # Also what was over by then: a clock that was set once is right again.
-    told = [a for a in newest.values() if a.event is not AlertEvent.NOTED]
-    named = [a for a in told if a.cause is not Cause.UNKNOWN]
-    alert = (named or told or [None])[-1]
+    alerts = [a for a in newest.values() if a.event is not AlertEvent.NOTED]
+    named = [a for a in alerts if a.cause is not Cause.UNKNOWN]
+    alert = (named or alerts or [None])[-1]
     return Told(
-        frozenset((a.cause, a.part) for a in told),
+        frozenset((a.cause, a.part) for a in alerts),
         frozenset(ever),
         () if alert is None else tuple((c.cause.value, c.part, c.probability) for c in alert.causes),
         "" if alert is None else alert.text,

@@ -44,8 +44,8 @@ class Child:
 
     def line(self, expected: str) -> None:
         assert self.process.stdout is not None
-        if (said := self.process.stdout.readline()) != f"{expected}\n":
-            raise RuntimeError(f"{' '.join(self.process.args)}: said {said!r}, not {expected!r}")  # type: ignore[arg-type]
+        if (line := self.process.stdout.readline()) != f"{expected}\n":
+            raise RuntimeError(f"{' '.join(self.process.args)}: printed {line!r}, not {expected!r}")  # type: ignore[arg-type]
 
     def mark(self) -> None:
         assert self.process.stdin is not None

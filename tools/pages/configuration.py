@@ -109,9 +109,9 @@ def _key(dotted: str, field: mi.Field) -> Key:
     meaning = _description(field.type)
     name = dotted.rpartition(".")[2]
     unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
-    said = re.search(r" \((no unit|number|[\w/²√]+(?: per [^()]*)?)\)$", meaning)
-    if said:
-        unit, meaning = (unit or said[1]).replace("no unit", "").replace("number", ""), meaning[: said.start()]
+    found = re.search(r" \((no unit|number|[\w/²√]+(?: per [^()]*)?)\)$", meaning)
+    if found:
+        unit, meaning = (unit or found[1]).replace("no unit", "").replace("number", ""), meaning[: found.start()]
     meaning = meaning.replace("|", "\\|").replace("<", "&lt;")
     return Key(dotted, _type(field.type), unit, _default(field), _bounds(field.type), meaning)
 

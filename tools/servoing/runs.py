@@ -116,7 +116,7 @@ class _Arms:
         step_s = time_s - self._simulator.time_s(self.readings[-1].seq) if self.readings else 0.0
         self.readings.append(reading)
         truth = self._simulator.truth(reading.seq)
-        told = {
+        values = {
             WITHOUT: Given(truth.reference_cam_T_grip, Verdict.VALID, 0.0),
             GRIPMON: given_by(reading, age_s, smoothed=False),
             SMOOTHED: given_by(reading, age_s, smoothed=True),
@@ -129,7 +129,7 @@ class _Arms:
             base_T_grip = self._arm.base_T_grip(servo.q)
             cam_T_object = truth.cam_T_grip @ invert(base_T_grip) @ self._base_T_object
             seen = None if "hand" in truth.events else self._eye.cam_T_object(cam_T_object, noise_px)
-            servo.decide(time_s, step_s, told[source], seen)
+            servo.decide(time_s, step_s, values[source], seen)
             off_m = truth.cam_T_grip[:3, 3] - cam_T_object[:3, 3]
             self._ways[source].append((servo.q, base_T_grip[:3, 3], off_m, servo.action, servo.grasped))
 
