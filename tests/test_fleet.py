@@ -132,7 +132,10 @@ def test_late_joiners_above_get_the_last_ones(fleet: Fleet, monitor: Published):
 
 def test_nobody_commands_from_above(fleet: Fleet, monitor: Published):
     file = str(fleet.folder / "central-operator.json5")
-    with Client("arm", "wrist", zenoh_config_file=file) as above, pytest.raises(NotCarriedOut, match="may not let you"):
+    with (
+        Client("arm", "wrist", zenoh_config_file=file) as above,
+        pytest.raises(NotCarriedOut, match="may not allow you"),
+    ):
         above.send(CommandName.STATE, timeout_s=1.5)
     assert monitor.commands.poll() is None
 

@@ -61,7 +61,7 @@ def test_a_step_is_placed_at_its_frame_with_its_size_and_cause():
     assert (old.what, old.ended_by) == ("old_calibration", "end_of_recording")
     assert (old.start_ns, old.end_ns) == (START_NS + 250 * PERIOD_NS, START_NS + 499 * PERIOD_NS)
     assert old.largest.size_m == pytest.approx(3e-3, abs=1e-5)
-    assert "moved once" in recording.summary and "still so" in recording.summary
+    assert "moved once" in recording.summary and "still displaced" in recording.summary
 
 
 def test_a_step_and_its_return_end_the_affected_time():
@@ -448,14 +448,14 @@ def test_a_motion_has_pictures_before_it_at_it_and_after_it():
     assert (event.before_seq, event.at_seq, event.after_seq) == (240, 250, 290)
 
 
-def test_what_was_not_believed_is_not_shown_in_green():
+def test_what_is_not_used_is_not_shown_in_green():
     points = np.stack([np.arange(20.0, 300.0, 4.0), np.full(70, 100.0)], axis=1).astype(np.float32)
     picture = Picture(
         7, START_NS, np.zeros((240, 320), np.uint8), "image/png", points, points[:0], (points[:2],), points[:0], ()
     )
     green = []
-    for believed in (True, False):
-        (shown,) = cut_alike([JudgedPicture(picture, believed)])
+    for used in (True, False):
+        (shown,) = cut_alike([JudgedPicture(picture, used)])
         data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))

@@ -103,7 +103,7 @@ def test_pictures_stand_beside_the_events(reported: tuple[Path, Report]):
         assert picture.shape[1] == 560
     seen = cv2.imdecode(np.frombuffer(base64.b64decode(blobs[0]), np.uint8), cv2.IMREAD_COLOR).astype(int)
     green = (seen[:, :, 1] - np.maximum(seen[:, :, 0], seen[:, :, 2])) > 60
-    assert green.sum() > 200, "edge points that were believed"
+    assert green.sum() > 200, "edge points that were used"
 
 
 @pytest.fixture

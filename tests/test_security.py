@@ -136,7 +136,7 @@ def test_only_the_operator_commands(site: Site):
     before = len(site.commands)
     with Client("arm", "wrist", zenoh_config_file=str(site.file("controller"))) as controller:
         for name in CommandName:
-            with pytest.raises(NotCarriedOut, match="may not let you"):
+            with pytest.raises(NotCarriedOut, match="may not allow you"):
                 controller.send(name, timeout_s=1.0)
         with site.session("controller") as session:
             assert not list(session.get(f"{PREFIX}/cmd/undo", timeout=1.0))
@@ -161,7 +161,7 @@ def test_the_page_of_the_fleet_can_do_what_its_certificate_may(site: Site):
             (card,) = page.shown().cards
             order = Order(robot="arm", camera="wrist", monitor_id=card.monitor_id, name="accept", argument="p-1")
             if name == "controller":
-                with pytest.raises(BadRequest, match="may not let you"):
+                with pytest.raises(BadRequest, match="may not allow you"):
                     page.carry_out(order)
             else:
                 assert page.carry_out(order).text == "so be it"
@@ -182,7 +182,7 @@ def test_send_says_what_may_be_wrong(site: Site, stranger: Path):
     assert unknown.stderr.startswith(f"send: --zenoh-config: can't open a Zenoh session: no connection to {place} (")
     assert "or the certificates don't fit" in unknown.stderr
     refused, obeyed = send(site.file("controller")), send(site.file("operator"))
-    assert refused.returncode == 3 and refused.stderr.count("\n") == 1 and "may not let you" in refused.stderr
+    assert refused.returncode == 3 and refused.stderr.count("\n") == 1 and "may not allow you" in refused.stderr
     assert (obeyed.returncode, obeyed.stdout) == (0, "so be it\n")
 
 

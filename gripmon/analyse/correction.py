@@ -21,10 +21,10 @@ from gripmon.analyse.vectors import (
     Run,
     at,
     covariances_to_poses,
+    outlier_frames,
     prepare,
     to_poses,
     to_vectors,
-    wild_frames,
     with_gaps,
 )
 from gripmon.model.records import Array
@@ -93,8 +93,8 @@ def correct(
     Raises ValueError if fewer than :data:`.vectors.MIN_FRAMES` frames were measured.
     """
     run = prepare(stamp_ns, cam_T_grip, covariance, measured)
-    wild = wild_frames(run)
-    run.usable &= ~wild
+    outliers = outlier_frames(run)
+    run.usable &= ~outliers
     progress()
     found = _changes(run)
     progress()
@@ -104,7 +104,7 @@ def correct(
     if len(kept) < len(found):
         fit = _fit(run, kept)
     progress()
-    return _conclude(run, fit, stamp_ns, wild)
+    return _conclude(run, fit, stamp_ns, outliers)
 
 
 STAGES = 3
@@ -217,13 +217,13 @@ def _around(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
     return x, variance.sum(axis=0)
 
 
-def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
+def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, outliers: Bools) -> Correction:
     segment = _segments(run, fit.found)
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s, segment)
     variance = np.maximum(variance + fit.shares.unseen, MIN_VARIANCE)
     good = np.flatnonzero(run.usable)
     source = np.full(len(x), GAP, np.int8)
-    source[good], source[wild] = SMOOTHED, DISBELIEVED
+    source[good], source[outliers] = SMOOTHED, DISBELIEVED
     # Quick motion: vibration from the spectrum, swinging as far as frames scatter more than usual.
     frame = (fit.shares.frame + fit.shares.white + fit.shares.mid) * run.claimed[good]
     follow = fit.swing / (fit.swing + frame)

@@ -121,7 +121,7 @@ def _judged(analysed: Analysed, seq: int | None) -> JudgedPicture | None:
         return None
     table = analysed.source.frames
     held = table.source[_index(analysed, seq)] == table.ORIGINS.index(Origin.HELD)
-    return JudgedPicture(picture, believed=not held)
+    return JudgedPicture(picture, used=not held)
 
 
 def _index(analysed: Analysed, seq: int) -> int:
@@ -233,7 +233,7 @@ class JudgedPicture(NamedTuple):
     """A picture, and whether its measurement was used; otherwise all its points are shown as refused."""
 
     picture: Picture
-    believed: bool
+    used: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +294,7 @@ def _shown(
     look: LookNote | msgspec.UnsetType,
 ) -> Shown | None:
     left, top, right, bottom = box
-    picture, believed = judged
+    picture, used = judged
     image = to_8_bit(picture.image)
     crop = (cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)[top:bottom, left:right]
     if not crop.size:
@@ -320,9 +320,9 @@ def _shown(
         ()
         if look is not msgspec.UNSET
         else (
-            (picture.edges_used, USED if believed else REFUSED, 2),
+            (picture.edges_used, USED if used else REFUSED, 2),
             (picture.edges_refused, REFUSED, 2),
-            (_corners(picture)[: None if believed else 0], CORNER, 5),
+            (_corners(picture)[: None if used else 0], CORNER, 5),
         )
     ):
         for x, y in place(points).tolist():

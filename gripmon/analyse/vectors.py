@@ -26,7 +26,7 @@ MAX_DISTANCE_M = 1e6
 """Transforms with a larger translation are rejected; their squares overflow."""
 MIN_COVARIANCE_DIAGONAL, MIN_CORRELATION_EIGENVALUE = 1e-24, 1e-9
 """Least diagonal of a covariance (m², rad²: a picometre) and least eigenvalue of its correlations."""
-WILD_SIGMAS, WILD_WINDOW_FRAMES, WILD_MAX_FRAMES = 8.0, 9, 2
+OUTLIER_SIGMAS, OUTLIER_WINDOW_FRAMES, OUTLIER_MAX_FRAMES = 8.0, 9, 2
 """A frame farther than this from its window's median is an outlier if at most this many in a row are."""
 
 
@@ -107,21 +107,21 @@ def are_definite(covariance: Array) -> Bools:
     return out
 
 
-def wild_frames(run: Run) -> Bools:
+def outlier_frames(run: Run) -> Bools:
     """Outliers: frames far from their neighbours on both sides, singly or in pairs."""
     out = np.zeros(len(run.y), bool)
     good = np.flatnonzero(run.usable)
-    if len(good) < 2 * WILD_WINDOW_FRAMES:
+    if len(good) < 2 * OUTLIER_WINDOW_FRAMES:
         return out
     y = run.y[good]
-    off = y - median_filter(y, size=(WILD_WINDOW_FRAMES, 1), mode="nearest")
+    off = y - median_filter(y, size=(OUTLIER_WINDOW_FRAMES, 1), mode="nearest")
     usual = np.sqrt(np.median(off * off, axis=0) / CHI2_MEDIAN) + 1e-9
     local = np.sqrt(median_filter(off * off, size=(65, 1), mode="nearest") / CHI2_MEDIAN)
-    far = (np.abs(off) > WILD_SIGMAS * np.maximum(usual, local)).any(axis=1)
+    far = (np.abs(off) > OUTLIER_SIGMAS * np.maximum(usual, local)).any(axis=1)
     far &= (off * off / run.claimed[good]).max(axis=1) > 4.0
     crowd = np.convolve(far, np.ones(17), mode="same")
     # Several frames in a row are motion; a single one is not.
-    out[good[far & (crowd <= WILD_MAX_FRAMES)]] = True
+    out[good[far & (crowd <= OUTLIER_MAX_FRAMES)]] = True
     return out
 
 

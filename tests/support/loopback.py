@@ -68,10 +68,10 @@ def accepts(endpoint: str) -> bool:
 
 
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = WAIT_S) -> None:
-    """Come back when the condition holds; fail with ``what`` when it takes too long."""
+    """Return when the condition holds; fail with ``what`` when it takes too long."""
     end_s = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < end_s, f"waited {timeout_s:g} s in vain: {what}"
+        assert time.monotonic() < end_s, f"not within {timeout_s:g} s: {what}"
         time.sleep(0.005)
 
 
