@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
+from gripmon.model.targets import TargetError, parse_target, refuse_other_size
 from gripmon.track.edges.taught import gripper_digest
 
 TRUE = nominal_cam_T_grip()
@@ -186,6 +188,25 @@ def test_the_camera_s_target_in_another_size_is_refused(
     assert said.startswith(f"--target {TWICE}: the camera was calibrated with {TARGET}, the same pattern in another si")
     assert "--other-target" in said and said.count("\n") == 1
     assert not (here / "he.yaml").exists() and not (here / "new.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("recorded", "given", "refused"),
+    [
+        (TARGET, "circles:10x12:0.016:0.008", True),
+        (TARGET, "circles:12x10:0.008:0.003", True),
+        (TARGET, "circles:12x10:0.008:0.00400000001", False),
+        (TARGET, "circles:8x8:0.016:0.008", False),
+        (TARGET, "chequerboard:12x10:0.016", False),
+        ("chequerboard:9x6:0.025", "chequerboard:9x6:0.0251", True),
+        ("charuco:8x6:0.03:0.022:DICT_4X4_250", "charuco:8x6:0.04:0.03:DICT_4X4_100", True),
+        ("the board in the workshop", TARGET, False),
+        (None, TARGET, False),
+    ],
+)
+def test_the_same_pattern_in_another_size(recorded: str | None, given: str, refused: bool):
+    with pytest.raises(TargetError, match="another size") if refused else contextlib.nullcontext():
+        refuse_other_size(parse_target(given), recorded)
 
 
 def test_another_target_of_the_same_pattern_is_taken_where_it_is_confirmed(here: Path):

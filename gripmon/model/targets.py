@@ -130,7 +130,7 @@ def refuse_other_size(target: Target, recorded: str | None, made: str = "the cam
         return
     if known is None or type(known) is not type(target):
         return
-    if (known.columns, known.rows) != (target.columns, target.rows):
+    if {known.columns, known.rows} != {target.columns, target.rows}:  # discs show the same with both swapped
         return
     lengths = [name for name in known.__struct_fields__ if name.endswith("_m")]
     if not all(math.isclose(getattr(target, n), getattr(known, n), rel_tol=_AS_WRITTEN) for n in lengths):
