@@ -245,7 +245,7 @@ def test_bad_input_is_one_line_and_nothing_is_lost(user: new_user.NewUser, drive
         visitor.go("gripper")
         visitor.fill(gripper="a file", gripper_file=str(folder / "setup.yaml"))
         visitor.press("step")
-        visitor.refused("setup.yaml", "name")
+        visitor.refused("setup.yaml", "what was said to gripmon setup; a gripper file")
         visitor.fill(gripper="two_box_fingers")
         visitor.press("step")
         visitor.done("gripper")
