@@ -103,8 +103,8 @@ def knocked_behind_a_bar(size_m: float) -> Scenario:
 
 @pytest.mark.parametrize(("size_m", "within"), [(1e-3, 4), (-1e-3, 3), (-3e-3, 3), (-5e-3, 3), (3e-3, 6), (5e-3, 8)])
 def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_away(size_m: float, within: int):
-    """Valid again within three or four frames; towards the background, where the fingers' own long edges lie beside the place
-    that they left, within six, or eight where a search is needed: its result counts 0.1 s later.
+    """Valid again within three or four frames; towards the background, where the fingers' own long edges lie beside the
+    place that they left, within six, or eight where a search is needed: its result counts 0.1 s later.
     """
     seen = watched(scene(28, mount=(along_fingers(size_m, BEGINS_S),)))
     assert_nothing_misleads(seen)

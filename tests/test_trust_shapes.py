@@ -17,7 +17,7 @@ from support.watched import Watched, reference_of, watch
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import gripper_from_dict
-from gripmon.model.records import AlertEvent, AlertKind, Verdict
+from gripmon.model.records import AlertKind, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.refits import SIGMA_INFLATION
 from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
