@@ -21,9 +21,9 @@ from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
 from gripmon.track.look.kernel import CLIP_SIGMAS
 
-LENGTH_PX, REACH_PX = 64, 40
-"""How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: 3 to 9 mm
-beside the ends, where what is mistaken for them lies.
+LENGTH_PX, REACH_PX = 64, 96
+"""How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: as far as a
+lost gripper is searched for, 12 mm at 8 px to the millimetre.
 """
 
 SHORTEST_PX = 16
@@ -82,7 +82,7 @@ class FingerStrips:
         self._nothing = not len(self._points_grip_m)
         if self._nothing:
             return
-        strips = self._read(image, cam_T_grip, jaw_opening_m)[:, REACH_PX : REACH_PX + LENGTH_PX]
+        strips = self._read(image, cam_T_grip, jaw_opening_m)
         self.frames += 1
         self._learnt_s = now_s
         self._mean += (strips - self._mean) * self._within / min(self.frames, MOST_FRAMES)
@@ -93,15 +93,14 @@ class FingerStrips:
         """
         if not self.ready:
             return None
-        strips = self._read(image, cam_T_grip, jaw_opening_m)
         most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
-        np.clip(strips, -most, most, out=strips)
         learnt = np.clip(self._mean, -most, most)
-        # Gain and brightness are free: light changes.
         own = float(np.square(learnt).sum())
-        there = strips[:, REACH_PX : REACH_PX + LENGTH_PX] * self._within
+        # Gain and brightness are free: light changes.  Usually they are seen where they are, and no slide is better.
+        there = np.clip(self._read(image, cam_T_grip, jaw_opening_m), -most, most) * self._within
         if float((there * learnt).sum()) > EXPLAINED_CORRELATION * math.sqrt(float(np.square(there).sum()) * own):
             return None
+        strips = np.clip(self._read(image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
         energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
@@ -116,21 +115,27 @@ class FingerStrips:
             return None
         return (best - REACH_PX) * self._step_grip_m
 
-    def _read(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> NDArray[np.float32]:
-        """(n, LENGTH_PX + 2 REACH_PX) grey levels along the strips, without their slow changes."""
+    def _read(
+        self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
+    ) -> NDArray[np.float32]:
+        """(n, LENGTH_PX + 2 beyond) grey levels along the strips, without their slow changes."""
+        margin = SLOPE_PX // 2 + 1  # what the filters below take in
+        first, last = REACH_PX - beyond, REACH_PX + LENGTH_PX + 2 * margin + beyond
+        points_grip_m = self._points_grip_m[:, first:last]
         now = self._gripper.points_grip_m(jaw_opening_m)
         then = self._gripper.points_grip_m(self._laid_out_at_m)
         moved = (now[self._first] - then[self._first])[self._finger]
-        points = (self._points_grip_m + moved[:, None]).reshape(-1, 3)
+        points = (points_grip_m + moved[:, None]).reshape(-1, 3)
         uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         # A point outside the lens is NaN; OpenCV needs a number for it.
-        shape = self._points_grip_m.shape[:2]
+        shape = points_grip_m.shape[:2]
         u, v = (c.reshape(shape) for c in np.nan_to_num(uv_px, nan=-1.0).astype(np.float32).T)
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         if values.ndim == 3:
             values = values @ GREY_BGR
         smooth = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
+        fast = smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(fast[:, margin:-margin], dtype=np.float32)
 
     def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
         start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
@@ -147,8 +152,9 @@ class FingerStrips:
         long_enough = length_m >= SHORTEST_PX * pitch_m
         if not long_enough.any():
             return
-        reach = np.arange(-REACH_PX, LENGTH_PX + REACH_PX) * pitch_m
-        within = reach[REACH_PX : REACH_PX + LENGTH_PX] < length_m[long_enough, None]
+        around = REACH_PX + SLOPE_PX // 2 + 1
+        reach = np.arange(-around, LENGTH_PX + around) * pitch_m
+        within = reach[around : around + LENGTH_PX] < length_m[long_enough, None]
         self._step_grip_m = pitch_m * way[long_enough].mean(axis=0)
         self._points_grip_m = start[long_enough, None] + reach[:, None] * way[long_enough, None]
         self._within, self._finger = within.astype(np.float32), finger[long_enough]
