@@ -235,6 +235,40 @@ def test_a_few_mistaken_frames_do_not_decide():
     assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
 
 
+def test_what_other_borders_can_imitate_is_confirmed_by_a_second_conclusion():
+    shown = Shown(sharp_gripper())
+    left, right = ({finger: bend(shown.gripper, finger, (8e-4, 5e-4))} for finger in ("left", "right"))
+    judge, settings = shown.judge(), CauseSettings()
+
+    def concluded(**scene: Any) -> tuple[Cause, str | None, bool]:
+        for _ in range(settings.frames):  # none of the conclusion before
+            judge.add(shown.evidence(**scene))
+        found = judge.explanation(shown.reference)
+        assert found.text.startswith("perhaps ") != found.confirmed
+        return found.probable.cause, found.probable.part, found.confirmed
+
+    assert concluded(bent=left) == (Cause.FINGER_BENT, "left", False)
+    assert concluded(bent=left) == (Cause.FINGER_BENT, "left", True)
+    assert concluded(bent=left) == (Cause.FINGER_BENT, "left", True)
+    assert concluded(bent=right) == (Cause.FINGER_BENT, "right", False)
+    assert concluded(opening_m=OPENING_M + 5e-4) == (Cause.JAW_OPENING, None, False)
+    assert concluded(camera=make_camera(zoomed(1.01))) == (Cause.LENS, None, False)
+    assert concluded() == (Cause.UNKNOWN, None, True)
+    assert concluded(camera=make_camera(zoomed(1.01))) == (Cause.LENS, None, False)
+    judge.reset()
+    assert concluded(camera=make_camera(zoomed(1.01))) == (Cause.LENS, None, False)
+    assert concluded(camera=make_camera(zoomed(1.01))) == (Cause.LENS, None, True)
+
+
+def test_a_camera_that_moved_needs_no_second_conclusion():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(shown.evidence(knocked(shown.reference, (3e-4, 0.0, 0.0))))
+    found = judge.explanation(shown.reference)
+    assert found.confirmed and found.confirmed_cause.cause is Cause.CAMERA_MOUNT
+
+
 def test_settings_refuse_a_probability_that_names_anything():
     with pytest.raises(msgspec.ValidationError, match="probable"):
         msgspec.convert({"probable": 0.4}, CauseSettings)

@@ -184,11 +184,11 @@ def test_images_that_come_again_do_not_tell_that_the_jaw_is_elsewhere():
 
 def test_a_report_that_is_only_roughly_known_is_named_when_it_is_wrong():
     """What the images tell of its error is soon believed: neither the drift nor the edges show anything then."""
-    scenario = Scenario(name="jaw", fps=FPS, duration_s=1.2, background=PLAIN)
+    scenario = Scenario(name="jaw", fps=FPS, duration_s=2.0, background=PLAIN)
     scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, 3)
     monitor, rng = new_monitor(MonitorSettings(jaw_sigma_m=3e-5)), np.random.default_rng(5)
     told = []
-    for index in range(34):
+    for index in range(40):
         wrong_m = rng.normal(0.0, 3e-5) + (3e-4 if index >= 24 else 0.0)
         told.append(monitor.process(replace(scene.frame(index), jaw_opening_m=OPENING_M + wrong_m)))
     named = {alert.cause for record in told for alert in record.alerts} - {Cause.UNKNOWN}

@@ -11,6 +11,7 @@ from support.policy_runs import (
     BENT,
     CLEARED,
     KNOCKED,
+    PERHAPS_BENT,
     RAISED,
     SETTINGS,
     UPDATED,
@@ -21,7 +22,7 @@ from support.policy_runs import (
     settled,
 )
 
-from gripmon.model.records import AlertKind, Cause, Vibration
+from gripmon.model.records import AlertKind, Cause, Verdict, Vibration
 
 K = AlertKind
 
@@ -90,6 +91,22 @@ def test_causes_and_the_part_are_in_the_alerts():
     assert KNOCKED.text in moved.text
     [unknown] = settled().feed(seen(0.3)).alerts
     assert unknown.cause is Cause.UNKNOWN
+
+
+def test_a_cause_that_is_not_confirmed_makes_a_transform_suspect_and_is_not_named():
+    run = settled()
+    doubted = run.feed(seen(0.0, explanation=PERHAPS_BENT))
+    assert (doubted.verdict, doubted.reason, doubted.alerts) == (Verdict.SUSPECT, PERHAPS_BENT.text, ())
+    [moved] = run.feed(seen(0.3, explanation=PERHAPS_BENT)).alerts
+    assert (moved.kind, moved.cause, moved.part) == (K.STEP, Cause.UNKNOWN, None)
+    confirmed = run.feed(seen(0.3, explanation=BENT)).alerts
+    assert [(a.kind, a.event, a.cause, a.part) for a in confirmed] == [
+        (K.STEP, UPDATED, Cause.FINGER_BENT, "left"),
+        (K.GRIPPER, RAISED, Cause.FINGER_BENT, "left"),
+    ]
+    doubted_again = run.feed_all([seen(0.3, explanation=PERHAPS_BENT)] * 30)
+    assert (K.GRIPPER, CLEARED) not in kinds(doubted_again)
+    assert (K.GRIPPER, CLEARED) in kinds(run.feed_all([seen(0.3)] * 30))
 
 
 def test_a_drift_at_the_edge_of_a_limit_is_not_told_again_and_again():

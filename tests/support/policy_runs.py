@@ -87,6 +87,7 @@ def explained(cause: Cause, part: str | None = None, probability: float = 0.97) 
 
 
 BENT, KNOCKED = explained(Cause.FINGER_BENT, "left"), explained(Cause.CAMERA_MOUNT)
+PERHAPS_BENT = replace(BENT, text="perhaps a finger", confirmed=False)
 
 
 @dataclass(frozen=True)

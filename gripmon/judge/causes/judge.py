@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import msgspec
@@ -15,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
-from gripmon.judge.causes.models import Weighed
+from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, Weighed
 from gripmon.judge.causes.pooling import Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.judge.causes.watches import LEARNT
@@ -49,8 +50,8 @@ by how much its cells may have wandered before, and may differ now, parts of the
 that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
 """
 
-MOST_EDGES = 0.5
-"""Part of the seen edges beyond which a cause has to explain them to be named: the others belong to something else."""
+TO_CONFIRM = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
+"""Causes that borders of other things near some of the edges can imitate: two conclusions in a row must name them."""
 
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,6 +100,7 @@ class CauseJudge:
         """All is well again: evidence is forgotten."""
         self._frames.clear()
         self._interrupted = False
+        self._named: tuple[Cause, str | None] | None = None  # by the last conclusion
 
     def interrupted(self) -> None:
         """No frames came for long, before those that are added next: someone may have exchanged the camera."""
@@ -129,7 +131,17 @@ class CauseJudge:
         self._frames.append(evidence)
 
     def explanation(self, ref_cam_T_grip: Array) -> Explanation:
-        """What the frames since the last reset say together about what moved since ``ref_cam_T_grip`` (4, 4)."""
+        """What the frames since the last reset say together about what moved since ``ref_cam_T_grip`` (4, 4);
+        confirmed if the conclusion before named the same cause, or the cause needs no confirmation.
+        """
+        found = self._concluded(ref_cam_T_grip)
+        named, before = (found.probable.cause, found.probable.part), self._named
+        self._named = named
+        if found.probable.cause not in TO_CONFIRM or named == before:
+            return found
+        return replace(found, text=f"perhaps {found.text}", confirmed=False)
+
+    def _concluded(self, ref_cam_T_grip: Array) -> Explanation:
         if not self._frames:
             return self._told({Cause.UNKNOWN: 1.0}, "nothing was seen that tells a cause")
         baseline = self._learnt(ref_cam_T_grip)
@@ -237,7 +249,7 @@ def _ill_founded(key: Key, pooled: Pooled) -> bool:
 def _of_few_edges(key: Key, comparison: Comparison) -> bool:
     """Whether a cause says where the edges stand, but most of them don't."""
     says_where = key[0] not in (Cause.UNKNOWN, Cause.VIEW_BLOCKED)
-    return says_where and bool((comparison.fits[key].own > 0.5).mean() <= MOST_EDGES)
+    return says_where and bool((comparison.fits[key].own > 0.5).mean() <= 1.0 - MOST_FOREIGN_EDGES)
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

@@ -38,8 +38,16 @@ of a bent finger; of a wrong opening; and of a lens, of several things and of no
 """
 
 
-WRONG_EDGE_PROBABILITY = 0.1
-"""Probability that an edge belongs to something else, given that something looks wrong."""
+MOST_FOREIGN_EDGES = 0.5
+"""Share of the seen edges that may belong to something else; a cause must explain the others to be named.  How many do
+is unknown beforehand, any share up to this one equally probable: a thing that is grasped has borders beside several
+edges at once, so that edges aren't mistaken independently of each other.
+"""
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # exact up to 23 edges
+_SHARES = 0.5 * MOST_FOREIGN_EDGES * (1.0 + _NODES)
+_LOG_FOREIGN, _LOG_OWN = np.log(_SHARES)[:, None], np.log1p(-_SHARES)[:, None]
+_LOG_WEIGHTS = np.log(0.5 * _WEIGHTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +150,8 @@ class Model:
 class Errors:
     """Of the pieces (s,) of edges: what they showed beyond the model when all was well, their scale ``sigma_px``, and
     the scale ``spread_px`` of what a whole edge is off by; ``edge`` (s,) numbers the edges from 0 to k - 1.
-    ``something_else`` (k,): log probability of what each edge shows if it belongs to something else, up to the constant
-    that all models share (see :func:`something_else`); None where none may.
+    ``something_else`` (k,): log probability density of what each edge shows if it belongs to something else, up to the
+    constant that all models share (see :func:`something_else`); None where none may.
     """
 
     bias_px: Array
@@ -243,9 +251,9 @@ class _Problem:
             point = self._moved(point, step)
             if converged:
                 break
-        logs, own = _of_edges(point.residual, point.off_px, self._errors)
+        shown, own = _of_edges(point.residual, point.off_px, self._errors)
         priors = np.array([model.precision(size)[self._free] for size in (model.sizes.tolist() or [0.0])])
-        log = logs.sum() + _volume(point.design, *self._weights(point), point.motion[self._free], priors)
+        log = shown + _volume(point.design, *self._weights(point), point.motion[self._free], priors)
         evidence = float(np.logaddexp.reduce(log)) - math.log(len(log))
         return Weighed(evidence, point.state, point.motion, point.residual, own)
 
@@ -285,15 +293,19 @@ def _student(error: Array, scale: Array) -> Array:
     return np.asarray(-0.5 * (STUDENT_FREEDOM + 1.0) * np.log1p((error / scale) ** 2 / STUDENT_FREEDOM))
 
 
-def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[Array, Array]:
-    """(k,) log probability of what each edge shows, and (k,) that it is the edge, not something else."""
+def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[float, Array]:
+    """Log probability of what all edges show, and (k,) the probability of each that it is the edge, not something else;
+    averaged over the shares of edges that may be something else.
+    """
     pieces = _student(residual - off_px[errors.edge], errors.sigma_px)
     own = np.bincount(errors.edge, pieces, errors.edges) + _student(off_px, errors.of_edge_px)
     if errors.something_else is None:
-        return own, np.ones(len(own))
-    own += math.log1p(-WRONG_EDGE_PROBABILITY)
-    both = np.logaddexp(own, errors.something_else)
-    return both, np.maximum(np.exp(own - both), LEAST_SHARE)
+        return float(own.sum()), np.ones(len(own))
+    is_own = own + _LOG_OWN
+    either = np.logaddexp(is_own, errors.something_else + _LOG_FOREIGN)
+    of_share = either.sum(axis=1) + _LOG_WEIGHTS
+    log = float(np.logaddexp.reduce(of_share))
+    return log, np.maximum(np.exp(of_share - log) @ np.exp(is_own - either), LEAST_SHARE)
 
 
 def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: float) -> Array:
@@ -319,7 +331,7 @@ def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: f
         is_own = math.log(_STUDENT_HEIGHT / errors.of_edge_px[k]) + 0.5 * math.log(2.0 * math.pi)
         is_own -= 0.5 * math.log(weight[at].sum() + spread_weight[k])
         fit = float(_student(residual[at] - border, errors.sigma_px[at]).sum())
-        out[k] = math.log(WRONG_EDGE_PROBABILITY) + fit + may_be - is_own
+        out[k] = fit + may_be - is_own
     return out
 
 

@@ -192,7 +192,7 @@ class Policy:
         explanation = explanation or NO_EXPLANATION
         if explanation.probable.cause in HIDES_NOTHING:
             explanation = NO_EXPLANATION  # of a motion before
-        probable = explanation.probable
+        probable = explanation.confirmed_cause
         if self.state is State.LOST:
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
             cause = self._bad(explanation) if refusal else probable.cause
@@ -235,7 +235,7 @@ class Policy:
     @staticmethod
     def _bad(explanation: Explanation) -> Cause:
         """Why images are refused: by themselves, unless the stream says otherwise."""
-        return explanation.probable.cause if explanation.text else Cause.IMAGE_BAD
+        return explanation.confirmed_cause.cause if explanation.text else Cause.IMAGE_BAD
 
     def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
         """The reference was replaced: drift is reckoned from zero, and what was said of it is over."""
@@ -262,7 +262,7 @@ class Policy:
     def _about_renewal(
         self, kind: AlertKind, severity: Severity, text: str, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
-        probable, before = explanation.probable, self.alerts.about(RENEWAL)
+        probable, before = explanation.confirmed_cause, self.alerts.about(RENEWAL)
         alert = Alert(kind, probable.cause, severity, text, part=probable.part, causes=explanation.causes)
         over: tuple[Alert, ...] = ()
         if before is not None and (before.kind is not kind or (kind is AlertKind.PROPOSED and before.text != text)):
@@ -302,7 +302,7 @@ class Policy:
             self._still += 1
 
     def _alerts_of(self, evidence: Evidence, moved: bool, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
-        book, motion, probable = self.alerts, evidence.motion, evidence.explanation.probable
+        book, motion, probable = self.alerts, evidence.motion, evidence.explanation.confirmed_cause
         not_the_camera = probable.cause in NOT_THE_CAMERA
         since = self._unproven_since
         if since is not None and now_s - since[0] >= self._settings.hold_s:
@@ -337,7 +337,7 @@ class Policy:
         elif probable.cause is Cause.CAMERA_MOUNT:
             # The same edges explained better: what was said before they were seen well was wrong.
             alerts += book.absent(GRIPPER, "the camera moved, not the gripper or the lens", now_s, at_once=True)
-        else:
+        elif evidence.explanation.confirmed:
             alerts += book.absent(GRIPPER, "fingers, jaw and lens are as they should be", now_s)
         return alerts
 
@@ -354,10 +354,10 @@ class Policy:
         parts = [motion_text(motion, evidence.since_first), creep_text(rate, left_s), explanation.text]
         return Alert(
             kind=motion.kind,
-            cause=explanation.probable.cause,
+            cause=explanation.confirmed_cause.cause,
             severity=_severity(past_warning, past_limit, self.alerts.about(MOTION)),
             text="; ".join(part for part in parts if part),
-            part=explanation.probable.part,
+            part=explanation.confirmed_cause.part,
             causes=explanation.causes,
             tcp_shift_m=(x, y, z),
             rotation_rad=turn_rad,

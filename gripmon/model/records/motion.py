@@ -65,8 +65,17 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Possible causes of an observation: all that were weighed, the ``probable`` one, and a sentence about it."""
+    """Possible causes of an observation: all that were weighed, the ``probable`` one, and a sentence about it.
+
+    One that isn't ``confirmed`` yet makes a transform doubtful; an alert doesn't name it.
+    """
 
     causes: tuple[CauseWeight, ...] = ()
     probable: CauseWeight = UNEXPLAINED
     text: str = ""
+    confirmed: bool = True
+
+    @property
+    def confirmed_cause(self) -> CauseWeight:
+        """The probable cause if it is confirmed, else that it is unknown."""
+        return self.probable if self.confirmed else UNEXPLAINED
