@@ -21,27 +21,27 @@ Key = tuple[Cause | None, int | None]
 """A cause and the finger that it is about; None for the cause: nothing moved."""
 
 FOLLOWED = (Cause.CAMERA_MOUNT, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
-"""Causes by which the whole gripper shows elsewhere, however far."""
+"""Causes that move the whole gripper in the image, however far; fits of them start at the measured pose."""
 
 BASELINE_ERROR_SHARE = 0.1
-"""Part of what a whole edge is off by that is left when it is compared with itself before."""
+"""Share of a whole edge's error that remains after the baseline is subtracted."""
 
 EDGE_SIGMA_PX = 0.02
-"""What a whole edge is off by at least."""
+"""Smallest standard deviation of a whole edge's error, px."""
 
 MODEL_M = 3e-5
-"""How exactly a gripper's file says where its edges lie, which counts as long as there is no baseline."""
+"""Standard deviation of the edges' places in a gripper file, m; it counts while there is no baseline."""
 
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
 SETTLED_JAW_M = float(SETTLED_SIGMA[0])
-"""Of the pose (m and rad) and the opening that a baseline knows."""
+"""Standard deviations of the pose (m and rad) and the opening (m) that a baseline knows."""
 
 LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
-"""Scatter of the blur while the lens stays as it is, and how far it goes when it doesn't."""
+"""Standard deviation of the blur while the lens is unchanged, and the range of its changes otherwise, px."""
 
 LOWEST_BLUR_LOG_RATIO = -40.0
-"""Log likelihood ratio that a change of the blur is worth at most."""
+"""Lower limit of the log likelihood ratio of a change of the blur."""
 
 ABSENT_PROBABILITY = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 """How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
@@ -49,12 +49,12 @@ several things happened; with every other cause it is a ``STRAY_PROBABILITY``.""
 STRAY_PROBABILITY = 0.02
 
 BLOCKED_VIEW_PROBABILITY = 0.15
-"""Probability of a blocked view beforehand, where a finger isn't seen."""
+"""Prior probability of a blocked view where a finger isn't seen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What is told of the reported opening beforehand, m: the part of its error that changes, and that doesn't."""
+    """Standard deviations of a reported opening's error, m: of the part that changes as the jaw moves, and the rest."""
 
     sigma_m: float
     offset_sigma_m: float
@@ -62,8 +62,8 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """``log`` evidence of each model with its prior, how each fits, and by how much the blur has changed; None where it
-    can't be told.
+    """``log``: evidence times prior of each model, as a logarithm; ``fits``: its fit; ``blur_change_px``: None where
+    the blur isn't known.
     """
 
     log: Mapping[Key, float]
@@ -138,7 +138,7 @@ def compare(
 def _knowledge(
     jaw_reported_m: float | None, reference_sigma: Array, report: Report, baseline: Baseline | None
 ) -> Knowledge:
-    """What holds as long as nothing has moved."""
+    """What is known while nothing has moved."""
     exact = report.sigma_m == 0.0
     if jaw_reported_m is None:
         pose = reference_sigma if baseline is None else SETTLED_SIGMA
@@ -155,8 +155,8 @@ def _knowledge(
 
 
 def _shared_px(residual_px: Array, sigma_px: Array) -> float:
-    """Scale that comes on top of that assumed: from the middle size of what the freest model leaves, which takes about
-    half of the scatter upon itself.
+    """Standard deviation to add to the assumed one: from the median residual of the freest model, which itself absorbs
+    about half of the scatter.
     """
     excess = float(np.median(residual_px**2 / sigma_px**2)) / (0.6745**2 * 0.5) - 1.0
     return math.sqrt(max(excess, 0.0) * float(np.median(sigma_px**2)))
@@ -169,7 +169,7 @@ def _blur_change_px(pooled: Pooled, baseline: Baseline | None) -> float | None:
 
 
 def _blur_log_likelihood(change_px: float, *, may: bool) -> float:
-    """Of a change of the blur where the lens stays as it is, or may have changed."""
+    """Log likelihood of a change of the blur with an unchanged lens, or one that ``may`` have changed."""
     stays = -0.5 * (change_px / BLUR_SIGMA_PX) ** 2
     if not may:
         return max(stays, LOWEST_BLUR_LOG_RATIO)

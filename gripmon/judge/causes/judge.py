@@ -1,6 +1,6 @@
-"""Which single cause explains what the fingers' edges show, with probabilities, and an honest ``unknown``.
+"""The single cause that explains where the fingers' edges are seen, with probabilities; ``unknown`` if none does.
 
-In words it says how far which part moved, and which causes a single camera can't distinguish.
+Its text says which part moved how far, and which causes a single camera can't distinguish.
 """
 
 from __future__ import annotations
@@ -19,35 +19,45 @@ from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, Weighed
 from gripmon.judge.causes.pooling import Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
-from gripmon.judge.causes.watches import LEARNT
+from gripmon.judge.causes.watches import BASELINE_FRAMES
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause, CauseWeight, EdgeEvidence, Explanation
 from gripmon.track.edges.evidence import FINGER_SEEN_SHARE
 
 FEWEST_PIECES = 4
-"""Pieces of edges without which nothing is told about motions."""
+"""Pieces of edges below which no motions are compared."""
 
 SCATTERED_PX = 0.4
-"""Standard deviation of most pieces' places beyond which they are not believed: they usually have 0.03 to 0.3."""
+"""Median standard deviation of the pieces' places above which no cause is named, px; usual are 0.03 to 0.3."""
 
-SETTLED = 6
-"""Frames in which all was well with which a first baseline is made, if it is asked for before :data:`LEARNT`."""
+FEWEST_BASELINE_FRAMES = 6
+"""Frames in which all was well that suffice for a baseline while there aren't :data:`BASELINE_FRAMES` yet."""
 
 CONTRADICTION_LOG_EVIDENCE = 8.0
-"""Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
+"""Log Bayes factor of a cause against "nothing moved" above which frames are no baseline."""
 
 BLIND_CAUSES = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
-"""Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
-BAD_IMAGE_CAUSES = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
-"""And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
-MUCH_NOISE, LEAST_NOISE, DARK, BRIGHT = 4.0, 0.02, 0.08, 0.95
+"""Probabilities where the search finds no finger in an image with the usual noise."""
 
-FLATTENED = 0.5
-STEADY, ALIKE, MOSTLY = 0.02, 0.05, 0.7
-"""Part of the usual steepness to which the steepest edges of an image must have sunk for its focus to be in doubt; and
-by how much its cells may have wandered before, and may differ now, parts of the full scale, so that so many of those
-that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
+BAD_IMAGE_CAUSES = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
+"""The same in an image that is dark, or too noisy."""
+
+MAX_NOISE_RATIO, MAX_NOISE = 4.0, 0.02
+"""Noise, over the usual one and as a fraction of full scale, that hides edges where it exceeds both."""
+
+DARK_LEVEL, BRIGHT_LEVEL = 0.08, 0.95
+"""Levels, fractions of full scale: an image is dark if its brightest pixels are below the first, too bright if its
+darkest cell is above the second.
+"""
+
+UNSHARP_RATIO = 0.5
+"""Steepest grey-level slope, over the usual one, below which an image may be out of focus."""
+
+STEADY_CELL_RANGE, SAME_CELL_DIFFERENCE, SAME_CELLS_SHARE = 0.02, 0.05, 0.7
+"""A blur keeps the mean grey levels of an image's cells; a thing before the lens doesn't.  Of the cells that varied by
+less than the first while all was well, the share in the third must differ from then by less than the second; both
+fractions of full scale.
 """
 
 TO_CONFIRM = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
@@ -67,8 +77,8 @@ class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class CauseJudge:
     """Compares models of what moved on the same pieces of edges, over some frames.
 
-    Frames from a time when all is well (:meth:`well`) let it tell much smaller changes.  A pure function of what it was
-    shown.  Frames cost nothing; an explanation takes some milliseconds.
+    Frames in which all is well (:meth:`well`) let it detect much smaller changes.  Deterministic: it depends on the
+    frames alone.  Adding one costs nothing; an explanation takes 20 to 50 ms.
     """
 
     def __init__(
@@ -89,7 +99,7 @@ class CauseJudge:
         self.rebase(reference_sigma)
 
     def rebase(self, reference_sigma: Array) -> None:
-        """There is a new reference (``reference_sigma`` as above): evidence and baseline are forgotten."""
+        """Start again with a new reference (``reference_sigma`` as above): evidence and baseline are dropped."""
         self._reference_sigma = reference_sigma
         self._well: list[EdgeEvidence] = []
         self._baseline: Baseline | None = None
@@ -97,42 +107,42 @@ class CauseJudge:
         self.reset()
 
     def reset(self) -> None:
-        """All is well again: evidence is forgotten."""
+        """All is well again: drop the evidence."""
         self._frames.clear()
         self._interrupted = False
         self._named: tuple[Cause, str | None] | None = None  # by the last conclusion
 
     def interrupted(self) -> None:
-        """No frames came for long, before those that are added next: someone may have exchanged the camera."""
+        """No frames came for a long time before those added next: the camera may have been exchanged."""
         self._interrupted = True
 
     @property
     def wants_baseline(self) -> bool:
-        """Whether frames in which all is well still teach anything."""
-        return self._learning and len(self._well) < LEARNT
+        """Whether frames in which all is well still improve the baseline."""
+        return self._learning and len(self._well) < BASELINE_FRAMES
 
     def well(self, evidence: EdgeEvidence) -> None:
-        """A frame in which all seems well."""
+        """Add a frame in which all seems well."""
         if self.wants_baseline:
             self._well.append(evidence)
             self._baseline = None
 
     def knocked(self) -> None:
-        """The camera is elsewhere from now on: frames from before and after a knock are no baseline together.  Those
-        from before stay one if they suffice.
+        """The camera is elsewhere from now on: frames from before and after a knock make no baseline together.  Those
+        from before are kept if they suffice.
         """
-        if len(self._well) < SETTLED:
+        if len(self._well) < FEWEST_BASELINE_FRAMES:
             self._well = []
         else:
             self._learning = False
 
     def add(self, evidence: EdgeEvidence) -> None:
-        """A frame in which something may be wrong, measured or not."""
+        """Add a frame in which something may be wrong, measured or not."""
         self._frames.append(evidence)
 
     def explanation(self, ref_cam_T_grip: Array) -> Explanation:
-        """What the frames since the last reset say together about what moved since ``ref_cam_T_grip`` (4, 4);
-        confirmed if the conclusion before named the same cause, or the cause needs no confirmation.
+        """What has moved since ``ref_cam_T_grip`` (4, 4), by all frames since the last reset; confirmed if the
+        conclusion before named the same cause, or the cause needs no confirmation.
         """
         found = self._concluded(ref_cam_T_grip)
         named, before = (found.probable.cause, found.probable.part), self._named
@@ -157,8 +167,9 @@ class CauseJudge:
         if blind and baseline is not None and _unsharp(pooled, baseline):
             text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
             return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
-        if blind and pooled.cells.min() > BRIGHT:
-            text = f"no part of the image is below {100.0 * BRIGHT:.0f} % of the full scale: too much light, or hidden"
+        if blind and pooled.cells.min() > BRIGHT_LEVEL:
+            level = f"{100.0 * BRIGHT_LEVEL:.0f} % of the full scale"
+            text = f"no part of the image is below {level}: too much light, or hidden"
             return self._told({Cause.IMAGE_BAD: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind:
             return self._told(
@@ -193,12 +204,12 @@ class CauseJudge:
         )
 
     def _learnt(self, ref_cam_T_grip: Array) -> Baseline | None:
-        """The baseline of the frames in which all was well; None with too few.
+        """The baseline from the frames in which all was well; None with too few.
 
-        Frames that contradict the gripper's model within what is known of reference and jaw teach nothing: a finger
-        that is bent from the start must not pass for normal.
+        Frames that contradict the gripper's model, given what is known of reference and jaw, are no baseline: a finger
+        that was bent from the start must not pass for normal.
         """
-        if self._baseline is not None or len(self._well) < SETTLED:
+        if self._baseline is not None or len(self._well) < FEWEST_BASELINE_FRAMES:
             return self._baseline
         pooled = pool(self._well, self._camera, self._gripper)
         if len(pooled.piece) < FEWEST_PIECES or pooled.absent:
@@ -212,32 +223,32 @@ class CauseJudge:
         return self._baseline
 
     def _told(self, shares: Mapping[Cause, float], text: str) -> Explanation:
-        """Where no models were compared."""
+        """An explanation without a comparison of models."""
         return _explained({(c, None): p for c, p in shares.items()}, self._gripper, self._settings.probable, text)
 
 
 def _spoilt(pooled: Pooled, baseline: Baseline | None) -> str | None:
-    """By what the image hides the gripper's edges; None if by nothing."""
-    if pooled.brightest < DARK:
+    """What about the image hides the gripper's edges, in words; None if nothing does."""
+    if pooled.brightest < DARK_LEVEL:
         return f"the image is dark: hardly a pixel above {100.0 * pooled.brightest:.0f} % of the full scale"
-    if pooled.noise > max(MUCH_NOISE * (0.0 if baseline is None else baseline.noise), LEAST_NOISE):
+    if pooled.noise > max(MAX_NOISE_RATIO * (0.0 if baseline is None else baseline.noise), MAX_NOISE):
         return f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
     return None
 
 
 def _unsharp(pooled: Pooled, baseline: Baseline) -> bool:
-    """Whether the image shows what it did, without its edges."""
-    steady = baseline.wander < STEADY
-    if not steady.any() or pooled.steepest >= FLATTENED * baseline.steepest:
+    """Whether the image has kept its grey levels and lost its sharp edges."""
+    steady = baseline.wander < STEADY_CELL_RANGE
+    if not steady.any() or pooled.steepest >= UNSHARP_RATIO * baseline.steepest:
         return False
-    return bool((np.abs(pooled.cells - baseline.cells)[steady] < ALIKE).mean() >= MOSTLY)
+    return bool((np.abs(pooled.cells - baseline.cells)[steady] < SAME_CELL_DIFFERENCE).mean() >= SAME_CELLS_SHARE)
 
 
 def _ill_founded(key: Key, pooled: Pooled) -> bool:
-    """Whether a cause is told from fingers that most of their own profiles contradict.
+    """Whether a cause rests on fingers that most of their own search lines contradict.
 
-    A finger that isn't seen at all is weighed as such.  Of an opening and of the lens two fingers have to tell: what
-    one does may as well be its own.
+    A finger that isn't seen at all is weighed as such.  An opening or a lens needs two well-seen fingers: what one
+    shows may as well be its own motion.
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
@@ -247,13 +258,13 @@ def _ill_founded(key: Key, pooled: Pooled) -> bool:
 
 
 def _of_few_edges(key: Key, comparison: Comparison) -> bool:
-    """Whether a cause says where the edges stand, but most of them don't."""
+    """Whether a cause predicts where edges are seen, but doesn't explain most of them."""
     says_where = key[0] not in (Cause.UNKNOWN, Cause.VIEW_BLOCKED)
     return says_where and bool((comparison.fits[key].own > 0.5).mean() <= 1.0 - MOST_FOREIGN_EDGES)
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:
-    """``shares``: probabilities of the models; that nothing moved counts as unknown."""
+    """An explanation from the models' probabilities ``shares``; that nothing moved counts as unknown."""
     weights: dict[tuple[Cause, int | None], float] = {}
     for (cause, part), share in shares.items():
         named = (Cause.UNKNOWN if cause is None else cause, part)
@@ -270,7 +281,7 @@ def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, t
 def sentence(
     shares: Mapping[Key, float], comparison: Comparison, absent: Sequence[int], probable: float, gripper: Gripper
 ) -> str:
-    """One sentence for the alert; ``shares``: probability of each model."""
+    """One sentence for the alert; ``shares``: the models' probabilities."""
     ranked = sorted(shares, key=lambda key: -shares[key])
     best = ranked[0]
     names = gripper.finger_ids

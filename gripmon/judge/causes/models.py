@@ -2,12 +2,12 @@
 
 Every model has the same unknowns; what it doesn't free is held by what is known (the calibration's error, the error of
 the reported opening), and what it frees has a normal prior of a size that is itself unknown: an average over sizes
-from the smallest worth telling to the largest believed.  A model with more freedom spreads its prior over more that
+from the smallest worth reporting to the largest plausible.  A model with more freedom spreads its prior over more that
 could have been seen, and so pays for what it doesn't need (MacKay 1992, "Bayesian interpolation").
 
 Pieces of edges, and whole edges, err with Student's distribution (Lange, Little and Taylor 1989), and an edge may as
-well belong to something else, a border anywhere within the profiles' reach: one that was mistaken costs every model the
-same, and must not be worth a motion that bends itself around it.
+well belong to something else, a border anywhere within the search lines' reach: a mistaken edge costs every model the
+same, so that no motion is fitted to it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gripmon.model.records import Array, Cause
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M
 
 SMALLEST_M = 5e-5
-"""The smallest motion that is worth telling."""
+"""The smallest motion worth reporting, m."""
 
 MOUNT_SIZES_M = np.geomspace(SMALLEST_M, 1e-2, 8)
 PART_SIZES_M = np.geomspace(SMALLEST_M, 3e-3, 6)
@@ -33,15 +33,15 @@ FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 """How far things move when they move: shift of the TCP; of a finger or the opening; relative focal length."""
 
 _MOUNT, _FINGER, _JAW, _RARE = 0.3, 0.25, 0.15, 0.1
-"""Probabilities beforehand, given that something looks wrong: of a mount that moved, or another camera after a pause;
-of a bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
+"""Prior probabilities, given that something looks wrong: of a mount that moved, or another camera after a pause; of a
+bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
 """
 
 
 MOST_FOREIGN_EDGES = 0.5
-"""Share of the seen edges that may belong to something else; a cause must explain the others to be named.  How many do
-is unknown beforehand, any share up to this one equally probable: a thing that is grasped has borders beside several
-edges at once, so that edges aren't mistaken independently of each other.
+"""Share of the seen edges that may belong to something else; a cause must explain the others to be named.  The
+prior of their share is uniform up to this: a grasped thing has borders beside several edges at once, so that edges
+aren't mistaken independently of each other.
 """
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # exact up to 23 edges
@@ -64,7 +64,7 @@ class Knowledge:
 @dataclass(frozen=True, slots=True)
 class Suspect:
     """One model: the cause that it stands for (``None``: nothing moved; ``UNKNOWN``: several things at once), the
-    finger that it is about, its probability before anything is seen.
+    finger that it is about, and its prior probability.
     """
 
     cause: Cause | None
@@ -258,7 +258,7 @@ class _Problem:
         return Weighed(evidence, point.state, point.motion, point.residual, own)
 
     def point(self, state: State, off_px: Array | None = None) -> _Point:
-        """No edge is off, unless told."""
+        """At a state, with all edges' offsets zero unless given."""
         residual, jacobian = self._view.residual(state)
         design = np.hstack([jacobian[:, self._free], self._belongs])
         off_px = np.zeros(self._errors.edges) if off_px is None else off_px

@@ -1,8 +1,8 @@
 """Evidence of several frames combined: the median place of each piece of an edge, robust against single mistakes.
 
-The baseline is how the edges show while all is well: it holds the calibration's error and what the gripper model
-leaves out.  Like is compared with like: a bevel, a shade or a reference that is off by a tenth of a millimetre shifts
-the edges before and after alike.
+The baseline is where the edges are seen while all is well.  It contains the calibration's error and what the gripper
+model leaves out: a bevel, shading or a reference that is off by a tenth of a millimetre shifts the edges before and
+after alike.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ TEXTURE_SIGMA_SHARE = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
 
 FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
-"""Stretches of a finger, edges that they lie on, and share of its profiles, with which it counts as seen in a frame."""
+"""Stretches of a finger, edges that they lie on, and inlier ratio of its search lines from which it counts as seen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
-    edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
-    finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where it
-    can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
+    """``evidence`` at the pose of the central frame (see :func:`pool`), with a stretch for each piece ``piece`` (s,) of
+    an edge; ``absent``: fingers in view that are not seen; ``share`` (f,): inlier ratio of each finger's search lines
+    at the finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where
+    it isn't known; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
     of the cells from frame to frame; ``frames`` that it was made of.
     """
 
@@ -60,10 +60,9 @@ def piece_of(edge: NDArray[np.intp], fraction: Array) -> NDArray[np.intp]:
 
 
 def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Pooled:
-    """One or more frames as one, at the place of the one in their midst; motion between them that comes and goes
-    averages out.
+    """One or more frames as one, at the pose of the central one; vibration between them averages out.
 
-    Not at the newest's: a frame in which too little agreed may have the gripper anywhere.
+    Not at the newest's pose: a frame in which too little agreed may have the gripper anywhere.
     """
     midst = frames[_midst(frames, gripper)]
     base = _state(midst, midst, gripper)
@@ -162,7 +161,7 @@ def isotropic_blur_px2(evidence: EdgeEvidence) -> float | None:
 
 
 def _midst(frames: Sequence[EdgeEvidence], gripper: Gripper) -> int:
-    """Number of the frame that has the gripper nearest to where all of them have it; of equals the newest."""
+    """Number of the frame whose pose is nearest to those of all frames; of equals the newest."""
     points = gripper.points_grip_m(None)
     places = np.array([points @ frame.cam_T_grip[:3, :3].T + frame.cam_T_grip[:3, 3] for frame in frames])
     away_m = [float(np.linalg.norm(places - own, axis=2).mean(axis=1).sum()) for own in places]
@@ -179,7 +178,7 @@ def _state(frame: EdgeEvidence, base: EdgeEvidence, gripper: Gripper) -> State:
 
 
 def _without(evidence: EdgeEvidence, fingers: tuple[int, ...], gripper: Gripper) -> EdgeEvidence:
-    """Less what was taken for fingers that are not there."""
+    """Without the stretches of fingers that are not seen."""
     return _only(evidence, ~np.isin(gripper.edge_finger[evidence.edge], fingers)) if fingers else evidence
 
 

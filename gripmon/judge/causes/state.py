@@ -1,4 +1,4 @@
-"""Where everything stands that may have moved, and where the edges' stretches should show then.
+"""The state of everything that may have moved, and where the edges' stretches are predicted for it.
 
 The unknowns are one vector for all models: the camera's pose (6), the jaw opening (1), the logarithm of the focal
 length (1), and six for each finger.  A model of what moved frees some of them.
@@ -178,7 +178,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _across(a: Array, b: Array) -> Array:
-    """(s, 2) across the images of edges from a to b, ideal coordinates: as the normal of a profile points."""
+    """(s, 2) across the images of edges from a to b, ideal coordinates, along the search lines' direction."""
     along = b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:]
     along /= np.sqrt(np.einsum("si,si->s", along, along))[:, None]
     return np.column_stack([-along[:, 1], along[:, 0]])

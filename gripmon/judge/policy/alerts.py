@@ -16,7 +16,7 @@ RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 
 @dataclass(frozen=True, slots=True)
 class _Open:
-    """What was said last, when (seconds of the frames' time), and since when the condition has been absent."""
+    """The alert as last published, when (seconds of the frames' time), and since when its condition has been absent."""
 
     alert: Alert
     said_s: float
@@ -26,7 +26,7 @@ class _Open:
 class AlertBook:
     """The open alerts, one for each topic at a time.
 
-    A pure function of what it is told: time is passed in, as seconds of the frames.
+    Deterministic: time is passed in, as seconds of the frames.
     """
 
     def __init__(self, update_s: float, clear_s: float):
@@ -54,7 +54,7 @@ class AlertBook:
         return self._raised
 
     def restore(self, alerts: tuple[OpenAlert, ...], raised: int, now_s: float) -> None:
-        """Go on after a restart: what was open still is, and keeps its id."""
+        """Go on after a restart: open alerts stay open and keep their ids."""
         self._raised = raised
         self._open = {each.topic: _Open(each.alert, now_s) for each in alerts}
 
@@ -66,7 +66,7 @@ class AlertBook:
     def present(
         self, topic: str, alert: Alert, now_s: float, stamp_ns: int, *, news: bool = False
     ) -> tuple[Alert, ...]:
-        """The condition holds, as ``alert`` says now; what there is to tell: one event or none.
+        """The condition holds, as ``alert`` says now; returns the events to publish: one or none.
 
         ``news``: the text alone says something new to a person; else only another cause, severity or size does.
         """

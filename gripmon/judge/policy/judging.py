@@ -55,7 +55,7 @@ VIBRATION_SIGMAS = 3.0
 """Standard deviations of a vibrating camera's way that are no drift."""
 
 RELEASE_RATIO = 0.8
-"""Part of a limit below which what was said to be past it no longer is."""
+"""Part of a limit below which an alert that is past it no longer is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Evidence:
     ``where_it_was``: the gripper is where it proved to be before, so that no second frame has to say so.
     ``swing`` (6,): variance of the way between one proven pose and the next, m² and rad²; None where that isn't known.
     ``believed``: the gripper may be taken to be there.
-    ``since_first``: ``motion`` is reckoned from where the first frames had the camera, which the reference allows, not
+    ``since_first``: ``motion`` counts from where the first frames had the camera, which the reference allows, not
     from the reference.  ``unproven``: nothing in the frame proves where the gripper is, though a frame before did.
     """
 
@@ -238,7 +238,7 @@ class Policy:
         return explanation.confirmed_cause.cause if explanation.text else Cause.IMAGE_BAD
 
     def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
-        """The reference was replaced: drift is reckoned from zero, and what was said of it is over."""
+        """The reference was replaced: drift counts from zero, and its alerts are cleared."""
         self._still = 0
         over = self.alerts.absent(MOTION, "there is a new reference", now_s, at_once=True)
         return over + self.decided("there is a new reference", now_s)
@@ -266,7 +266,7 @@ class Policy:
         alert = Alert(kind, probable.cause, severity, text, part=probable.part, causes=explanation.causes)
         over: tuple[Alert, ...] = ()
         if before is not None and (before.kind is not kind or (kind is AlertKind.PROPOSED and before.text != text)):
-            # It is said once only: no update that may be too soon, or of something that was acknowledged.
+            # A new alert, not an update, which may be too soon or of something that was acknowledged.
             over = self.decided("overtaken by what follows", now_s)
         return over + self.alerts.present(RENEWAL, alert, now_s, stamp_ns)
 
@@ -314,7 +314,7 @@ class Policy:
         else:
             alerts = book.absent(VIEW, "the gripper is measured again", now_s)
         alerts += book.absent(IMAGE, "images are good again", now_s)
-        # What lies in the gripper or the lens is told once, as that.
+        # A fault of the gripper or the lens has one alert, about that.
         if moved and (not not_the_camera or book.about(MOTION) is not None):
             alerts += book.present(MOTION, self._motion_alert(evidence), now_s, stamp_ns)
         else:
@@ -335,7 +335,7 @@ class Policy:
         if not_the_camera:
             alerts += book.present(GRIPPER, _gripper_alert(evidence.explanation), now_s, stamp_ns)
         elif probable.cause is Cause.CAMERA_MOUNT:
-            # The same edges explained better: what was said before they were seen well was wrong.
+            # The same edges, seen better: the alert about the gripper was wrong.
             alerts += book.absent(GRIPPER, "the camera moved, not the gripper or the lens", now_s, at_once=True)
         elif evidence.explanation.confirmed:
             alerts += book.absent(GRIPPER, "fingers, jaw and lens are as they should be", now_s)
@@ -391,8 +391,8 @@ def past_alert_limit(protection: Protection | None, settings: PolicySettings) ->
 
 
 def _severity(past_warning: float, past_limit: float, before: Alert | None) -> Severity:
-    """Of what is so many times as large as is worth a warning, and as the limit; what is open (``before``) stays as
-    severe until it is clearly less: at a limit's edge noise would be told again and again.
+    """Severity of a size, given over the warning's threshold and over the limit.  An open alert (``before``) keeps its
+    severity until the size is clearly less: near a threshold noise would change it again and again.
     """
     said = None if before is None else before.severity
     if past_limit >= (RELEASE_RATIO if said is Severity.ERROR else 1.0):

@@ -1,4 +1,4 @@
-"""What alerts say of a motion, a vibration, and a gripper whose place nothing proves."""
+"""Texts of alerts about a motion, a vibration, and a gripper whose place nothing proves."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def frequency_text(hertz: float) -> str:
 
 
 def unproven_text(since_ns: int) -> str:
-    """Of a place that nothing has proven since a time, Unix ns.  An image doesn't tell which of the two it is."""
+    """Text about a place that nothing has proven since a time, Unix ns.  An image can't distinguish the two causes."""
     since = f"{datetime.fromtimestamp(since_ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M:%S} UTC"
     return (
         f"the fingers' ends have not been seen where they should be since {since}: something hides them, or the camera "
