@@ -11,15 +11,16 @@ from scipy.integrate import dblquad, quad
 from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
-from support.shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, two_fingers
+from support.shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, beside, ill_seen, knocked, two_fingers
 from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
+from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, STUDENT_FREEDOM, Errors, Model, something_else, weigh
 from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
-from gripmon.model.records import Cause
+from gripmon.model.records import Cause, EdgeEvidence
 
 ALL_OF_LEFT = ("L_tip_in", "L_tip_near", "L_in_far_along", "L_out_near_along")
 """The left finger's edges that the view shows."""
@@ -172,6 +173,27 @@ def test_a_finger_of_which_two_edges_stay_is_not_bent(off_px: float):
     for _ in range(FRAMES):
         judge.add(beside(shown, shown.evidence(), ("L_tip_in", "L_in_far_along"), off_px))
     assert judge.explanation(shown.reference).probable.cause is not Cause.FINGER_BENT
+
+
+@pytest.mark.parametrize(("moved", "named"), [(("L_tip_near",), False), (("L_tip_in", "L_tip_near"), True)])
+def test_one_edge_alone_does_not_tell_a_bent_finger_from_a_border(moved: tuple[str, ...], named: bool):
+    """Of the left finger nothing but the two edges of its end is seen."""
+    shown = Shown(sharp_gripper())
+    seen = [number for number, name in enumerate(shown.gripper.edge_ids) if name not in ALL_OF_LEFT[2:]]
+
+    def end_only(evidence: EdgeEvidence) -> EdgeEvidence:
+        own = np.isin(evidence.edge, seen)
+        per_stretch = ("edge", "fraction", "xy", "per_px", "sigma_px", "spread_px", "blur_px2", "across")
+        return dataclasses.replace(evidence, **{name: getattr(evidence, name)[own] for name in per_stretch})
+
+    judge = CauseJudge(shown.camera, shown.gripper, CauseSettings(), REFERENCE_SIGMA, 0.0, 0.0)
+    for _ in range(FRAMES):
+        judge.well(end_only(shown.evidence()))
+    for _ in range(FRAMES):
+        judge.add(end_only(beside(shown, shown.evidence(), moved, 0.3)))
+    explanation = judge.explanation(shown.reference)
+    assert (explanation.probable.cause is Cause.FINGER_BENT) == named
+    assert ("what is seen would fit if finger left is bent" in explanation.text) != named
 
 
 def test_how_many_edges_belong_to_something_else_is_averaged_over():

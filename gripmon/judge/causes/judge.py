@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, Weighed
-from gripmon.judge.causes.pooling import Baseline, Pooled, pool
+from gripmon.judge.causes.pooling import FEWEST_EDGES, Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.judge.causes.watches import BASELINE_FRAMES
 from gripmon.model.camera import Camera
@@ -184,7 +184,7 @@ class CauseJudge:
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
         best = max(shares, key=lambda key: shares[key])
-        of_few_edges = _of_few_edges(best, comparison)
+        of_few_edges = _of_few_edges(best, comparison) or _of_one_edge(best, comparison)
         for key in [key for key in shares if _ill_founded(key, pooled) or (of_few_edges and key == best)]:
             if shares[key] >= self._settings.probable:
                 text = f"too little of the fingers is seen to tell what moved; what is seen would fit if {text}"
@@ -261,6 +261,12 @@ def _of_few_edges(key: Key, comparison: Comparison) -> bool:
     """Whether a cause predicts where edges are seen, but doesn't explain most of them."""
     says_where = key[0] not in (Cause.UNKNOWN, Cause.VIEW_BLOCKED)
     return says_where and bool((comparison.fits[key].own > 0.5).mean() <= 1.0 - MOST_FOREIGN_EDGES)
+
+
+def _of_one_edge(key: Key, comparison: Comparison) -> bool:
+    """Whether a finger seems bent because of a single edge: a border of something else beside it shows the same."""
+    moved = (comparison.fits[key].own > 0.5) & (comparison.fits[None, None].own <= 0.5)
+    return key[0] is Cause.FINGER_BENT and int(moved.sum()) < FEWEST_EDGES
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:
