@@ -9,6 +9,8 @@ parallel to the fingers stays the same line when the gripper is slid along them:
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,6 +37,12 @@ STRIP_LINES = 3
 SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
 """A tenth of a millimetre must do no harm, and light that falls off along the finger says nothing."""
 
+FILTERED_PX = SLOPE_PX // 2 + 1
+"""Beside a strip that what is smooth and what changes slowly on it are taken from."""
+
+NODE_PX = 16
+"""Between points of a strip that are projected: lenses bend a line by less than a hundredth of a pixel between them."""
+
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
@@ -59,9 +67,8 @@ class FingerStrips:
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.frames = 0
         self._learnt_s = -math.inf
-        self._laid_out_at_m: float | None = None
         self._nothing = False
-        self._points_grip_m: Array = np.zeros((0, 0, 3))
+        self._start_grip_m: Array = np.zeros((0, 3))
 
     @property
     def ready(self) -> bool:
@@ -77,15 +84,17 @@ class FingerStrips:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s."""
         if self.frames >= FEWEST_FRAMES and now_s - self._learnt_s < RELEARN_S:
             return
-        if not len(self._points_grip_m):
+        if not len(self._start_grip_m):
             self._lay_out(cam_T_grip, jaw_opening_m)
-        self._nothing = not len(self._points_grip_m)
+        self._nothing = not len(self._start_grip_m)
         if self._nothing:
             return
         strips = self._read(image, cam_T_grip, jaw_opening_m)
         self.frames += 1
         self._learnt_s = now_s
         self._mean += (strips - self._mean) * self._within / min(self.frames, MOST_FRAMES)
+        self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
+        self._learnt = np.clip(self._mean, -self._most, self._most)
 
     def slide_m(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> Array | None:
         """By how much (3,), gripper frame, the gripper stands along its fingers from a pose (4, 4); None where the
@@ -93,25 +102,26 @@ class FingerStrips:
         """
         if not self.ready:
             return None
-        most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
-        learnt = np.clip(self._mean, -most, most)
+        most, learnt = self._most, self._learnt
         own = float(np.square(learnt).sum())
-        # Gain and brightness are free: light changes.  Usually they are seen where they are, and no slide is better.
+        # Gain and brightness are free: light changes.
         there = np.clip(self._read(image, cam_T_grip, jaw_opening_m), -most, most) * self._within
-        if float((there * learnt).sum()) > EXPLAINED_CORRELATION * math.sqrt(float(np.square(there).sum()) * own):
-            return None
+        alike_here = float((there * learnt).sum()) / math.sqrt(float(np.square(there).sum()) * own + 1e-12)
+        independent = float(self._within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
+        # By how much more of the variance a slide has to explain.
+        beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
+        if beyond_chance * _unexplained(EXPLAINED_CORRELATION) >= _unexplained(alike_here):
+            return None  # Usually: no slide could be so much better.
         strips = np.clip(self._read(image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
         energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
         alike = product / np.sqrt(np.maximum(energy, least) * own + 1e-12)
-        unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED_CORRELATION))
+        unexplained = _unexplained(alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - SMALLEST_SLIDE_PX : REACH_PX + SMALLEST_SLIDE_PX + 1] = 1.0
         best = int(np.argmin(unexplained))
-        independent = float(self._within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
-        odds = 0.5 * independent * math.log(here / float(unexplained[best]))
-        if odds <= math.log(len(unexplained) / risk):
+        if here <= beyond_chance * float(unexplained[best]):
             return None
         return (best - REACH_PX) * self._step_grip_m
 
@@ -119,23 +129,21 @@ class FingerStrips:
         self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
     ) -> NDArray[np.float32]:
         """(n, LENGTH_PX + 2 beyond) grey levels along the strips, without their slow changes."""
-        margin = SLOPE_PX // 2 + 1  # what the filters below take in
-        first, last = REACH_PX - beyond, REACH_PX + LENGTH_PX + 2 * margin + beyond
-        points_grip_m = self._points_grip_m[:, first:last]
+        width = LENGTH_PX + 2 * (FILTERED_PX + beyond)
+        node, share = _nodes(width)
+        along = (node - FILTERED_PX - beyond)[:, None] * self._step_of_each_m[:, None]
         now = self._gripper.points_grip_m(jaw_opening_m)
-        then = self._gripper.points_grip_m(self._laid_out_at_m)
-        moved = (now[self._first] - then[self._first])[self._finger]
-        points = (points_grip_m + moved[:, None]).reshape(-1, 3)
+        moved = (now[self._first] - self._laid_out_m)[self._finger]
+        points = (self._start_grip_m[:, None] + moved[:, None] + along).reshape(-1, 3)
         uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         # A point outside the lens is NaN; OpenCV needs a number for it.
-        shape = points_grip_m.shape[:2]
-        u, v = (c.reshape(shape) for c in np.nan_to_num(uv_px, nan=-1.0).astype(np.float32).T)
+        u, v = (c.reshape(-1, len(node)).astype(np.float32) @ share for c in np.nan_to_num(uv_px, nan=-1.0).T)
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         if values.ndim == 3:
             values = values @ GREY_BGR
         smooth = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
         fast = smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(fast[:, margin:-margin], dtype=np.float32)
+        return np.asarray(fast[:, FILTERED_PX:-FILTERED_PX], dtype=np.float32)
 
     def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
         start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
@@ -152,14 +160,12 @@ class FingerStrips:
         long_enough = length_m >= SHORTEST_PX * pitch_m
         if not long_enough.any():
             return
-        around = REACH_PX + SLOPE_PX // 2 + 1
-        reach = np.arange(-around, LENGTH_PX + around) * pitch_m
-        within = reach[around : around + LENGTH_PX] < length_m[long_enough, None]
-        self._step_grip_m = pitch_m * way[long_enough].mean(axis=0)
-        self._points_grip_m = start[long_enough, None] + reach[:, None] * way[long_enough, None]
+        within = np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]
+        self._step_of_each_m, self._start_grip_m = pitch_m * way[long_enough], start[long_enough]
+        self._step_grip_m = self._step_of_each_m.mean(axis=0)
         self._within, self._finger = within.astype(np.float32), finger[long_enough]
         self._mean = np.zeros_like(self._within)
-        self._laid_out_at_m = jaw_opening_m
+        self._laid_out_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
 
     def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
         """Strips behind the end edges on faces that look at the camera: where they start (n, 3) and the way (n, 3)
@@ -212,3 +218,16 @@ class FingerStrips:
             passed |= further
             begin += sorted(further)
         return out
+
+
+def _unexplained(alike: Any) -> Any:
+    """Part of the variance that correlations leave."""
+    return 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED_CORRELATION))
+
+
+@lru_cache(maxsize=4)
+def _nodes(width: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """(k,) points of a strip that are projected, of ``width``, and (k, width) their shares in those between them."""
+    node = np.linspace(0.0, width - 1.0, width // NODE_PX + 2)
+    share = np.maximum(1.0 - np.abs(np.arange(width) - node[:, None]) / node[1], 0.0)
+    return node, share.astype(np.float32)
