@@ -22,7 +22,7 @@ from gripmon.track.edges.prediction import ROWS, SHORTEST_PX, independent_part, 
 from gripmon.track.edges.profiles import find_candidates, profile_offsets_px, read_profiles
 from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
 from gripmon.track.look import FingerStrips
-from gripmon.track.look.strips import FEWEST_FRAMES
+from gripmon.track.look.strips import FIRST_FRAMES
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
@@ -139,7 +139,7 @@ def test_what_shows_along_fingers_is_learnt_where_their_sides_are_made_of_severa
     assert first, "facets that run along the finger"
     simulator = Simulator(make_camera(PAPER_LENS), solids, nominal_cam_T_grip(), Scenario(fps=2.0, duration_s=4.0), 1)
     strips = FingerStrips(make_camera(PAPER_LENS), model, along)
-    for i in range(FEWEST_FRAMES):
+    for i in range(FIRST_FRAMES):
         truth = simulator.truth(i)
         strips.learn(simulator.render(i), truth.cam_T_grip, truth.jaw_opening_m, truth.time_s)
     assert strips.ready

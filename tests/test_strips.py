@@ -15,7 +15,7 @@ from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
 from gripmon.track.edges.ends import along_fingers
 from gripmon.track.look import FingerStrips
-from gripmon.track.look.strips import FEWEST_FRAMES, RELEARN_S
+from gripmon.track.look.strips import FIRST_FRAMES, RELEARN_S
 
 RISK = 1e-3
 SLIDES_M = (1.5e-3, -1.5e-3, 3.3e-3, -3.3e-3, 6e-3, -6e-3)
@@ -40,7 +40,7 @@ def new_strips() -> FingerStrips:
     return FingerStrips(make_camera(PAPER_LENS), gripper, along_fingers(gripper)[1])
 
 
-def taught(simulation: Simulator, frames: int = FEWEST_FRAMES) -> FingerStrips:
+def taught(simulation: Simulator, frames: int = FIRST_FRAMES) -> FingerStrips:
     strips = new_strips()
     for i in range(frames):
         truth = simulation.truth(i)
@@ -119,20 +119,20 @@ def test_what_hides_the_fingers_tells_of_no_slide_that_isnt_there(way_m: float):
     assert told is None or told == pytest.approx(-way_m, abs=3e-4)
 
 
-def test_they_need_some_frames_and_then_learn_one_a_second():
+def test_they_need_one_frame_and_after_some_learn_one_a_second():
     simulation, _, image = lined()
-    strips = taught(simulation, FEWEST_FRAMES - 1)
-    assert not strips.ready and told_m(simulation, strips, image, 3.3e-3) is None
-    truth = simulation.truth(LAST)
-    for now_s, frames in ((10.0, 0), (10.0 + 0.9 * RELEARN_S, 0), (10.0 + RELEARN_S, 1)):
+    assert not new_strips().ready and told_m(simulation, new_strips(), image, 3.3e-3) is None
+    assert told_m(simulation, taught(simulation, 1), image, 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
+    strips, truth = taught(simulation), simulation.truth(LAST)
+    for now_s, frames in ((10.0, 1), (10.0 + 0.9 * RELEARN_S, 1), (10.0 + RELEARN_S, 2)):
         strips.learn(image, truth.cam_T_grip, truth.jaw_opening_m, now_s)
-        assert strips.ready and strips.frames == FEWEST_FRAMES + frames
+        assert strips.ready and strips.frames == FIRST_FRAMES + frames
 
 
 def test_out_of_view_there_is_nothing_to_learn():
     strips, away_T = new_strips(), nominal_cam_T_grip()
     away_T[:3, 3] = (0.0, 0.0, -0.5)
     image = np.full((576, 768), 90, dtype=np.uint8)
-    for i in range(FEWEST_FRAMES):
+    for i in range(FIRST_FRAMES):
         strips.learn(image, away_T, None, float(i))
     assert not strips.ready and strips.slide_m(image, away_T, None, RISK) is None

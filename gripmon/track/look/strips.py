@@ -52,8 +52,10 @@ SMALLEST_SLIDE_PX = 2
 EXPLAINED_CORRELATION = 0.87
 """Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
 
-FEWEST_FRAMES, MOST_FRAMES = 3, 32
-"""Frames learnt before it may judge: seen inside the outline, they differ by noise alone; and remembered."""
+FIRST_FRAMES, MOST_FRAMES = 3, 32
+"""Frames learned one after the other, and remembered.  One is enough to judge: seen inside the outline, they differ by
+noise alone.
+"""
 
 RELEARN_S = 1.0
 """Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
@@ -73,16 +75,16 @@ class FingerStrips:
     @property
     def ready(self) -> bool:
         """Whether it may judge."""
-        return self.frames >= FEWEST_FRAMES and bool(self._mean.any())
+        return self.frames > 0 and bool(self._mean.any())
 
     @property
     def awaited(self) -> bool:
-        """Whether more frames have to be learned before it may judge; False where the fingers have no strips."""
-        return self.frames < FEWEST_FRAMES and not self._nothing
+        """Whether a frame has to be learned before it may judge; False where the fingers have no strips."""
+        return self.frames == 0 and not self._nothing
 
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> None:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s."""
-        if self.frames >= FEWEST_FRAMES and now_s - self._learnt_s < RELEARN_S:
+        if self.frames >= FIRST_FRAMES and now_s - self._learnt_s < RELEARN_S:
             return
         if not len(self._start_grip_m):
             self._lay_out(cam_T_grip, jaw_opening_m)
