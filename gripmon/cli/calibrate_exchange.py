@@ -5,13 +5,8 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from typing import TYPE_CHECKING
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, input_errors, note
-from gripmon.model.errors import InputError
-
-if TYPE_CHECKING:
-    from gripmon.calibrate.verify import Calibrated
 
 CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
@@ -83,14 +78,13 @@ def import_(arguments: Arguments) -> None:
     """Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
     FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content.
     """
-    from gripmon.daemon.calibrations import import_camera
+    from gripmon.daemon.exchange import import_camera
 
     arguments.check_outputs("out")
-    said = arguments.camera, arguments.size, arguments.fisheye
-    kind, found = import_camera(arguments.file, arguments.format, *said, arguments.command_line())
+    given = arguments.camera, arguments.size, arguments.fisheye
+    kind, found = import_camera(arguments.file, arguments.format, *given, arguments.command_line())
     arguments.save("out", found)
-    camera = found.camera
-    lens = camera.__struct_config__.tag
+    camera, lens = found.camera, found.camera.__struct_config__.tag
     print(f"{kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px")
     print(f"written: {arguments.out}")
 
@@ -109,7 +103,7 @@ def export(arguments: Arguments) -> None:
     A hand/eye transform is written as the camera's pose in the gripper's frame (origin at the TCP, x
     across the jaws, z out of the gripper), as a robot's tree runs; --gripper-in-camera turns it round.
     """
-    from gripmon.daemon.calibrations import export_notes, read_calibrated
+    from gripmon.daemon.exchange import export_calibration
 
     arguments.check_outputs("out")
     camera = arguments.format in CAMERA_FORMATS
@@ -118,39 +112,16 @@ def export(arguments: Arguments) -> None:
     if not camera and arguments.format != "easy_handeye2":
         unused += ["robot_base_frame", "tracking_marker_frame"]
     arguments.refuse(unused, f"has no meaning with --format {arguments.format}; leave it out")
-    source = read_calibrated(arguments.calibration)
-    notes = export_notes(source, arguments.command_line(), with_pose=not camera)
-    data = (_camera if camera else _hand_eye)(source, notes, arguments)
-    if arguments.out is None:
-        sys.stdout.write(data.decode())
-    else:
-        arguments.save("out", data)
-        print(f"written: {arguments.out}")
-
-
-def _camera(source: Calibrated, notes: tuple[str, ...], arguments: Arguments) -> bytes:
-    from gripmon.calibrate.interchange import write_camera
-
-    if source.lens is None:
-        right = "a camera calibration, a hand/eye calibration or a configuration"
-        raise InputError(f"{source.name}: is {source.kind} without a camera; {right}")
-    suffix = "" if arguments.out is None else arguments.out.suffix
-    exported = write_camera(
-        source.lens, arguments.format, notes, name=arguments.name or "gripmon", file=source.name, suffix=suffix,
-        fit=arguments.fit,
-    )  # fmt: skip
-    note(f"warning: {warning}" for warning in exported.warnings)
-    return exported.data
-
-
-def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: Arguments) -> bytes:
-    from gripmon.calibrate.interchange import HandEye, write_hand_eye
-
-    if source.cam_T_grip is None:
-        right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
-        raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
     frames = {key: name for key in _FRAMES if (name := getattr(arguments, key))}
-    turned, name = arguments.gripper_in_camera, arguments.name or "gripmon"
     with input_errors("calibrate export"):
-        hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=turned, name=name, **frames)
-        return write_hand_eye(hand_eye, arguments.format, notes).encode()
+        exported = export_calibration(
+            arguments.calibration, arguments.format, arguments.command_line(), name=arguments.name or "gripmon",
+            suffix="" if arguments.out is None else arguments.out.suffix, fit=arguments.fit, frames=frames,
+            gripper_in_camera=arguments.gripper_in_camera,
+        )  # fmt: skip
+    note(f"warning: {warning}" for warning in exported.warnings)
+    if arguments.out is None:
+        sys.stdout.write(exported.data.decode())
+    else:
+        arguments.save("out", exported.data)
+        print(f"written: {arguments.out}")

@@ -33,24 +33,20 @@ OPTIONS = """
 --jaw MIN:MAX     openings at which it has to work (m; default: all)
 --picture FILE    draw the sweep (.png, .jpg)
 """
-NAMES = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "jaw", "picture")
-
-_MOST_VALUES = 100
-_BOUNDS = {
-    "distance": (0.005, 5.0, "m"), "tilt": (0.0, 180.0, "degrees"), "side": (-360.0, 360.0, "degrees"),
-    "roll": (-360.0, 360.0, "degrees"), "focal": (1.0, 1e6, "px"), "fov": (1.0, 170.0, "degrees"),
-}  # fmt: skip
+_RANGES = ("distance", "tilt", "side", "roll", "focal", "fov")
+NAMES = (*_RANGES, "lens", "at", "jaw", "picture")
 
 
 def run(arguments: Arguments) -> int:
     """Try the mounts, print the table, draw the picture."""
     from gripmon.daemon.config import load_config
     from gripmon.daemon.forecast import rig_of
-    from gripmon.daemon.sweeping import as_plain, make_grid, sweep
+    from gripmon.daemon.sweeping import as_plain, make_grid, sweep, values_in
     from gripmon.teach.mount_picture import draw_sweep, encoded
 
     config = load_config(arguments.config[0], check_source=False)
-    ranges = {name: _range(name, getattr(arguments, name)) for name in _BOUNDS if getattr(arguments, name) is not None}
+    typed = {name: getattr(arguments, name) for name in _RANGES}
+    ranges = {name: values_in(name, text) for name, text in typed.items() if text is not None}
     at_px = two_numbers(arguments.at or "", ",")
     if at_px is None and arguments.at is not None:
         width_px, height_px = config.camera.width_px, config.camera.height_px
@@ -70,28 +66,6 @@ def run(arguments: Arguments) -> int:
         if not arguments.json:
             print(f"picture    {arguments.picture}")
     return EXIT_DONE
-
-
-def _range(name: str, text: str) -> tuple[float, ...]:
-    """The values of a RANGE; a fault ends the command with exit code 2."""
-    lowest, highest, unit = _BOUNDS[name]
-    right = f"FIRST:LAST:COUNT or values with commas, {lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
-    try:
-        if ":" in text:
-            first, last, number = text.split(":")
-            low, high, count = float(first), float(last), int(number)
-            if not 1 <= count <= _MOST_VALUES or (count == 1 and low != high):
-                raise ValueError
-            values = [low + (high - low) * k / max(count - 1, 1) for k in range(count)]
-        else:
-            values = [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"--{name} {text}: isn't a range; {right}") from None
-    wrong = [v for v in values if not lowest <= v <= highest]
-    if wrong or len(values) > _MOST_VALUES:
-        what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
-        raise InputError(f"--{name} {text}: {what}; {right}")
-    return tuple(sorted(set(values)))
 
 
 _SHOWN, _REASONS_SHOWN = 8, 4

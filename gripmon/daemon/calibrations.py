@@ -12,9 +12,6 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.documents import CameraCalibration
-from gripmon.calibrate.interchange import format_of
-from gripmon.calibrate.interchange import read_camera as read_foreign_camera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
@@ -28,7 +25,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import LARGEST_BYTES, image_paths
-from gripmon.model.provenance import Provenance, provenance_of
+from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, refuse_other_size
 from gripmon.model.units import in_degrees, in_mm
@@ -207,36 +204,6 @@ def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[f
 def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> None:
     """Write a calibration as YAML, whole or not at all.  OSError if it can't be written."""
     write_atomically(path, as_yaml(msgspec.to_builtins(document)).encode())
-
-
-def import_camera(
-    path: Path,
-    kind: str | None,
-    which: str | None,
-    size_px: tuple[int, int] | None,
-    fisheye: bool | None,
-    command: str,
-) -> tuple[str, CameraCalibration]:
-    """The format of another program's file (``kind`` None: recognised by its content), and its camera.  ``command`` is
-    for the provenance.  :class:`~gripmon.model.errors.InputError`.
-    """
-    data = read_bytes(path)
-    kind = kind or format_of(data, str(path))
-    return kind, CameraCalibration(
-        camera=read_foreign_camera(data, str(path), kind, which, size_px, fisheye),
-        parameters=(),
-        covariance=(),
-        warnings=(f"imported from {kind}: how certain it is isn't known",),
-        provenance=provenance_of(command, [path]),
-    )
-
-
-def export_notes(source: Calibrated, command: str, *, with_pose: bool) -> tuple[str, ...]:
-    """Provenance notes in a file for another program; ``with_pose``: also about the transform."""
-    made = provenance_of(command, [Path(source.name)])
-    written = f"written {made.time} by gripmon {made.gripmon}: {made.command}"
-    origin = f"from {source.name}, SHA-256 {made.inputs[0].sha256}"
-    return written, origin, *source.notes, *(source.pose_notes if with_pose else ())
 
 
 @dataclass(frozen=True)

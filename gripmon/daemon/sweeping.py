@@ -27,7 +27,11 @@ from gripmon.teach.mounts import (
     with_focal,
 )
 
-_MOST_MOUNTS = 20000
+_MOST_MOUNTS, _MOST_VALUES = 20000, 100
+_BOUNDS = {
+    "distance": (0.005, 5.0, "m"), "tilt": (0.0, 180.0, "degrees"), "side": (-360.0, 360.0, "degrees"),
+    "roll": (-360.0, 360.0, "degrees"), "focal": (1.0, 1e6, "px"), "fov": (1.0, 170.0, "degrees"),
+}  # fmt: skip
 _DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), (0.0, 75.0, 6)  # first, last, count: multiples of the present distance, degrees
 
 
@@ -82,6 +86,30 @@ def make_grid(
     if len(grid) > _MOST_MOUNTS:
         raise InputError(f"{len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", "sweep")
     return grid, place
+
+
+def values_in(name: str, text: str) -> tuple[float, ...]:
+    """The values, ascending, of a range for :func:`make_grid` as a person types it: FIRST:LAST:COUNT, or single ones
+    with commas.  Raises :class:`InputError` for another text, and values out of bounds.
+    """
+    lowest, highest, unit = _BOUNDS[name]
+    right = f"FIRST:LAST:COUNT or values with commas, {lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
+    try:
+        if ":" in text:
+            first, last, number = text.split(":")
+            low, high, count = float(first), float(last), int(number)
+            if not 1 <= count <= _MOST_VALUES or (count == 1 and low != high):
+                raise ValueError
+            values = [low + (high - low) * k / max(count - 1, 1) for k in range(count)]
+        else:
+            values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{text}: isn't a range; {right}", name) from None
+    wrong = [v for v in values if not lowest <= v <= highest]
+    if wrong or len(values) > _MOST_VALUES:
+        what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
+        raise InputError(f"{text}: {what}; {right}", name)
+    return tuple(sorted(set(values)))
 
 
 def _spaced(first: float, last: float, count: int) -> list[float]:
