@@ -130,10 +130,10 @@ def test_whatever_happens_at_once_no_valid_transform_is_far_from_the_truth(repla
 
 
 def test_a_bent_finger_is_told_as_that(replayed: dict[str, Lines]):
-    """Soon after it bends; nothing is said of the camera, and no transform is valid from then on."""
+    """Once two conclusions agree; nothing is said of the camera, and no transform is valid from then on."""
     lines = replayed["bent_finger"]
     [alert] = [(line["seq"], alert) for line in lines for alert in line["alerts"]]
-    assert (alert[1]["kind"], alert[1]["cause"]) == ("gripper", "finger_bent") and 45 < alert[0] <= 52
+    assert (alert[1]["kind"], alert[1]["cause"]) == ("gripper", "finger_bent") and 45 < alert[0] <= 58
     assert all(line["verdict"] == "suspect" for line in lines[alert[0] :])
 
 
