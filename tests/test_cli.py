@@ -260,7 +260,7 @@ def test_run_ends_after_its_duration(live_simulation: Path, tmp_path: Path):
     done = gripmon("run", live_simulation, "--duration", "1.5", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     lines = (tmp_path / "out" / "estimates.jsonl").read_text().splitlines()
-    assert 5 <= len(lines) <= 31
+    assert 5 <= len(lines) <= 40
 
 
 def test_ctrl_c_in_simulate_leaves_no_traceback(tmp_path: Path):
