@@ -210,7 +210,7 @@ class Integrity:
         seen = self._weigher.confirmations(here.measurement, at_first.ends)
         if proven or seen < CORNERS_WHERE_EXPECTED:
             return standing
-        return _reaching(standing, here.cam_T_grip)
+        return _reaching(standing, here.cam_T_grip, "the fingers stand elsewhere, where their ends are seen, too")
 
     def _held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: what is measured at the anchor.  None without an anchor, where
@@ -267,13 +267,13 @@ class Integrity:
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        protection = trust.protection
-        if trust.displaced and not (moved or trust.ambiguous):
-            # Until another frame says so, too, it may as well be where it was.
-            away = perturbation_between(cam_T_grip, self._weigher.expected[0])
-            protection = reaching(protection, away, "the fingers stand elsewhere, or the mount was knocked just now")
-        at = measurement, cam_T_grip, covariance, protection
-        return Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
+        at = measurement, cam_T_grip, covariance, trust.protection
+        standing = Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
+        if moved or trust.ambiguous or not trust.displaced:
+            return standing
+        # Until another frame says so, too, it may as well be where it was.
+        why = "the fingers stand elsewhere, or the mount was knocked just now"
+        return _reaching(standing, self._weigher.expected[0], why)
 
     def _knocked(self, trust: Trust, beside_px: float) -> bool:
         """Whether the mount was knocked; the edges show ``beside_px`` from the old place.  Knocks are so rare that one
@@ -327,8 +327,7 @@ class Integrity:
         return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_ODDS)
 
 
-def _reaching(standing: Standing, other_T: Array) -> Standing:
+def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
     """The same with a bound that includes another possible pose (4, 4), and not believed."""
     away = perturbation_between(standing.cam_T_grip, other_T)
-    bound = reaching(standing.protection, away, "the fingers stand elsewhere, where their ends are seen, too")
-    return replace(standing, protection=bound, believed=False)
+    return replace(standing, protection=reaching(standing.protection, away, why), believed=False)

@@ -70,12 +70,13 @@ class FingerStrips:
         self.frames = 0
         self._learnt_s = -math.inf
         self._nothing = False
+        self._own = 0.0  # sum of squares of what was learnt: none of a finger of one shade
         self._start_grip_m: Array = np.zeros((0, 3))
 
     @property
     def ready(self) -> bool:
         """Whether it may judge."""
-        return self.frames > 0 and bool(self._mean.any())
+        return self._own > 0.0
 
     @property
     def awaited(self) -> bool:
@@ -97,6 +98,7 @@ class FingerStrips:
         self._mean += (strips - self._mean) * self._within / min(self.frames, MOST_FRAMES)
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
         self._learnt = np.clip(self._mean, -self._most, self._most)
+        self._own = float(np.square(self._learnt).sum())
 
     def slide_m(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> Array | None:
         """By how much (3,), gripper frame, the gripper stands along its fingers from a pose (4, 4); None where the
@@ -104,8 +106,7 @@ class FingerStrips:
         """
         if not self.ready:
             return None
-        most, learnt = self._most, self._learnt
-        own = float(np.square(learnt).sum())
+        most, learnt, own = self._most, self._learnt, self._own
         # Gain and brightness are free: light changes.
         there = np.clip(self._read(image, cam_T_grip, jaw_opening_m), -most, most) * self._within
         alike_here = float((there * learnt).sum()) / math.sqrt(float(np.square(there).sum()) * own + 1e-12)
