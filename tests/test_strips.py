@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, simulator
 
 from gripmon.model.camera import make_camera
-from gripmon.model.records import Image
+from gripmon.model.geometry import to_record
+from gripmon.model.records import Image, StripsRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
 from gripmon.track.edges.ends import along_fingers
-from gripmon.track.look import FingerStrips
+from gripmon.track.look import FingerStrips, LookRefused
 from gripmon.track.look.strips import FIRST_FRAMES, RELEARN_S
 
 RISK = 1e-3
@@ -64,9 +66,11 @@ def slid(cam_T_grip: np.ndarray, way_m: float) -> np.ndarray:
 def told_m(simulation: Simulator, strips: FingerStrips, image: Image, way_m: float) -> float | None:
     """The slide that the strips tell of a pose ``way_m`` beside the true one, along the fingers."""
     truth = simulation.truth(LAST)
-    slide_m = strips.slide_m(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+    seen = strips.compare(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+    slide_m = seen.slide_m
     if slide_m is None:
         return None
+    assert not seen.here
     assert np.abs(slide_m[:2]).max() < 1e-9, "these fingers run along z"
     return float(slide_m[2])
 
@@ -119,6 +123,63 @@ def test_what_hides_the_fingers_tells_of_no_slide_that_isnt_there(way_m: float):
     assert told is None or told == pytest.approx(-way_m, abs=3e-4)
 
 
+def test_the_true_place_is_seen_also_in_other_light_and_no_other_is():
+    simulation, strips, image = lined()
+    truth = simulation.truth(LAST)
+    for lit, way_m, here in ((image, 0.0, True), (image // 2, 0.0, True), (image, 6e-4, False), (image, 3.3e-3, False)):
+        seen = strips.compare(lit, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+        assert seen.here == here, way_m
+
+
+def test_hidden_or_of_one_shade_they_are_seen_nowhere():
+    covered = filmed(LINED, covers=(Cover(start_s=2.0, end_s=5.0, move_s=0.5),))
+    for simulation in (covered, filmed(PLAIN)):
+        truth = simulation.truth(LAST)
+        seen = taught(simulation).compare(simulation.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, RISK)
+        assert not seen.here
+
+
+def test_they_go_on_after_a_restart():
+    simulation, strips, image = lined()
+    state = strips.state()
+    assert state is not None and state.frames == FIRST_FRAMES
+    again = new_strips()
+    again.restore(msgspec.json.decode(msgspec.json.encode(state), type=StripsRecord))
+    kept = again.state()
+    assert kept is not None and kept.mean == state.mean and kept.frames == FIRST_FRAMES and not again.awaited
+    truth = simulation.truth(LAST)
+    for way_m in (0.0, *SLIDES_M):
+        where = image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK
+        before, after = strips.compare(*where), again.compare(*where)
+        assert after.here == before.here and (after.slide_m is None) == (before.slide_m is None)
+        if before.slide_m is not None:
+            assert after.slide_m == pytest.approx(before.slide_m, rel=1e-9, abs=1e-12)
+    for now_s in (0.0, 0.9 * RELEARN_S):
+        again.learn(image, truth.cam_T_grip, truth.jaw_opening_m, now_s)
+        assert again.frames == FIRST_FRAMES + 1, "enough were learnt before: one more a second"
+
+
+@pytest.mark.parametrize("fault", ["another place", "cut", "not finite"])
+def test_kept_strips_that_cant_be_this_grippers_are_refused_and_learnt_again(fault: str):
+    simulation, strips, image = lined()
+    state = strips.state()
+    assert state is not None
+    behind_T = np.diag([1.0, 1.0, 1.0, 1.0])
+    behind_T[2, 3] = -1.0
+    change = {
+        "another place": {"cam_T_grip": to_record(behind_T)},
+        "cut": {"mean": state.mean[:-4]},
+        "not finite": {"mean": np.full(len(state.mean) // 4, np.nan, dtype="<f4").tobytes()},
+    }[fault]
+    again = new_strips()
+    with pytest.raises(LookRefused, match="learnt again"):
+        again.restore(msgspec.structs.replace(state, **change))
+    assert again.awaited and not again.ready
+    truth = simulation.truth(LAST)
+    again.learn(image, truth.cam_T_grip, truth.jaw_opening_m, 0.0)
+    assert again.ready and again.frames == 1
+
+
 def test_they_need_one_frame_and_after_some_learn_one_a_second():
     simulation, _, image = lined()
     assert not new_strips().ready and told_m(simulation, new_strips(), image, 3.3e-3) is None
@@ -135,4 +196,5 @@ def test_out_of_view_there_is_nothing_to_learn():
     image = np.full((576, 768), 90, dtype=np.uint8)
     for i in range(FIRST_FRAMES):
         strips.learn(image, away_T, None, float(i))
-    assert not strips.ready and strips.slide_m(image, away_T, None, RISK) is None
+    assert not strips.ready and not strips.awaited and strips.state() is None
+    assert strips.compare(image, away_T, None, RISK) == (None, False)

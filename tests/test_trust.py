@@ -21,8 +21,8 @@ from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import make_transform, perturb
-from gripmon.model.records import Frame, Protection, State, Verdict, to_json
-from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.model.records import AlertKind, Frame, MonitorState, Protection, State, Verdict, to_json
+from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import MISREAD_PROBABILITY
@@ -39,6 +39,7 @@ from gripmon.simulate.scenario import (
     Sensor,
 )
 from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.look import StripsSeen
 
 FPS, BEGINS = 20.0, 16
 """Frame in which something begins to happen: until then the view is free, and the gripper's place has proved itself."""
@@ -252,6 +253,28 @@ def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_mis
     assert valid(seen)[2 : BEGINS + 1].all() and valid(seen)[-4:].all() and errors_m(seen)[-4:].max() < 2e-4
 
 
+@pytest.mark.parametrize("from_tip_m", [1.2e-3, 5e-3])
+def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_while_nothing_runs_is_seen_after_the_start(
+    from_tip_m: float,
+):
+    """The border stands where the tips were: without the kept strips the picture fits the reference."""
+    border = FingerMark(from_tip_m=(from_tip_m, from_tip_m + 0.02), across=(-2.0, 2.0), gain=0.4)
+    plain = Background(kind="plain", contrast=0.0, level_dn=180.0, boxes=0, cables=0, motion="still")
+    knock = along_fingers(from_tip_m, BEGINS_S)
+    frames, truths = frames_of(scene(40, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,))))
+    before = new_monitor()
+    for frame in frames[:BEGINS]:
+        before.process(frame)
+    state = msgspec.json.decode(msgspec.json.encode(before.state()), type=MonitorState)
+    reference = reference_of(nominal_cam_T_grip())
+    after = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, state=state)
+    seen = watch(frames[BEGINS + 1 :], truths[BEGINS + 1 :], after)
+    assert_nothing_misleads(seen)
+    assert not valid(seen).any() and errors_m(seen)[-1] < 1e-4
+    [alert] = [alert for record in seen.records for alert in record.alerts if alert.kind is AlertKind.RESTARTED]
+    assert "the picture does not fit it: the camera has moved" in alert.text
+
+
 # --- references ---
 
 
@@ -428,7 +451,25 @@ def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():
 
 
 def test_a_pose_that_stays_slid_after_it_was_measured_again_is_not_followed(monkeypatch: pytest.MonkeyPatch):
-    assert not knock_followed(monkeypatch, _slide_m=lambda *_: np.array([0.0, 0.0, 1e-4]))
+    slid = StripsSeen(np.array([0.0, 0.0, 1e-4]))
+    assert not knock_followed(monkeypatch, _along=lambda *_, **__: slid)
+
+
+def test_a_slide_is_doubted_until_the_fingers_are_seen_where_they_are_expected(monkeypatch: pytest.MonkeyPatch):
+    """Something in front of them looked like them, a millimetre farther along, in one frame."""
+    frames, _ = frames_of(scene(BEGINS + 4))
+    for after, verdict in (
+        (StripsSeen(here=True), Verdict.VALID),
+        (StripsSeen(), Verdict.SUSPECT),
+    ):
+        monitor = new_monitor()
+        for frame in frames[:BEGINS]:
+            assert monitor.process(frame) is not None
+        with monkeypatch.context() as patch:
+            patch.setattr(Integrity, "_along", lambda *_, **__: StripsSeen(np.array([0.0, 0.0, 1e-3])))
+            assert monitor.process(frames[BEGINS]).verdict is Verdict.SUSPECT
+            patch.setattr(Integrity, "_along", lambda *_, after=after, **__: after)
+            assert {monitor.process(frame).verdict for frame in frames[BEGINS + 1 :]} == {verdict}
 
 
 def test_a_knock_has_to_prove_itself_strictly(monkeypatch: pytest.MonkeyPatch):

@@ -25,7 +25,7 @@ from gripmon.monitor.standing import Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Weigher
 from gripmon.track.edges import Measurement
-from gripmon.track.look import FingerStrips, GripperLook, LookRefused
+from gripmon.track.look import FingerStrips, GripperLook, LookRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
 """Frames from one look at the fingers' ends to the next, while the gripper is where it was and the last look proved
@@ -75,8 +75,10 @@ class Integrity:
     def look_state(self, reference: ReferenceRecord) -> LookRecord | None:
         """The gripper's look for the state file; None before it is learnt."""
         record = self._look.state(reference.reference_id)
-        finer = None if self._finer is None else self._finer.state()
-        return record if record is None or finer is None else msgspec.structs.replace(record, finer=finer)
+        if record is None:
+            return None
+        strips, finer = self._strips.state(), None if self._finer is None else self._finer.state()
+        return msgspec.structs.replace(record, strips=strips or msgspec.UNSET, finer=finer or msgspec.UNSET)
 
     @property
     def swing(self) -> Array:
@@ -98,6 +100,8 @@ class Integrity:
         if state is not None and state.look is not None:
             try:
                 self._look.restore(state.look, reference.reference_id)
+                if state.look.strips is not msgspec.UNSET:
+                    self._strips.restore(state.look.strips)
                 if self._finer is not None and state.look.finer is not msgspec.UNSET:
                     self._finer.restore(state.look.finer)
             except LookRefused as refused:
@@ -170,7 +174,7 @@ class Integrity:
             strictly = weigh(measurement, cam_T_grip, ends, now_s)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds speak against it.
-            proven = proven and self._slide_m(frame, measurement, cam_T_grip, risk=1.0) is None
+            proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
@@ -180,16 +184,19 @@ class Integrity:
         where the look has it either: the same pose, bounded without the ends.
         """
         weigher, (measurement, cam_T_grip, _, trust) = self._weigher, here
-        slide_m = self._slide_m(frame, measurement, cam_T_grip)
-        if slide_m is not None:
+        along = self._along(frame, measurement, cam_T_grip)
+        if along.slide_m is not None:
             self._slid_until_s = now_s + self._policy.hold_s
             slid_T = cam_T_grip.copy()
-            slid_T[:3, 3] += cam_T_grip[:3, :3] @ slide_m
+            slid_T[:3, 3] += cam_T_grip[:3, :3] @ along.slide_m
             again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
-            if again is not None and self._slide_m(frame, again.measurement, again.cam_T_grip) is None:
+            if again is not None and self._along(frame, again.measurement, again.cam_T_grip).slide_m is None:
                 return again
-        elif trust.displaced or now_s >= self._slid_until_s:
-            return here
+        else:
+            if along.here and not trust.displaced:
+                self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
+            if trust.displaced or now_s >= self._slid_until_s:
+                return here
         return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
 
     def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
@@ -227,12 +234,12 @@ class Integrity:
         beside them look like ends elsewhere.  None where that is excluded, or too little of the sides is seen.
         """
         weigher = self._weigher
-        if now_s < self._slid_until_s:
-            return None
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
-        return there if self._slide_m(frame, there.measurement, there.cam_T_grip) is None else None
+        along = self._along(frame, there.measurement, there.cam_T_grip)
+        not_slid = along.slide_m is None and now_s >= self._slid_until_s
+        return there if along.here or not_slid else None
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
         """The measurement at a pose (4, 4), of edges within the standard deviations (6,) of it; None where no edge is
@@ -310,15 +317,11 @@ class Integrity:
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
-    def _slide_m(
-        self, frame: Frame, measurement: Measurement, cam_T_grip: Array, risk: float = LOOK_ODDS
-    ) -> Array | None:
-        """(3,) motion along the fingers, gripper frame, by which their look is seen beside a pose (4, 4), at odds of
-        one to ``risk``; None where it isn't.
-        """
+    def _along(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, risk: float = LOOK_ODDS) -> StripsSeen:
+        """Where the gripper is seen to stand along its fingers, against a pose (4, 4), at odds of one to ``risk``."""
         if frame.image is None:
-            return None
-        return self._strips.slide_m(frame.image, cam_T_grip, measurement.jaw_opening_m, risk)
+            return StripsSeen()
+        return self._strips.compare(frame.image, cam_T_grip, measurement.jaw_opening_m, risk)
 
     def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
         """Whether the gripper's look is seen at a pose (4, 4)."""

@@ -41,7 +41,15 @@ from gripmon.model.records.frames import (
 )
 from gripmon.model.records.json_schema import json_schema, summary
 from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
-from gripmon.model.records.looks import FinerLookRecord, LookBias, LookNote, LookPixels, LookRecord, LookVersion
+from gripmon.model.records.looks import (
+    FinerLookRecord,
+    LookBias,
+    LookNote,
+    LookPixels,
+    LookRecord,
+    LookVersion,
+    StripsRecord,
+)
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
@@ -124,6 +132,7 @@ __all__ = [
     "StandingAlert",
     "State",
     "StateRecord",
+    "StripsRecord",
     "Transform",
     "Verdict",
     "Vibration",

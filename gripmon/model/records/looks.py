@@ -71,6 +71,17 @@ class FinerLookRecord(msgspec.Struct, frozen=True):
     ]
 
 
+class StripsRecord(msgspec.Struct, frozen=True):
+    """What the fingers show along themselves; bytes are little-endian and base64 in JSON."""
+
+    cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when the strips were chosen")]
+    jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
+    frames: Annotated[int, Meta(ge=1, description="that they were learnt from")]
+    mean: Annotated[
+        bytes, Meta(description="float32 (n, 64): grey levels from the finger's end on, slow changes left out")
+    ]
+
+
 class LookRecord(msgspec.Struct, frozen=True):
     """Learned texture of the fingers; bytes are little-endian and base64 in JSON."""
 
@@ -88,4 +99,7 @@ class LookRecord(msgspec.Struct, frozen=True):
     finer: Annotated[
         FinerLookRecord | msgspec.UnsetType,
         Meta(description="left out unless monitor.look.enabled, or before there is one"),
+    ] = msgspec.UNSET
+    strips: Annotated[
+        StripsRecord | msgspec.UnsetType, Meta(description="left out before a frame was learned, or without strips")
     ] = msgspec.UNSET

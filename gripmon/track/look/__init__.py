@@ -5,7 +5,7 @@ from gripmon.track.look.alignment import LookAlignment, LookMotion, warm_up
 from gripmon.track.look.blocks import BLOCK_PX
 from gripmon.track.look.core import GripperLook, another_background
 from gripmon.track.look.fusion import Fused, LookFusion
-from gripmon.track.look.strips import FingerStrips
+from gripmon.track.look.strips import FingerStrips, StripsSeen
 
 __all__ = [
     "BLOCK_PX",
@@ -17,6 +17,7 @@ __all__ = [
     "LookFusion",
     "LookMotion",
     "LookRefused",
+    "StripsSeen",
     "another_background",
     "warm_up",
 ]

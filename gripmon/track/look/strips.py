@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import invert
+from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
-from gripmon.model.records import Array, Image
+from gripmon.model.records import Array, Image, StripsRecord
+from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.kernel import CLIP_SIGMAS
 
 LENGTH_PX, REACH_PX = 64, 96
@@ -61,6 +62,27 @@ RELEARN_S = 1.0
 """Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
 
 
+class _Layout(NamedTuple):
+    """Where n strips lie, gripper frame: their points nearest to the finger's end (n, 3), the steps (n, 3) from each
+    point to the next, which points are on the finger (n, LENGTH_PX), and the finger of each (n,).
+    """
+
+    start_m: Array
+    step_m: Array
+    within: NDArray[np.float32]
+    finger: NDArray[np.intp]
+
+
+class StripsSeen(NamedTuple):
+    """What the strips show at a pose."""
+
+    slide_m: Array | None = None
+    """(3,) by how much the gripper stands along its fingers from there, gripper frame; None where that isn't seen."""
+
+    here: bool = False
+    """Whether it is seen to stand there."""
+
+
 class FingerStrips:
     """Strips along the fingers of one gripper in one camera; ``along`` (e,): which of its edges run along them."""
 
@@ -69,9 +91,9 @@ class FingerStrips:
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.frames = 0
         self._learnt_s = -math.inf
-        self._nothing = False
+        self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
+        self._layout: _Layout | None = None
         self._own = 0.0  # sum of squares of what was learnt: none of a finger of one shade
-        self._start_grip_m: Array = np.zeros((0, 3))
 
     @property
     def ready(self) -> bool:
@@ -81,42 +103,62 @@ class FingerStrips:
     @property
     def awaited(self) -> bool:
         """Whether a frame has to be learned before it may judge; False where the fingers have no strips."""
-        return self.frames == 0 and not self._nothing
+        return self._laid_out is None
 
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> None:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s."""
         if self.frames >= FIRST_FRAMES and now_s - self._learnt_s < RELEARN_S:
             return
-        if not len(self._start_grip_m):
+        if self._layout is None:
             self._lay_out(cam_T_grip, jaw_opening_m)
-        self._nothing = not len(self._start_grip_m)
-        if self._nothing:
+        if self._layout is None:
             return
-        strips = self._read(image, cam_T_grip, jaw_opening_m)
+        strips, within = self._read(self._layout, image, cam_T_grip, jaw_opening_m), self._layout.within
         self.frames += 1
         self._learnt_s = now_s
-        self._mean += (strips - self._mean) * self._within / min(self.frames, MOST_FRAMES)
-        self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
-        self._learnt = np.clip(self._mean, -self._most, self._most)
-        self._own = float(np.square(self._learnt).sum())
+        self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
+        self._prepare(self._layout)
 
-    def slide_m(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> Array | None:
-        """By how much (3,), gripper frame, the gripper stands along its fingers from a pose (4, 4); None where the
-        strips are not seen elsewhere, at odds of 1 to ``risk`` for each slide that was tried, or can't tell.
-        """
-        if not self.ready:
+    def state(self) -> StripsRecord | None:
+        """What survives a restart, some 10 kB; None before a frame was learned."""
+        if self._laid_out is None or not self.frames:
             return None
+        cam_T_grip, jaw_opening_m = self._laid_out
+        return StripsRecord(to_record(cam_T_grip), jaw_opening_m, self.frames, self._mean.astype("<f4").tobytes())
+
+    def restore(self, record: StripsRecord) -> None:
+        """Go on with kept strips of the same gripper and camera.  Raises :class:`LookRefused`, and begins again, if
+        they don't fit.
+        """
+        self._lay_out(from_record(record.cam_T_grip), record.jaw_opening_m)
+        layout = self._layout
+        fits = layout is not None and len(record.mean) == 4 * layout.within.size
+        if layout is None or not fits or not np.isfinite(np.frombuffer(record.mean, "<f4")).all():
+            self._laid_out = self._layout = None
+            raise LookRefused("the kept look along the fingers isn't this gripper's; it is learnt again")
+        self._mean = np.frombuffer(record.mean, "<f4").reshape(layout.within.shape).astype(np.float32)
+        self.frames = record.frames
+        self._prepare(layout)
+
+    def compare(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> StripsSeen:
+        """Where the gripper stands along its fingers, against a pose (4, 4): elsewhere only at odds of 1 to ``risk``
+        for each slide that is tried.
+        """
+        layout = self._layout
+        if layout is None or not self.ready:
+            return StripsSeen()
         most, learnt, own = self._most, self._learnt, self._own
         # Gain and brightness are free: light changes.
-        there = np.clip(self._read(image, cam_T_grip, jaw_opening_m), -most, most) * self._within
+        there = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m), -most, most) * layout.within
         alike_here = float((there * learnt).sum()) / math.sqrt(float(np.square(there).sum()) * own + 1e-12)
-        independent = float(self._within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
+        independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
         if beyond_chance * _unexplained(EXPLAINED_CORRELATION) >= _unexplained(alike_here):
-            return None  # Usually: no slide could be so much better.
-        strips = np.clip(self._read(image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
-        energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
+            # Usually: no slide could be so much better.
+            return StripsSeen(here=alike_here >= EXPLAINED_CORRELATION)
+        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
+        energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
         alike = product / np.sqrt(np.maximum(energy, least) * own + 1e-12)
@@ -125,19 +167,25 @@ class FingerStrips:
         unexplained[REACH_PX - SMALLEST_SLIDE_PX : REACH_PX + SMALLEST_SLIDE_PX + 1] = 1.0
         best = int(np.argmin(unexplained))
         if here <= beyond_chance * float(unexplained[best]):
-            return None
-        return (best - REACH_PX) * self._step_grip_m
+            return StripsSeen()
+        return StripsSeen((best - REACH_PX) * layout.step_m.mean(axis=0))
+
+    def _prepare(self, layout: _Layout) -> None:
+        """What a comparison needs of the mean."""
+        self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
+        self._learnt = np.clip(self._mean, -self._most, self._most)
+        self._own = float(np.square(self._learnt).sum())
 
     def _read(
-        self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
+        self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
     ) -> NDArray[np.float32]:
         """(n, LENGTH_PX + 2 beyond) grey levels along the strips, without their slow changes."""
         width = LENGTH_PX + 2 * (FILTERED_PX + beyond)
         node, share = _nodes(width)
-        along = (node - FILTERED_PX - beyond)[:, None] * self._step_of_each_m[:, None]
+        along = (node - FILTERED_PX - beyond)[:, None] * layout.step_m[:, None]
         now = self._gripper.points_grip_m(jaw_opening_m)
-        moved = (now[self._first] - self._laid_out_m)[self._finger]
-        points = (self._start_grip_m[:, None] + moved[:, None] + along).reshape(-1, 3)
+        moved = (now[self._first] - self._laid_out_m)[layout.finger]
+        points = (layout.start_m[:, None] + moved[:, None] + along).reshape(-1, 3)
         uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         # A point outside the lens is NaN; OpenCV needs a number for it.
         u, v = (c.reshape(-1, len(node)).astype(np.float32) @ share for c in np.nan_to_num(uv_px, nan=-1.0).T)
@@ -149,6 +197,7 @@ class FingerStrips:
         return np.asarray(fast[:, FILTERED_PX:-FILTERED_PX], dtype=np.float32)
 
     def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
+        self._laid_out = cam_T_grip.copy(), jaw_opening_m
         start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
         if not len(start):
             return
@@ -163,11 +212,9 @@ class FingerStrips:
         long_enough = length_m >= SHORTEST_PX * pitch_m
         if not long_enough.any():
             return
-        within = np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]
-        self._step_of_each_m, self._start_grip_m = pitch_m * way[long_enough], start[long_enough]
-        self._step_grip_m = self._step_of_each_m.mean(axis=0)
-        self._within, self._finger = within.astype(np.float32), finger[long_enough]
-        self._mean = np.zeros_like(self._within)
+        within = (np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]).astype(np.float32)
+        self._layout = _Layout(start[long_enough], pitch_m * way[long_enough], within, finger[long_enough])
+        self._mean = np.zeros_like(within)
         self._laid_out_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
 
     def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
