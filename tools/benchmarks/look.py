@@ -14,6 +14,8 @@ import numpy as np
 from benchmarks import options
 from benchmarks.accuracy_runs import Row, judge
 from benchmarks.conditions import CONDITIONS
+from benchmarks.look_motions import HEAD as MOTIONS_HEAD
+from benchmarks.look_motions import MOTIONS, motion_row
 from benchmarks.rendered import all_row_names, sequences
 from benchmarks.scenes import Sequence, Shot, make_scene
 from gripmon.judge.drift import DriftSettings
@@ -36,13 +38,22 @@ def add_parser(commands: Any) -> None:
     parser = options.add_command(
         commands, "look", run, "the gripper's look as a measurement, beside the edges alone", __doc__ or "", seed=True
     )
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows: conditions, or rendered sequences")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows: conditions, rendered sequences, motions")
     parser.add_argument("--scenes", type=int, default=2, metavar="N", help="simulated scenes of a condition")
+    parser.add_argument(
+        "--motions", action="store_true", help="instead: frames until small motions of the mount are noticed"
+    )
     parser.add_argument("--frames", type=int, default=FRAMES, metavar="N", help="of a simulated scene")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Prints a table; TCP errors in micrometres, x / y / z of the camera."""
+    if arguments.motions:
+        print(MOTIONS_HEAD)
+        for motion in MOTIONS:
+            if not arguments.only or motion.name in arguments.only:
+                print(motion_row(motion, arguments.seed, arguments.scenes, _monitors), flush=True)
+        return 0
     print(_HEAD)
     for name, sequence in _rows(arguments):
         print(f"look: {name}", file=sys.stderr)
@@ -92,25 +103,22 @@ def compared(name: str, sequence: Sequence) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _monitors(sequence: Sequence) -> list[Monitor]:
+    """One without the look, one with it."""
+    covariance = tuple(sequence.start_covariance.ravel().tolist())
+    reference = ReferenceRecord("start", 0, 0, "configuration", to_record(sequence.start_cam_T_grip), covariance)
+    settings = MonitorSettings(drift=DriftSettings(frames_per_s=sequence.fps))
+    if sequence.jaw_sigma_m is not None:
+        settings = msgspec.structs.replace(settings, jaw_sigma_m=sequence.jaw_sigma_m)
+    each = [msgspec.structs.replace(settings, look=LookSettings(enabled=enabled)) for enabled in (False, True)]
+    return [Monitor(sequence.camera, sequence.gripper, one, reference, sequence.taught) for one in each]
+
+
 class _Both:
     """Two monitors on one sequence, frame by frame."""
 
     def __init__(self, sequence: Sequence) -> None:
-        covariance = tuple(sequence.start_covariance.ravel().tolist())
-        reference = ReferenceRecord("start", 0, 0, "configuration", to_record(sequence.start_cam_T_grip), covariance)
-        settings = MonitorSettings(drift=DriftSettings(frames_per_s=sequence.fps))
-        if sequence.jaw_sigma_m is not None:
-            settings = msgspec.structs.replace(settings, jaw_sigma_m=sequence.jaw_sigma_m)
-        self._monitors = [
-            Monitor(
-                sequence.camera,
-                sequence.gripper,
-                msgspec.structs.replace(settings, look=LookSettings(enabled=enabled)),
-                reference,
-                sequence.taught,
-            )
-            for enabled in (False, True)
-        ]
+        self._monitors = _monitors(sequence)
         self.rows: tuple[list[Row], list[Row]] = ([], [])
         self.misleading = [0, 0]
 
