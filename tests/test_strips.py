@@ -139,6 +139,16 @@ def test_hidden_or_of_one_shade_they_are_seen_nowhere():
         assert not seen.here
 
 
+@pytest.mark.parametrize("level_dn", [10.0, 240.0])
+def test_what_lies_behind_the_fingers_ends_is_no_part_of_them(level_dn: float):
+    """Learnt before one background, and seen before another."""
+    fingers = FingerLook(level_dn=100.0, texture=0.05, marks=LINED.marks)
+    strips = taught(filmed(fingers, background=Background(kind="plain", contrast=0.0, level_dn=100.0)))
+    other = filmed(fingers, background=Background(kind="plain", contrast=0.0, level_dn=level_dn))
+    truth = other.truth(LAST)
+    assert strips.compare(other.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, RISK) == (None, True)
+
+
 def test_they_go_on_after_a_restart():
     simulation, strips, image = lined()
     state = strips.state()

@@ -411,12 +411,18 @@ def test_one_frame_is_no_knock_nor_are_two_with_the_old_place_between_them():
     trust = new_monitor()._trust
     seen = Trust(Protection(0.0, 0.0, 1e-5), proven=True, displaced=True)
     at_home, explained = replace(seen, displaced=False), replace(seen, ambiguous=True)
-    assert not trust._knocked(seen, 10.0) and not trust._knocked(replace(seen, proven=False), 10.0)
-    assert trust._knocked(seen, 10.0), "seen there before"
+    assert not trust._knocked(seen, 10.0, False) and not trust._knocked(replace(seen, proven=False), 10.0, False)
+    assert trust._knocked(seen, 10.0, False), "seen there before"
     for between in (at_home, explained):
-        assert not trust._knocked(between, 0.0) and not trust._knocked(seen, 10.0)
-        assert trust._knocked(seen, 10.0)
-    assert not trust._knocked(at_home, 0.0) and trust._knocked(seen, 1.0), "creeps are followed"
+        assert not trust._knocked(between, 0.0, False) and not trust._knocked(seen, 10.0, False)
+        assert trust._knocked(seen, 10.0, False)
+    assert not trust._knocked(at_home, 0.0, False) and trust._knocked(seen, 1.0, False), "creeps are followed"
+
+
+def test_one_frame_is_a_knock_where_the_ends_and_what_the_fingers_show_along_themselves_agree():
+    seen = Trust(Protection(0.0, 0.0, 1e-5), proven=True, displaced=True)
+    for trust, knocked in ((seen, True), (replace(seen, proven=False), False), (replace(seen, ambiguous=True), False)):
+        assert new_monitor()._trust._knocked(trust, 10.0, seen_along=True) == knocked
 
 
 # --- what a pose elsewhere has to stand against ---

@@ -62,8 +62,12 @@ def make_grid(
     cameras.  Missing ranges keep the present value, except distance and tilt, which have default ranges.  ``at_px``:
     position of the TCP in the present camera's image (None: as now), which is also returned.
 
-    Raises :class:`InputError` for impossible lenses, a position outside the image, and too many mounts.
+    Raises :class:`InputError` for values out of bounds, impossible lenses, a position outside the image, and too many
+    mounts.
     """
+    for name, values in ranges.items():
+        if wrong := _wrong_with(name, values):
+            raise InputError(f"{wrong}; {_in_words(name)}", name)
     present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
     distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
     turns = {"tilt": ranges.get("tilt") or _spaced(*_TILTS_DEG)}
@@ -92,8 +96,7 @@ def values_in(name: str, text: str) -> tuple[float, ...]:
     """The values, ascending, of a range for :func:`make_grid` as a person types it: FIRST:LAST:COUNT, or single ones
     with commas.  Raises :class:`InputError` for another text, and values out of bounds.
     """
-    lowest, highest, unit = _BOUNDS[name]
-    right = f"FIRST:LAST:COUNT or values with commas, {lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
+    right = f"FIRST:LAST:COUNT or values with commas, {_in_words(name)}"
     try:
         if ":" in text:
             first, last, number = text.split(":")
@@ -105,11 +108,22 @@ def values_in(name: str, text: str) -> tuple[float, ...]:
             values = [float(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{text}: isn't a range; {right}", name) from None
-    wrong = [v for v in values if not lowest <= v <= highest]
-    if wrong or len(values) > _MOST_VALUES:
-        what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
-        raise InputError(f"{text}: {what}; {right}", name)
+    if wrong := _wrong_with(name, values):
+        raise InputError(f"{text}: {wrong}; {right}", name)
     return tuple(sorted(set(values)))
+
+
+def _in_words(name: str) -> str:
+    lowest, highest, unit = _BOUNDS[name]
+    return f"{lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
+
+
+def _wrong_with(name: str, values: Sequence[float]) -> str:
+    lowest, highest, unit = _BOUNDS[name]
+    wrong = [value for value in values if not lowest <= value <= highest]
+    if wrong:
+        return f"{wrong[0]:g} {unit} is out of bounds"
+    return f"has {len(values)} values" if len(values) > _MOST_VALUES else ""
 
 
 def _spaced(first: float, last: float, count: int) -> list[float]:

@@ -34,12 +34,15 @@ it.
 
 
 class _Candidate(NamedTuple):
-    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), and its worth."""
+    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), its worth, and whether
+    what the fingers show along themselves is seen there.
+    """
 
     measurement: Measurement
     cam_T_grip: Array
     covariance: Array
     trust: Trust
+    seen_along: bool = False
 
 
 class Integrity:
@@ -166,7 +169,7 @@ class Integrity:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
             self._ends_seen = trust.proven
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, trust), now_s)
-        measurement, cam_T_grip, _, trust = here
+        measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
@@ -183,16 +186,19 @@ class Integrity:
         taken for their ends: also at the expected place, if a knock brought it there.  If the gripper isn't measured
         where the look has it either: the same pose, bounded without the ends.
         """
-        weigher, (measurement, cam_T_grip, _, trust) = self._weigher, here
+        weigher, measurement, cam_T_grip, trust = self._weigher, here.measurement, here.cam_T_grip, here.trust
         along = self._along(frame, measurement, cam_T_grip)
         if along.slide_m is not None:
             self._slid_until_s = now_s + self._policy.hold_s
             slid_T = cam_T_grip.copy()
             slid_T[:3, 3] += cam_T_grip[:3, :3] @ along.slide_m
             again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
-            if again is not None and self._along(frame, again.measurement, again.cam_T_grip).slide_m is None:
-                return again
+            if again is not None:
+                along = self._along(frame, again.measurement, again.cam_T_grip)
+                if along.slide_m is None:
+                    return again._replace(seen_along=along.here)
         else:
+            here = here._replace(seen_along=along.here)
             if along.here and not trust.displaced:
                 self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
             if trust.displaced or now_s >= self._slid_until_s:
@@ -256,13 +262,13 @@ class Integrity:
 
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """What to publish of a place, and whether it becomes the anchor."""
-        measurement, cam_T_grip, covariance, trust = candidate
+        measurement, cam_T_grip, covariance, trust, seen_along = candidate
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
-        moved = self._knocked(trust, beside_px)
+        moved = self._knocked(trust, beside_px, seen_along)
         knocked = moved and beside_px >= ONE_EDGE_PX
         settles = trust.proven and (moved or not trust.displaced)
         unproven = self._weigher.anchor is not None and not settles
@@ -282,16 +288,17 @@ class Integrity:
         why = "the fingers stand elsewhere, or the mount was knocked just now"
         return _reaching(standing, self._weigher.expected[0], why)
 
-    def _knocked(self, trust: Trust, beside_px: float) -> bool:
+    def _knocked(self, trust: Trust, beside_px: float, seen_along: bool) -> bool:
         """Whether the mount was knocked; the edges show ``beside_px`` from the old place.  Knocks are so rare that one
-        frame doesn't suffice, unless the motion is as small as a creep.  Further frames have to prove the new place
-        before the old one is proven again or something else explains the motion; the mount may ring meanwhile.  Before
-        the fingers' look is known they prove nothing: that a mark was taken for the ends is less rare than a knock.
+        frame doesn't suffice, unless what the fingers show along themselves is seen there, too, or the motion is as
+        small as a creep.  Further frames have to prove the new place before the old one is proven again or something
+        else explains the motion; the mount may ring meanwhile.  Before the fingers' look is known they prove nothing:
+        that a mark was taken for the ends is less rare than a knock.
         """
         if not trust.proven:
             return False
         self._elsewhere = self._elsewhere + 1 if trust.displaced and not trust.ambiguous else 0
-        if beside_px < ONE_EDGE_PX:
+        if beside_px < ONE_EDGE_PX or seen_along:
             return self._elsewhere >= 1
         unknown = self._weigher.anchor is not None and self._strips.awaited
         return self._elsewhere >= self._policy.confirm_frames and not unknown

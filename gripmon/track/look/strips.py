@@ -209,6 +209,8 @@ class FingerStrips:
         if not px_per_m > 0.0:
             return
         pitch_m = 1.0 / px_per_m
+        # What the filters take in at the first point must be the finger, not what lies behind its end.
+        start, length_m = start + FILTERED_PX * pitch_m * way, length_m - FILTERED_PX * pitch_m
         long_enough = length_m >= SHORTEST_PX * pitch_m
         if not long_enough.any():
             return
