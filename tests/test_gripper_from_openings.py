@@ -115,7 +115,7 @@ def test_tapered_fingers_are_tracked_before_other_backgrounds() -> None:
             errors.append(perturbation_between(truth @ true_T_made, from_record(record.cam_T_grip)))
             assert record.protection is not None
             assert np.linalg.norm(errors[-1][:3]) <= record.protection.position_m
-    assert len(errors) >= 0.9 * (frames - 1)
+    assert len(errors) >= 0.75 * (frames - 1)
     assert np.quantile(np.abs(np.array(errors)[:, :2]), 0.95) < 5e-5
     assert np.quantile(np.abs(np.array(errors)[:, 2]), 0.95) < 1.5e-4
 

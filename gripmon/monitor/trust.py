@@ -186,7 +186,7 @@ class Integrity:
         taken for their ends: also at the expected place, if a knock brought it there.  If the gripper isn't measured
         where the look has it either: the same pose, bounded without the ends.
         """
-        weigher, measurement, cam_T_grip, trust = self._weigher, here.measurement, here.cam_T_grip, here.trust
+        weigher, (measurement, cam_T_grip, covariance, trust, _) = self._weigher, here
         along = self._along(frame, measurement, cam_T_grip)
         if along.slide_m is not None:
             self._slid_until_s = now_s + self._policy.hold_s
@@ -198,7 +198,7 @@ class Integrity:
                 if along.slide_m is None:
                     return again._replace(seen_along=along.here)
         else:
-            here = here._replace(seen_along=along.here)
+            here = _Candidate(measurement, cam_T_grip, covariance, trust, along.here)
             if along.here and not trust.displaced:
                 self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
             if trust.displaced or now_s >= self._slid_until_s:

@@ -145,7 +145,7 @@ class FingerStrips:
         for each slide that is tried.
         """
         layout = self._layout
-        if layout is None or not self.ready:
+        if layout is None or self._own == 0.0:
             return StripsSeen()
         most, learnt, own = self._most, self._learnt, self._own
         # Gain and brightness are free: light changes.
