@@ -149,6 +149,19 @@ def test_what_lies_behind_the_fingers_ends_is_no_part_of_them(level_dn: float):
     assert strips.compare(other.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, RISK) == (None, True)
 
 
+@pytest.mark.parametrize("pitch_m", [1e-3, 2e-3, 4e-3])
+def test_ribs_that_look_alike_a_rib_farther_on_are_seen_nowhere(pitch_m: float):
+    ribs = [
+        FingerMark(from_tip_m=(k * pitch_m, (k + 0.5) * pitch_m), across=(-2.0, 2.0), gain=0.5)
+        for k in range(1, round(0.03 / pitch_m))
+    ]
+    simulation = filmed(FingerLook(texture=0.05, marks=tuple(ribs)))
+    strips, image, truth = taught(simulation), simulation.render(LAST), simulation.truth(LAST)
+    for way_m in (0.0, pitch_m, -pitch_m):
+        seen = strips.compare(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+        assert not seen.here
+
+
 def test_they_go_on_after_a_restart():
     simulation, strips, image = lined()
     state = strips.state()

@@ -274,3 +274,26 @@ def test_a_knock_along_fingers_with_round_tips_is_found_and_told(knock_m: float)
     assert valid[-15:].all() and error_m[-15:].max() < 3e-4 and error_m[valid].max() < 1e-3
     told = {alert.kind for record in seen.records for alert in record.alerts}
     assert told & {AlertKind.STEP, AlertKind.DRIFT}
+
+
+# --- a finger that is alone ---
+
+
+@pytest.mark.parametrize("away_m", [0.0, 1e-3])
+def test_of_a_lone_finger_that_may_have_slid_along_itself_no_look_is_learnt(away_m: float):
+    """Found a millimetre along from its reference: that may be a mark's place, and only a person can say."""
+    model = box_fingers(bevel_m=0.0)
+    model["fingers"] = {"left": model["fingers"]["left"]}
+    model["points"] = {name: point for name, point in model["points"].items() if point["finger"] == "left"}
+    model["edges"] = {name: edge for name, edge in model["edges"].items() if edge["from"] in model["points"]}
+    model["faces"] = [face for face in model["faces"] if face["finger"] == "left"]
+    gripper, camera, pose = gripper_from_dict(model), make_camera(PAPER_LENS), nominal_cam_T_grip()
+    simulator = Simulator(camera, gripper, pose, Scenario(name="lone", fps=FPS, duration_s=1.0), 1)
+    reference_T = pose.copy()
+    reference_T[:3, 3] += away_m * pose[:3, 2]
+    monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(reference_T))
+    for k in range(10):
+        monitor.process(simulator.frame(k))
+    anchor = monitor._trust._weigher.anchor
+    assert anchor is not None, "its ends were seen"
+    assert monitor._trust._strips.awaited == (away_m > 0.0)

@@ -34,15 +34,15 @@ it.
 
 
 class _Candidate(NamedTuple):
-    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), its worth, and whether
-    what the fingers show along themselves is seen there.
+    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), where the fingers are
+    seen along themselves from there, and its worth.
     """
 
     measurement: Measurement
     cam_T_grip: Array
     covariance: Array
+    along: StripsSeen
     trust: Trust
-    seen_along: bool = False
 
 
 class Integrity:
@@ -162,14 +162,15 @@ class Integrity:
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
         weigh = self._weigher.weigh
         cam_T_grip, covariance = self._tracker.update(measurement)
+        along = self._along(frame, measurement, cam_T_grip)
         trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
         if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
             self._ends_seen = trust.proven
-        here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, trust), now_s)
-        measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
+        here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
+        measurement, cam_T_grip, _, along, trust = here
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
@@ -186,23 +187,19 @@ class Integrity:
         taken for their ends: also at the expected place, if a knock brought it there.  If the gripper isn't measured
         where the look has it either: the same pose, bounded without the ends.
         """
-        weigher, (measurement, cam_T_grip, covariance, trust, _) = self._weigher, here
-        along = self._along(frame, measurement, cam_T_grip)
+        weigher, (measurement, cam_T_grip, _, along, trust) = self._weigher, here
         if along.slide_m is not None:
             self._slid_until_s = now_s + self._policy.hold_s
             slid_T = cam_T_grip.copy()
             slid_T[:3, 3] += cam_T_grip[:3, :3] @ along.slide_m
             again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
-            if again is not None:
-                along = self._along(frame, again.measurement, again.cam_T_grip)
-                if along.slide_m is None:
-                    return again._replace(seen_along=along.here)
-        else:
-            here = _Candidate(measurement, cam_T_grip, covariance, trust, along.here)
-            if along.here and not trust.displaced:
-                self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
-            if trust.displaced or now_s >= self._slid_until_s:
-                return here
+            if again is not None and again.along.slide_m is None:
+                return again
+        elif along.here and not trust.displaced:
+            self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
+            return here
+        elif trust.displaced or now_s >= self._slid_until_s:
+            return here
         return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
 
     def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
@@ -243,9 +240,8 @@ class Integrity:
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
-        along = self._along(frame, there.measurement, there.cam_T_grip)
-        not_slid = along.slide_m is None and now_s >= self._slid_until_s
-        return there if along.here or not_slid else None
+        not_slid = there.along.slide_m is None and now_s >= self._slid_until_s
+        return there if there.along.here or not_slid else None
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
         """The measurement at a pose (4, 4), of edges within the standard deviations (6,) of it; None where no edge is
@@ -256,19 +252,19 @@ class Integrity:
             return None
         measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
-        ends = self._tracker.ends(frame, measurement)
+        ends, along = self._tracker.ends(frame, measurement), self._along(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, ends, now_s)
-        return _Candidate(measurement, cam_T_grip, covariance, trust)
+        return _Candidate(measurement, cam_T_grip, covariance, along, trust)
 
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """What to publish of a place, and whether it becomes the anchor."""
-        measurement, cam_T_grip, covariance, trust, seen_along = candidate
+        measurement, cam_T_grip, covariance, along, trust = candidate
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
-        moved = self._knocked(trust, beside_px, seen_along)
+        moved = self._knocked(trust, beside_px, along.here)
         knocked = moved and beside_px >= ONE_EDGE_PX
         settles = trust.proven and (moved or not trust.displaced)
         unproven = self._weigher.anchor is not None and not settles
@@ -276,7 +272,7 @@ class Integrity:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if knocked:
                 self._slid_until_s = -math.inf
-            if frame.image is not None and not moved:
+            if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)

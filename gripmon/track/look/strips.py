@@ -156,7 +156,8 @@ class FingerStrips:
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
         if beyond_chance * _unexplained(EXPLAINED_CORRELATION) >= _unexplained(alike_here):
             # Usually: no slide could be so much better.
-            return StripsSeen(here=alike_here >= EXPLAINED_CORRELATION)
+            alone = beyond_chance * _unexplained(EXPLAINED_CORRELATION) <= _unexplained(self._alike_beside)
+            return StripsSeen(here=bool(alone) and alike_here >= EXPLAINED_CORRELATION)
         strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
@@ -175,6 +176,7 @@ class FingerStrips:
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
         self._learnt = np.clip(self._mean, -self._most, self._most)
         self._own = float(np.square(self._learnt).sum())
+        self._alike_beside = _alike_beside(self._learnt, layout.within)
 
     def _read(
         self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
@@ -270,6 +272,21 @@ class FingerStrips:
             passed |= further
             begin += sorted(further)
         return out
+
+
+def _alike_beside(strips: NDArray[np.float32], within: NDArray[np.float32]) -> float:
+    """The largest correlation of strips with themselves, slid by :data:`SMALLEST_SLIDE_PX` and more: a broad line looks
+    alike beside its place, and ribs do one farther on.
+    """
+    reach = LENGTH_PX - SHORTEST_PX
+    wide = (0, 0), (reach, reach)
+    slid, shown = np.pad(strips, wide), np.pad(within, wide)
+    product = cv2.matchTemplate(slid, strips, cv2.TM_CCORR).ravel()
+    theirs = cv2.matchTemplate(np.square(slid), within, cv2.TM_CCORR).ravel()
+    own = cv2.matchTemplate(shown, np.square(strips), cv2.TM_CCORR).ravel()
+    alike = product / np.sqrt(np.maximum(theirs * own, 0.0) + 1e-12)
+    alike[reach - SMALLEST_SLIDE_PX + 1 : reach + SMALLEST_SLIDE_PX] = 0.0
+    return float(alike.max())
 
 
 def _unexplained(alike: Any) -> Any:
