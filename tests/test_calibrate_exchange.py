@@ -266,7 +266,7 @@ BAD: list[tuple[tuple[object, ...], str]] = [
     (("import", "gripper.yaml", "--out", "new.yaml", "--size", "big"), "'big' isn't an image size"),
     (("verify", "camera.yaml", "hand_eye.yaml"), "640 x 480 px and of 768 x 576 px"),
     (("verify", "hand_eye.yaml", "hand_eye.yaml", "hand_eye.yaml"), "hand_eye.yaml: a third calibration"),
-    (("verify", "hand_eye.yaml", "hand_eye.yaml", "--config", "config.yaml"), "--config: has a meaning only"),
+    (("verify", "hand_eye.yaml", "hand_eye.yaml", "--config", "config.yaml"), "--config: applies only"),
     (("verify", "hand_eye.yaml", "hand_eye.yaml", "--tolerance-mm", "1"), "--tolerance-deg: one without the other"),
     (("verify", "hand_eye.yaml", "hand_eye.yaml", "--level", "2"), "'2' isn't a probability of a false alarm"),
     (("verify", "hand_eye.yaml", "free1.png"), "--config: is missing"),

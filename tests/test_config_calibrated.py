@@ -131,7 +131,7 @@ def test_a_file_that_belongs_into_a_configuration_is_named_and_where(
 
 
 def test_a_file_of_corners_or_of_the_set_up_is_no_configuration_either(tmp_path: Path):
-    for text, kind in (("corners: {a: [1, 2]}", "a file with corners"), ("accepted: {}", "what was said to gripmon")):
+    for text, kind in (("corners: {a: [1, 2]}", "a file with corners"), ("accepted: {}", "the entries of gripmon")):
         (tmp_path / "a.yaml").write_text(text)
         with pytest.raises(ConfigError, match=f"a.yaml: is {kind}"):
             load_config(tmp_path / "a.yaml")

@@ -274,8 +274,8 @@ def test_over_http(cell: Cell):
     [
         (["--web", "--once"], "--once: has no effect beside --web; leave it out"),
         (["--web", "--seconds", "3"], "--seconds: has no effect beside --web; leave it out"),
-        (["--address", "127.0.0.1"], "--address: is for the page; add --web"),
-        (["--web", "--address", "0.0.0.0"], "--address 0.0.0.0: names no machine; the address by which others reach"),
+        (["--address", "127.0.0.1"], "--address: applies only to the page; add --web"),
+        (["--web", "--address", "0.0.0.0"], "--address 0.0.0.0: isn't a machine's address; the one at which"),
         (["--web", "--no-browser", "--address", "192.0.2.1"], "--address 192.0.2.1: can't be listened on"),
     ],
 )

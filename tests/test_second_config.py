@@ -151,7 +151,7 @@ def test_check_says_what_it_comes_to(folder: Path, capsys: pytest.CaptureFixture
     assert [row["pulses"] for row in report["foreseen"]["noticed"]] == sorted(
         row["pulses"] for row in report["foreseen"]["noticed"]
     )
-    assert "noticed    with 0.1 false alarms in 1000 pulses" in said
+    assert "detects    with 0.1 false alarms in 1000 pulses" in said
     assert report["pulses"]["count"] == 2 and report["pulses"]["key"] is None
     assert report["calibration"]["sigmas"]["base_T_cam.x_m"] == pytest.approx(8.6e-4, rel=0.3)
 

@@ -134,7 +134,7 @@ def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, c
     printed = capsys.readouterr().out
     hosts = "localhost, 127.0.0.1, ::1, 10.0.0.5, site.example"
     assert f"router-key.pem: made, common name router, for a router (and as a client) at {hosts}\n" in printed
-    text = "there already, left alone: common name operator, for a client only; to change that, delete both files\n"
+    text = "exists, unchanged: common name operator, for a client only; to change it, delete both files\n"
     assert f"operator-key.pem: {text}" in printed
     assert "arm7-key.pem: made, common name arm7, for a client only (--host makes it a router's)\n" in printed
     assert {file: file.read_bytes() for file in before} == before
@@ -265,7 +265,7 @@ def test_rules_for_more_robots_are_added_once(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("options", "said_text"),
     [
-        (["--rules", "router.json5"], "--rules for whom? add --robot NAME"),
+        (["--rules", "router.json5"], "--rules without a robot; add --robot NAME"),
         (["--robot", "a/b"], "--robot: 'a/b' can't be a robot's name in a certificate; letters, digits, - _ and ."),
         (["--robot", "a", "--rules", "{folder}/none"], "can't be written (No such file or directory)"),
         (["--robot", "a", "--rules", "{folder}/other"], "has no line '// robots: rules', before which"),

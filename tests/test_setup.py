@@ -254,9 +254,9 @@ def test_a_robots_own_calibration(tmp_path: Path):
     found = yaml.safe_load(text)["cam_T_grip"]
     np.testing.assert_allclose(found["translation_m"], cam_T_grip[:3, 3], atol=1e-12)
     turned = Rotation.from_quat(found["rotation_xyzw"]) * Rotation.from_matrix(cam_T_grip[:3, :3]).inv()
-    assert turned.magnitude() < 1e-9 and said == "TCP at 1.0, 2.0, 120.0 mm before the camera"
+    assert turned.magnitude() < 1e-9 and said == "TCP at 1.0, 2.0, 120.0 mm in the camera frame"
     for values, words in (
-        ({"a": 1}, "holds no hand/eye calibration"),
+        ({"a": 1}, "contains no hand/eye calibration"),
         ({"cam_T_grip": {"translation_m": [0.0, 0.0, 120.0], "rotation_xyzw": [0, 0, 0, 1]}}, "120 mm were meant"),
         (written | {"flange_T_cam": {"translation_m": [0, 0, 0], "rotation_xyzw": [1, 1, 0, 0]}}, "flange_T_cam"),
     ):
@@ -298,7 +298,7 @@ def test_grippers_from_cad_and_images_are_commands(tmp_path: Path):
     project.keep({"options": "'"})
     assert "words as on a command line" in project.states()[4].note
     project.keep({"gripper": "two_box_fingers", "reference_by": "with the gripper's images"})
-    with pytest.raises(InputError, match="no images gave this gripper"):
+    with pytest.raises(InputError, match="this gripper wasn't made from images"):
         project.do("standing")
 
 
@@ -328,7 +328,7 @@ def test_an_inferred_gripper_is_a_step_that_is_said(tmp_path: Path):
 def test_a_jaw_range_is_told_where_it_is_said(tmp_path: Path):
     project = Project(tmp_path)
     still, _ = project.do("gripper")
-    assert still.level == "WARN" and "they are taken to stand still" in still.text
+    assert still.level == "WARN" and "the jaws are assumed never to move" in still.text
     for wrong, said in (("60", "isn't a range"), ("0:60", "millimetres"), ("0.06:0", "doesn't ascend")):
         project.keep({"jaw_range": wrong})
         with pytest.raises(InputError, match=f"jaws move: .*{said}"):
@@ -487,7 +487,7 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         with pytest.raises(BadRequest, match="no step nose"):
             _sent(site, "open", Do(step="nose"))
         project.keep({"gripper": "from the plate"})
-        with pytest.raises(InputError, match="that is inferred needs its images on the target"):
+        with pytest.raises(InputError, match="an inferred gripper needs its images on the target"):
             project.do("standing")
     finally:
         site.close()
@@ -520,9 +520,9 @@ def _started_and_stopped(site: SetupSite, folder: Path) -> None:
     _sent(site, "start", Nothing())
     wait_until(lambda: any("/dev/video987" in line for line in site.state().monitor.lines), "what the monitor says")
     assert site.state().monitor.running and site.state().monitor.ended is None
-    with pytest.raises(BadRequest, match="runs already"):
+    with pytest.raises(BadRequest, match="is already running"):
         _sent(site, "start", Nothing())
-    with pytest.raises(BadRequest, match="the monitor has the camera"):
+    with pytest.raises(BadRequest, match="the monitor uses the camera"):
         _sent(site, "capture", CaptureOrder(step="teaching", action="start"))
     _sent(site, "stop", Nothing())
     assert (site.state().monitor.running, site.state().monitor.ended) == (False, "stopped")

@@ -318,7 +318,7 @@ def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["snapshot"], "send: snapshot has nowhere to go; --out DIR"),
+        (["snapshot"], "send: snapshot needs a folder; --out DIR"),
         (["state", "--out", "x"], "send: state writes nothing; leave --out out"),
         (["state", "--request", "x"], "send: state changes nothing"),
         (["snapshot", "r-1", "--out", "x"], "send: snapshot takes no ID"),

@@ -160,7 +160,7 @@ def test_a_gripper_without_faces_is_drawn_by_its_edges(tmp_path: Path, capsys: p
     said = capsys.readouterr().out
     assert "best " in said and "no faces   The gripper file has none" in said
     assert main(["check", str(config), "--verbose"]) == 0
-    assert "the gripper file has no faces: what the finger itself hides isn't known" in capsys.readouterr().out
+    assert "the gripper file has no faces: which of its own edges a finger hides is unknown" in capsys.readouterr().out
     # The present mount's thumbnail, the second of three, shows dark lines on blank grey and little else.
     second = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[-400:-120, 530:970]
     assert 0.01 < (second < 80).mean() < 0.2 and (abs(second.astype(int) - 170) < 4).mean() > 0.6
@@ -177,14 +177,14 @@ def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--distance", "0.1"], "--distance: only has a meaning for a sweep; add --sweep"),
+        (["--distance", "0.1"], "--distance: applies only to a sweep; add --sweep"),
         (["--sweep", "--distance", "80:200:7"], "80 m is out of bounds; FIRST:LAST:COUNT or values with commas"),
         (["--sweep", "--distance", "0.1:0.2"], "--distance 0.1:0.2: isn't a range"),
         (["--sweep", "--distance", "nan"], "nan m is out of bounds"),
         (["--sweep", "--distance", ""], "--distance : isn't a range"),
         (["--sweep", "--jaw", "0.02"], "--jaw 0.02: isn't a range; MIN:MAX in metres, within 0:0.06"),
         (["--sweep", "--jaw", "0.02:0.2"], "--jaw 0.02:0.2: is not in the jaw's travel"),
-        (["--jaw", "0.02:0.03"], "--jaw: only has a meaning for a sweep"),
+        (["--jaw", "0.02:0.03"], "--jaw: applies only to a sweep"),
         (["--sweep", "--tilt", "10:60:0"], "--tilt 10:60:0: isn't a range"),
         (["--sweep", "--tilt", "ten"], "--tilt ten: isn't a range"),
         (["--sweep", "--tilt=-10"], "-10 degrees is out of bounds"),

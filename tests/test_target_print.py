@@ -110,6 +110,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert "is there already" in capsys.readouterr().err
     assert main(["target", "checkerboard:9x6:0.02", "--pdf", str(pdf), "--force", "--paper", "letter"]) == 0
     assert main(["target", "--pdf", str(tmp_path / "plate.png")]) == 2
-    assert "is no PDF's name" in capsys.readouterr().err
+    assert "isn't the name of a PDF" in capsys.readouterr().err
     assert main(["target", "--pdf", str(tmp_path / "x.pdf"), "--paper", "a9"]) == 2
     assert capsys.readouterr().err.startswith("--paper")

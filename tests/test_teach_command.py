@@ -85,7 +85,7 @@ def taught(rig: Path) -> Path:
     )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert f"written: {rig / 'taught.yaml'}" in done.stdout and "put the line" not in done.stdout
+    assert f"written: {rig / 'taught.yaml'}" in done.stdout and "add the line" not in done.stdout
     assert len([line for line in done.stdout.splitlines() if line.endswith(("outline", "crease"))]) == 10
     return rig / "taught.yaml"
 
@@ -192,13 +192,13 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
     assert "names" in fault([*arguments, "--out", out, "--force", "--into-config"], capsys) and out.read_text() == "old"
     assert main([*map(str, arguments), "--out", str(out), "--force"]) == 0
     text = capsys.readouterr().out
-    assert f"put the line `taught: {out}` into" in text
+    assert f"add the line `taught: {out}` to" in text
     # A configuration that names none gets the line, by the command.
     mine = rig / "mine.yaml"
     mine.write_text(f"# my own words\n{(rig / 'untaught.yaml').read_text()}")
     words = ["teach", rig / "first" / "0.png", "--config", mine, "--out", tmp_path / "third.yaml", "--into-config"]
     assert main([*map(str, words)]) == 0
-    assert "put the line" not in capsys.readouterr().out and mine.read_text().startswith("# my own words\n")
+    assert "add the line" not in capsys.readouterr().out and mine.read_text().startswith("# my own words\n")
     assert load_config(mine).taught is not None and load_config(mine).taught_path.resolve() == tmp_path / "third.yaml"
     mine.unlink()
     assert len(to_settings(read_yaml(out), TaughtModel).provenance.images) == 1

@@ -1,6 +1,6 @@
-"""The command ``gripmon``: one declaration a subcommand, nothing heavy imported before a subcommand runs.
+"""The command ``gripmon``: one declaration per subcommand, no heavy import before a subcommand runs.
 
-``argparse`` stays: it costs no import time, and its error lines and exit codes are what scripts rely on.
+It uses ``argparse``, which costs no import time; scripts rely on its error lines and exit codes.
 """
 
 from __future__ import annotations
@@ -51,37 +51,37 @@ _LAST = (setup.setup, setup.target, teach.teach, certificates.certificates)
 
 _EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 
-# To be set before NumPy and OpenCV are imported; what the user has set stays.
+# Set before NumPy and OpenCV are imported, unless the user has set them.
 _ENVIRONMENT = {
     # One thread: the matrices are tiny, and the same input then gives the same bytes.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    # A camera that is absent, or a file that isn't a video, we report in our own words.
+    # We report missing cameras and files that aren't videos ourselves.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
-    # rerun's own lines, read when it is imported: so are a disk that is full and a file that is damaged.
+    # rerun reads this at import; we report full disks and damaged files ourselves.
     "RUST_LOG": "off",
 }
 
 _DESCRIPTION = """\
-gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the
-fingertips' corners, corrects the hand/eye calibration cam_T_grip, says whether it can still be
-trusted, and publishes it over Zenoh."""
+gripmon monitors a robot's wrist camera that sees its own fingertips: in every frame it measures the
+fingertips' edges and corners, corrects the hand/eye calibration cam_T_grip, judges whether it may be
+used, and publishes it over Zenoh."""
 
 _EPILOG = """\
 first steps:
-  gripmon demo                                   everything at work on a simulated camera, 20 s
+  gripmon demo                                   the whole system on a simulated camera, 20 s
   gripmon setup arm1                             from your camera to a running monitor, on one page
-  gripmon check arm1/config.yaml                 is a configuration sound?
+  gripmon check arm1/config.yaml                 validate a configuration
   gripmon run arm1/config.yaml                   the daemon
 
 exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what
-would be right); 3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
+would be right); 3 the monitored system failed (for example: no usable frame); 130 interrupted"""
 
 _CALIBRATE = """\
 The off-line methods, from images alone.  Each writes a file with residuals, covariance and
-provenance, whole or not at all, and replaces none without --force."""
+provenance, atomically, and replaces none without --force."""
 
 _CALIBRATE_EPILOG = """\
 examples:
@@ -94,8 +94,8 @@ exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated 
 
 
 _GRIPPER = """\
-Make a gripper file from what there is of a gripper.  Each way writes it whole or not at all, and
-replaces none without --force."""
+Make a gripper file from CAD or from images.  The file is written atomically, and none is replaced
+without --force."""
 
 _GROUPS = (
     (
@@ -131,7 +131,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 class _PrintCompletion(argparse.Action):
-    """Print what a shell needs to complete commands, options, choices and files:
+    """Print a shell's completion script for commands, options, choices and files:
     source <(gripmon --print-completion bash).
     """
 
@@ -146,7 +146,7 @@ class _PrintCompletion(argparse.Action):
 
 
 def _complete_files(parser: argparse.ArgumentParser, files: Any) -> None:
-    """Let every value be completed as a file's name: with a completion of a command's own, a shell's doesn't count."""
+    """Complete every value as a file name, because a command's own completion replaces the shell's."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
@@ -156,7 +156,7 @@ def _complete_files(parser: argparse.ArgumentParser, files: Any) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command line (default: the process's own) return its exit code; wrong usage raises ``SystemExit(2)``."""
+    """Run a command line (default: the process's own); return its exit code; wrong usage raises ``SystemExit(2)``."""
     parser = build_parser()
     chosen = parser.parse_args(arguments, Arguments())
     if not hasattr(chosen, "command"):
@@ -175,14 +175,14 @@ def main(arguments: list[str] | None = None) -> int:
         print("gripmon: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output has seen enough.  Python would complain once more at exit without this.
+        # The reader of our output has closed it.  Without this Python would report it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     return code
 
 
 def _in_words(error: InputError | NoResultError, arguments: Arguments) -> str:
-    """The line that says it; where a function's argument is wrong, the option stands in front."""
+    """The error's line; if a function's argument is wrong, its option is put in front."""
     command: Command = arguments.command
     if isinstance(error, InputError):
         for name in (error.argument, error.argument.rpartition("_")[0]):

@@ -31,16 +31,16 @@ _LASER_OPTIONS = """
 DATA...               table of samples: .csv, .yaml or .json
 --camera CAMERA.yaml  the camera: a file of gripmon calibrate intrinsics
 --out FILE.yaml       file to write
---picture FILE.png    also a picture of residuals and scene
---recording FILE.rrd  also the scene as a rerun recording
---refine-lens         estimate the lens, too, within its calibration's covariance; else it stays as it is, and what its
-                      covariance leaves open is in the result's
+--picture FILE.png    also draw residuals and scene
+--recording FILE.rrd  also write the scene as a rerun recording
+--refine-lens         also estimate the lens, within its calibration's covariance; otherwise it is held, and its
+                      covariance is included in the result's
 --arm-noise M:RAD     standard deviations of the arm's poses, position (m) and rotation (rad), each axis
                       (default: none)
---plan FILE.csv       also write which poses would help the most next; --reach
---poses N             how many are planned (default 10)
---reach M             how far the arm reaches (m)
---force               replace files that are there
+--plan FILE.csv       also write the poses that would help most next; needs --reach
+--poses N             number of planned poses (default 10)
+--reach M             the arm's reach (m)
+--force               replace existing files
 """
 
 _LASER_EXAMPLES = """\
@@ -49,24 +49,24 @@ _LASER_EXAMPLES = """\
   gripmon calibrate laser spots.yaml --camera camera.yaml --refine-lens --arm-noise 0.0001:0.0002 --out laser.yaml
   gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --plan next.csv --reach 0.85
 
-exit codes: 0 written; 2 wrong usage or files; 3 the spots can't be calibrated from, and why:
+exit codes: 0 written; 2 wrong usage or files; 3 no calibration from these spots, with the reason:
 nothing is written then"""
 
 _ROBOT_WORLD_OPTIONS = """
 DATA...               table of poses: .csv, .yaml or .json
 --camera CAMERA.yaml  for images: a file of gripmon calibrate intrinsics
 --target TARGET       for images: as in gripmon calibrate intrinsics
---other-target        it is another target than the camera's, of the same pattern in another size
---eye-in-hand         the camera is on the hand, the target stands
+--other-target        the target is another one than the camera's, of the same pattern in another size
+--eye-in-hand         the camera is on the hand, the target is fixed
 --out FILE.yaml       file to write
---force               replace files that are there
+--force               replace existing files
 """
 
 _ROBOT_WORLD_EXAMPLES = """\
   gripmon calibrate robot-world poses.csv --out robot_world.yaml
   gripmon calibrate robot-world views.csv --camera camera.yaml --target charuco:8x6:0.03:0.022 --out robot_world.yaml
 
-exit codes: 0 written; 2 wrong usage or files; 3 the poses can't be calibrated from, and why:
+exit codes: 0 written; 2 wrong usage or files; 3 no calibration from these poses, with the reason:
 nothing is written then"""
 
 
@@ -84,11 +84,11 @@ def _reach(text: str) -> float:
 )  # fmt: skip
 def laser(arguments: Arguments) -> None:
     """Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
-    plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
-    row for each spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
+    plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with
+    one row per spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
     base_T_ee as tx_m, ty_m, tz_m with qx, qy, qz, qw or with rx_rad, ry_rad, rz_rad, or as m00 to m33; in
-    YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of three orientations
-    or more, better nine, the end-effector is shifted along three directions without turning: ten spots.
+    YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of at least three
+    orientations, better nine, shift the end-effector along three directions without turning: ten spots.
     """
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
@@ -98,7 +98,7 @@ def laser(arguments: Arguments) -> None:
 
     arguments.check_outputs("out", "picture")
     if arguments.plan is not None and arguments.reach is None:
-        raise InputError("--plan needs --reach: how far the arm reaches; metres")
+        raise InputError("--plan needs --reach, the arm's reach; metres")
     arguments.check_outputs("recording", "plan")
     noise = None if arguments.arm_noise is None else PoseNoise(*arguments.arm_noise)
     found = calibrate_laser(
@@ -161,11 +161,11 @@ _TILTS = ("plane.tilt_a", "plane.tilt_b", "laser.turn_a", "laser.turn_b")
 )  # fmt: skip
 def robot_world(arguments: Arguments) -> None:
     """Calibrate a fixed camera against an arm that holds a target, or with --eye-in-hand a camera on the arm
-    against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
-    DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
-    qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
-    or image, from which --camera and --target find it (a charuco board, or a chequerboard with an even and
-    an odd number of corners, wholly in view: others don't tell which way up they are).
+    against a fixed target: both unknown transforms together, from the arm's poses and the target's.
+    DATA are tables (.csv, .yaml, .json) with one row per pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
+    qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with the prefix cam_, or
+    image, in which it is measured with --camera and --target (a charuco board, or a chequerboard with an
+    even and an odd number of corners, wholly in view: others have no unique orientation).
     Turn the hand about at least two axes; ten poses or more are good.
     """
     from gripmon.calibrate.api import calibrate_robot_world

@@ -1,4 +1,4 @@
-"""``gripmon calibrate import`` and ``export``: calibrations of other programs, and for them."""
+"""``gripmon calibrate import`` and ``export``: calibrations from and for other programs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ FILE                file of the other program
 --format            its format (default: recognised by its content)
 --camera CAM        which camera of a camchain, e.g. cam1 (default: the only one)
 --size WIDTHxHEIGHT
-                    image size (px), of an OpenCV file that doesn't say it
---fisheye           the four coefficients of an OpenCV file are cv2.fisheye's; without fisheye_model it doesn't say so
+                    image size (px), for an OpenCV file without it
+--fisheye           the four coefficients of an OpenCV file are cv2.fisheye's; for a file without fisheye_model
 --out FILE.yaml     file to write
 --force             replace the file if there is one
 """
@@ -36,7 +36,7 @@ CALIBRATION  file with the calibration
 --out FILE   file to write (default: to the terminal)
 --force      replace the file if there is one
 --name NAME  the camera's name, or the calibration's in easy_handeye2 (default: gripmon)
---fit        cameras: if the format lacks this lens, write the nearest Brown-Conrady and print how far off it is
+--fit        cameras: if the format lacks this lens, write the nearest Brown-Conrady and print its deviation
 """
 
 _EXPORT_FRAMES = """
@@ -44,7 +44,7 @@ _EXPORT_FRAMES = """
 --camera-frame NAME           the camera's optical frame (default: camera_optical_frame)
 --robot-base-frame NAME       in an easy_handeye2 file (default: base_link)
 --tracking-marker-frame NAME  in an easy_handeye2 file (default: calibration_plate)
---gripper-in-camera           the gripper below the camera instead of the reverse
+--gripper-in-camera           the gripper as child of the camera instead of the reverse
 """
 
 _EXPORT_EXAMPLES = """\
@@ -54,7 +54,7 @@ _EXPORT_EXAMPLES = """\
   gripmon calibrate export hand_eye.yaml --format urdf --out wrist_joint.xml
   gripmon calibrate export ~/.local/state/gripmon/arm-wrist.json --format json
 
-exit codes: 0 written; 2 wrong usage or files, or a lens that the format hasn't: nothing is written then"""
+exit codes: 0 written; 2 wrong usage or files, or a lens that the format lacks: nothing is written then"""
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -75,7 +75,7 @@ def _name(text: str) -> str:
     format={"choices": CAMERA_FORMATS}, size=_size, fisheye={"default": None}, out=REQUIRED,
 )  # fmt: skip
 def import_(arguments: Arguments) -> None:
-    """Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
+    """Import a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
     FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content.
     """
     from gripmon.daemon.exchange import import_camera
@@ -98,16 +98,16 @@ def export(arguments: Arguments) -> None:
     """Write a camera as ROS camera_info, Kalibr camchain, OpenCV FileStorage or mrcal .cameramodel, or a
     hand/eye transform as a tf2 static transform command, a URDF joint with its origin, an easy_handeye2
     file or JSON.  CALIBRATION is a file of gripmon calibrate, a configuration, a monitor's state file
-    (its reference in force) or estimates.jsonl (the last valid one).
+    (its reference in force) or estimates.jsonl (its last valid transform).
 
     A hand/eye transform is written as the camera's pose in the gripper's frame (origin at the TCP, x
-    across the jaws, z out of the gripper), as a robot's tree runs; --gripper-in-camera turns it round.
+    across the jaws, z out of the gripper), in the order of a robot's tree; --gripper-in-camera inverts it.
     """
     from gripmon.daemon.exchange import export_calibration
 
     arguments.check_outputs("out")
     camera = arguments.format in CAMERA_FORMATS
-    # An option that would do nothing was meant for something.
+    # An option without effect is a mistake.
     unused = [*_FRAMES, "gripper_in_camera"] if camera else ["fit"]
     if not camera and arguments.format != "easy_handeye2":
         unused += ["robot_base_frame", "tracking_marker_frame"]

@@ -20,12 +20,12 @@ IMAGE...               image file, or folder with images
                        charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m),
                        circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), or FILE.yaml of a calibration with it
 --model                lens model; auto: the one with the smallest information criterion
-                       (default: brown_conrady; of a single image paper)
+                       (default: brown_conrady; for a single image paper)
 --fix NAME[=VALUE]...  hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square
-                       pixels) or fx_px=870.5 (there); may be given several times
+                       pixels) or fx_px=870.5 (at this value); may be repeated
 --out FILE.yaml        file to write
 --picture FILE.png     also draw the residuals over the image, and how each view fits
---force                replace files that are there
+--force                replace existing files
 --json                 one JSON object instead of text; px, the lens's own units
 """
 
@@ -35,7 +35,7 @@ _EXAMPLES = """\
       --out camera.yaml --picture maps.png
   gripmon calibrate intrinsics one.png --target circles:8x8:0.008:0.004 --out camera.yaml
 
-exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why:
+exit codes: 0 written; 2 wrong usage or files; 3 no calibration from these images, with the reason:
 nothing is written then"""
 
 
@@ -46,8 +46,8 @@ nothing is written then"""
 def intrinsics(arguments: Arguments) -> None:
     """Calibrate a camera from images of a flat target, each of which may show a part of it: focal lengths,
     principal point and lens with their standard deviations.  Best are ten to thirty images that fill the
-    view, corners included, the target tilted by 20 to 45 degrees to different sides.  From one image
-    comes a calibration with the principal point at the image's centre and square pixels, as in the
+    view, corners included, the target tilted by 20 to 45 degrees to different sides.  A single image
+    gives a calibration with the principal point at the image's centre and square pixels, as in the
     self-viewing method.
     """
     import cv2
@@ -72,14 +72,14 @@ def intrinsics(arguments: Arguments) -> None:
 
 
 def _fixed(arguments: Arguments) -> dict[str, float | None]:
-    """What is held, and at which value."""
+    """The held parameters and their values."""
     from gripmon.calibrate.api import check_fixed
 
     fixed: dict[str, float | None] = {}
     for text in arguments.fix:
         name, equals, number = text.partition("=")
         if name in fixed:
-            raise InputError(f"--fix {text}: is held already; each once")
+            raise InputError(f"--fix {text}: is held already; each parameter once")
         try:
             fixed[name] = float(number) if equals else None
         except ValueError:
@@ -97,7 +97,7 @@ def _summary(found: CameraFromViews, fixed: dict[str, float | None]) -> list[str
     lines = [f"{'parameter':<15} {'value':>14} {'±':>11}"]
     for name, value in fit.values.items():
         sigma = found.sigmas[name]
-        # A tied one has no deviation of its own: fy_px is fx_px with square pixels.
+        # A tied parameter has no deviation of its own: fy_px is fx_px with square pixels.
         lines.append(f"{name:<15} {value:>14.6g} {'held' if sigma is None else f'{sigma:.2g}':>11}")
     images = f"{views} of {views + len(found.not_found)} images"
     line = f"{images}, {found.points} points, {found.outliers} left out; rms {fit.rms_px:.3f} px"
@@ -107,7 +107,7 @@ def _summary(found: CameraFromViews, fixed: dict[str, float | None]) -> list[str
     if views == 1:
         given = any(fixed.get(name) is not None for name in ("cx_px", "cy_px"))
         centre = "as held" if given else "at the image's centre"
-        lines.append(f"from a single image: principal point {centre}, square pixels, one number of the lens")
+        lines.append(f"from a single image: principal point {centre}, square pixels, one lens coefficient")
     if fit.criterion is not None and len(fit.criterion) > 1:
         least = min(fit.criterion.values())
         lines.append("model            information criterion above the best")

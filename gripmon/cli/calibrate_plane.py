@@ -14,20 +14,20 @@ if TYPE_CHECKING:
 _OPTIONS = """
 IMAGE...                image file, or folder with images
 --target TARGET         the plate; see gripmon calibrate intrinsics
---other-target          it is another plate than the camera's, of the same pattern in another size
+--other-target          the plate is another one than the camera's, of the same pattern in another size
 --camera FILE.yaml      file of gripmon calibrate intrinsics
 --config CONFIG         configuration (YAML) whose camera, gripper, and rough calibration are used
 --gripper FILE.yaml     gripper file
-| --infer               the gripper isn't known: infer it, see --gripper-out
---corners FILE.yaml...  rough corners: one file for all images, or one for each, in their order
+| --infer               infer the gripper from the images, see --gripper-out
+--corners FILE.yaml...  rough corners: one file for all images, or one per image, in their order
 --jaw-opening M         jaw opening in the images, as the robot reports it (m)
 --gripper-out FILE.yaml
                         with --infer: gripper file to write
---jaw-range MIN:MAX     with --infer: the jaws move in this range (m)
+--jaw-range MIN:MAX     with --infer: range of the jaw opening (m)
 --name NAME             with --infer: the gripper's name (default: gripper)
 --out FILE.yaml         file to write
 --picture FILE.png      also draw the first image with residuals, enlarged
---force                 replace files that are there
+--force                 replace existing files
 --json                  one JSON object instead of text; m, rad, px
 """
 
@@ -39,7 +39,7 @@ _EXAMPLES = """\
   gripmon calibrate plane plate/*.png --config arm1.yaml --target charuco:14x12:0.006:0.0044 \\
       --out hand_eye.yaml --picture hand_eye.png
 
-exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why:
+exit codes: 0 written; 2 wrong usage or files; 3 no calibration from these images, with the reason:
 nothing is written then"""
 
 
@@ -48,25 +48,25 @@ nothing is written then"""
     jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
 def plane(arguments: Arguments) -> None:
-    """Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
+    """Measure the gripper's pose in the camera frame from an image of it standing on a calibration plate (the
     Plane Coincidence Constraint of the self-viewing method): the contact plane of its fingertips is the
-    plate.  The fingers may hide part of the pattern.  Several images, the gripper put down again for each,
-    are averaged.
+    plate.  The fingers may hide part of the pattern.  Several images, with the gripper put down again for
+    each, are averaged.
 
-    The gripper is known (--gripper), or it is inferred from the same images (--infer): the four innermost
+    The gripper is given (--gripper), or inferred from the same images (--infer): the four innermost
     corners of two parallel fingertips form a rectangle about the TCP.
 
     --corners names a file with rough positions, several pixels off is fine:
       corners:
         L_in_near: [241, 240]      # name: [u, v] in px
-    Names are those of the gripper file (two at least; those that are given are used), or with --infer
+    Names are those of the gripper file (at least two; all that are given are used), or with --infer
       left_inner_near, left_inner_far, right_inner_near, right_inner_far
     where near is the upper one in an image that shows the left finger on the left, and, on the next edge of
     each, one or two of
       left_outer_near   the contact face's outer corner
       left_end_near     any point on an edge in the contact plane, whose end is out of view
       left_rise_near    any point on an edge that rises from the contact plane
-    With --config, the configuration's calibration tells where the corners are expected, good to some pixels.
+    With --config, the corners are predicted from the configuration's calibration, to some pixels.
     """
     import cv2
 
@@ -90,7 +90,7 @@ def plane(arguments: Arguments) -> None:
         cam_T_grip=given.cam_T_grip, progress=progress_bar,
     )  # fmt: skip
     note(f"not used: {reason}" for reason in found.not_used)
-    # As itself where a file named it: the hand/eye calibration holds its target nowhere else.
+    # In full even if a file named it: the hand/eye calibration records its target nowhere else.
     described = name_of(target) if is_target_file(arguments.target) else arguments.target
     provenance = provenance_of(arguments.command_line(target=described), list(dict.fromkeys([*paths, *given.files])))
     made = found.gripper(arguments.name, arguments.jaw_range, arguments.jaw_opening, provenance)
@@ -127,7 +127,7 @@ def _check_options(arguments: Arguments) -> None:
 
 
 def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:
-    """What a person should know."""
+    """The result as text lines."""
     lines = [*found.fit.table(), *(f"note: {note}" for note in notes)]
     lines += [
         f"note: {image.coincidence.sighting.name}: {name} not measured: {reason}"

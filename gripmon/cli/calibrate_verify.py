@@ -1,4 +1,4 @@
-"""``gripmon calibrate verify``: are two calibrations the same, or does a calibration still hold?"""
+"""``gripmon calibrate verify``: do two calibrations differ, or does a calibration still hold?"""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ A                    calibration
 B...                 the other calibration, or images (files, folders)
 --config CONFIG      with images: the configuration with gripper and monitor
 --target TARGET      with images: the plate that the gripper stands on
---other-target       it is another plate than the calibration's, of the same pattern in another size
+--other-target       the plate is another one than the calibration's, of the same pattern in another size
 --jaw-opening M      in the images (m); default: the calibration's, else the configuration's
---level P            say 'different' of equal ones so often (default: 0.01)
---tolerance-mm MM    shift of the TCP that doesn't matter, however significant
---tolerance-deg DEG  turn that doesn't matter, however significant; with --tolerance-mm
---tolerance-px PX    of two cameras anywhere in the image that doesn't matter, however significant
+--level P            probability that equal calibrations are reported as different (default: 0.01)
+--tolerance-mm MM    negligible shift of the TCP, however significant
+--tolerance-deg DEG  negligible rotation, however significant; with --tolerance-mm
+--tolerance-px PX    negligible difference of two cameras in the image, however significant
 --json               print JSON
 """
 
@@ -39,7 +39,7 @@ _EXAMPLES = """\
   gripmon calibrate verify hand_eye.yaml plate/*.png --config mine/arm1.yaml --target charuco:14x12:0.006:0.0044
 
 exit codes: 0 the same; 2 wrong usage or files; 3 different, or the images can't be measured (then
-nothing is printed but the reason)"""
+only the reason is printed)"""
 
 
 def _share(text: str) -> float:
@@ -53,18 +53,18 @@ def _share(text: str) -> float:
 
 
 @Command(
-    "verify", "are two calibrations the same, does one still hold", _OPTIONS, _EXAMPLES,
+    "verify", "do two calibrations differ, or does one still hold", _OPTIONS, _EXAMPLES,
     level={"type": _share, "default": DEFAULT_LEVEL}, jaw_opening=positive_number, tolerance_mm=positive_number,
     tolerance_deg=positive_number, tolerance_px=positive_number,
 )  # fmt: skip
 def verify(arguments: Arguments) -> int:
     """Compare two hand/eye calibrations (difference at the TCP, mm and degrees along the camera's axes), two
-    cameras (by what they do: the largest difference in the image), or a hand/eye calibration with fresh
-    images of the gripper: on the calibration plate (--target), or anywhere, measured as the monitor does;
-    then three or more before different backgrounds, since one that contradicts the others is left out.
-    Each may also be a configuration, a monitor's state file (its reference in force) or estimates.jsonl
-    (the last valid one).  How much of a difference is chance follows from both covariances; what they
-    share, such as the camera, makes differences look less significant than they are.
+    cameras (the largest difference of their projections in the image), or a hand/eye calibration with
+    fresh images of the gripper: on the calibration plate (--target), or anywhere, measured as by the
+    monitor; then three or more before different backgrounds, because one that contradicts the others is
+    left out.  Each may also be a configuration, a monitor's state file (its reference in force) or
+    estimates.jsonl (its last valid transform).  The significance follows from both covariances; errors
+    common to both, such as the camera's, make differences look less significant than they are.
     """
     from gripmon.calibrate.api import verify
     from gripmon.daemon.calibrations import read_calibrated
@@ -88,7 +88,7 @@ def verify(arguments: Arguments) -> int:
 
 
 def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[str, ...]]:
-    """The other calibration, or what images show; and what is doubtful about it."""
+    """The other calibration, or the measurement in images; and warnings about it."""
     from gripmon.daemon.calibrations import measure_again, read_calibrated
     from gripmon.daemon.targets import target_of
     from gripmon.model.images import IMAGE_SUFFIXES
@@ -101,7 +101,7 @@ def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[
             jaw_opening_m=arguments.jaw_opening,
         )  # fmt: skip
     of_images = "config", "target", "other_target", "jaw_opening"
-    arguments.refuse(of_images, "has a meaning only with images; leave it out")
+    arguments.refuse(of_images, "applies only to images; leave it out")
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(Path(names[0])), ()

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 _OPTIONS = """
 [NAME...]         common names; default: router, controller, operator and those of the robots
---robot ROBOT...  a robot's name, for its two certificates; several times if need be; default: arm1
---rules FILE      add the rules for these robots to the router's file (router.json5 or like it)
---out DIR         the folder; made if it is missing
---host HOST...    name or address at which the router, or who is named, will be reached; several times if need be;
+--robot ROBOT...  a robot's name, for its two certificates; may be repeated; default: arm1
+--rules FILE      add the rules for these robots to the router's file (such as router.json5)
+--out DIR         the folder; created if missing
+--host HOST...    name or address at which the router, or the named one, will be reached; may be repeated;
                   default: localhost, 127.0.0.1, ::1 for the router
 """
 
@@ -25,7 +25,7 @@ _EXAMPLES = """\
   gripmon certificates --out certificates                     router, controller, operator, robot arm1
   gripmon certificates --out certificates --host 10.0.0.5     the router will be reached at 10.0.0.5
   gripmon certificates --robot arm2 --robot arm3 --rules router.json5 --out certificates
-                                                              two more robots, in the router's rules, too
+                                                              two more robots, also in the router's rules
   gripmon certificates dashboard --out certificates           one more client
   gripmon certificates central --host 10.0.0.1 --out certificates       another router; without --host a client
 
@@ -48,13 +48,12 @@ def _name(text: str) -> str:
     out=REQUIRED, host={"default": []},
 )  # fmt: skip
 def certificates(arguments: Arguments) -> None:
-    """Make a small private certificate authority in a folder, and certificates for those who shall talk to
-    each other: the names that the access rules of configs/zenoh/router.json5 know. Every robot has two of
-    its own, monitor-NAME and robot-NAME (gripper and camera driver), which can't speak for another robot.
-    What is there already stays, so that names can be added later. Private keys can be read by their owner
-    alone.
+    """Make a small private certificate authority in a folder, and certificates for the common names in the
+    access rules of configs/zenoh/router.json5. Every robot has two of its own, monitor-NAME and robot-NAME
+    (gripper and camera driver), which are not valid for another robot. Existing files are kept, so that
+    names can be added later. Private keys are readable by their owner only.
 
-    The authority's key, ca-key.pem, makes more certificates: keep it away from the robots.
+    The authority's key, ca-key.pem, signs further certificates: keep it away from the robots.
     """
     try:
         from gripmon.io.wire.certificates import Authority, read
@@ -64,7 +63,7 @@ def certificates(arguments: Arguments) -> None:
     from gripmon.io.wire.rules import wanted_names
 
     if arguments.rules and not arguments.robot:
-        raise InputError("certificates: --rules for whom? add --robot NAME")
+        raise InputError("certificates: --rules without a robot; add --robot NAME")
     with input_errors("certificates: --robot"):
         wanted = wanted_names(arguments.name, arguments.robot, arguments.host)
     folder = make_directory(arguments.out)
@@ -86,7 +85,7 @@ def _issued(made: bool, issued: Issued, hosts: list[str]) -> str:
         what = f"common name {issued.name}, for a router (and as a client) at {', '.join(issued.hosts)}"
     if made and not hosts:
         what += " (--host makes it a router's)"
-    return f"made, {what}" if made else f"there already, left alone: {what}; to change that, delete both files"
+    return f"made, {what}" if made else f"exists, unchanged: {what}; to change it, delete both files"
 
 
 def _add_rules(arguments: Arguments) -> None:
@@ -100,5 +99,5 @@ def _add_rules(arguments: Arguments) -> None:
     except ValueError as error:
         wrong = "isn't text" if isinstance(error, UnicodeDecodeError) else str(error)
         raise error if isinstance(error, InputError) else InputError(f"certificates: --rules {path} {wrong}") from None
-    which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
-    print(f"{path}: {which}{'; restart the router' if changed else ' already'}")
+    which = f"rules for {', '.join(robots)}"
+    print(f"{path}: {which}{' added; restart the router' if changed else ' exist already'}")

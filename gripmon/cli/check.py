@@ -1,4 +1,4 @@
-"""``gripmon check``: is this configuration sound, and what does it expect to see?  Does a laser calibration hold?"""
+"""``gripmon check``: validate a configuration and forecast its performance; test whether a laser calibration holds."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
 --json       one JSON object instead of text; metres, radians, px
---verbose    what the calibration expects to see, in numbers
+--verbose    the forecast in numbers
 """
 
 _LASER = """\
 Instead of a configuration: does a file of gripmon calibrate laser still hold?  SPOTS are fresh tables of \
-spots and poses as for gripmon calibrate laser, in the order in which they were taken.  Without any: which \
-motions fresh spots would tell."""
+spots and poses as for gripmon calibrate laser, in the order in which they were taken.  Without SPOTS: which \
+motions fresh spots would detect."""
 
 _LASER_OPTIONS = """
---laser LASER.yaml  the calibration; what else is named are SPOTS, if any
+--laser LASER.yaml  the calibration; the other arguments are SPOTS, if any
 --arm-noise M:RAD   standard deviations of the arm's poses, position (m) and rotation (rad), each axis
                     (default 0.0001:0.0002)
---false-alarms N    how often in 1000 spots an unmoved set-up may be said to have moved (default 0.1, at most 10)
---wrong-spots PART  part of the spots that may be reflections (default 0.2, at most 0.5)
+--false-alarms N    false alarms per 1000 spots of an unmoved set-up (default 0.1, at most 10)
+--wrong-spots PART  fraction of the spots that may be reflections (default 0.2, at most 0.5)
 """
 
 _EXAMPLES = """\
@@ -42,33 +42,32 @@ _EXAMPLES = """\
   gripmon check --laser laser.yaml
   gripmon check --laser laser.yaml fresh_spots.csv --arm-noise 0.0002:0.0004
 
-exit codes: 0 sound, perhaps with warnings; 2 a fault in the configuration, in a file of Zenoh's that it
-names, or a package that it needs is missing (one line says file, key, what is wrong, what would be
-right); 3 a line says FAIL, such as a camera that can't be reached now; or something has moved since a
-laser calibration, or its spots don't tell"""
+exit codes: 0 sound, perhaps with warnings; 2 a fault in the configuration or in the Zenoh file that it
+names, or a missing package (one line says file, key, what is wrong, what would be right); 3 a line
+says FAIL, such as a camera that can't be reached now; or something has moved since a laser calibration,
+or its spots are inconclusive"""
 
 _MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
 @Command(
-    "check", "validate a configuration and show what it expects to see", _OPTIONS, _EXAMPLES,
+    "check", "validate a configuration and forecast its performance", _OPTIONS, _EXAMPLES,
     {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
     arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
 )  # fmt: skip
 def check(arguments: Arguments) -> int:
-    """Validate a configuration, its gripper file and its source, and say of each thing that matters whether
-    it is in order: OK, WARN (the monitor runs, but not all that is expected of it will come) or FAIL (it
-    can't do its work).
+    """Validate a configuration, its gripper file and its source, and rate each aspect: OK, WARN (the monitor
+    runs, with limitations) or FAIL (it can't work).
 
-    With --verbose, also what the calibration expects to see: where the fingertip corners are in the image
-    (px), which of them and which edges are visible, how far away the gripper is (mm), how exact one frame
-    will be along each axis, what the view can't separate (an unknown jaw opening and the distance), whether
-    its corners suffice to recalibrate, how far camera and jaws may move until too little is in view.  Of a
-    second camera (a configuration with a section laser): its calibration, what is known of its errors, and
-    what fresh spots would show.
+    With --verbose, also the forecast: where the fingertip corners are in the image (px), which of them and
+    which edges are visible, the gripper's distance (mm), the accuracy of one frame along each axis, what the
+    view can't separate (an unknown jaw opening and the distance), whether its corners suffice to
+    recalibrate, how far camera and jaws may move until too little is in view.  For a second camera (a
+    configuration with a section laser): its calibration, its standard deviations, and which motions fresh
+    spots would detect.
 
     With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
-    camera, plane and laser pointer fresh spots would tell, or do tell.
+    camera, plane and laser pointer fresh spots would detect, or which they show.
 
     With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
     anyone drills a hole.
@@ -76,10 +75,10 @@ def check(arguments: Arguments) -> int:
     if arguments.laser is not None and arguments.sweep:
         raise InputError("--sweep: not with --laser; one of them")
     if not arguments.sweep:
-        arguments.refuse(sweep.NAMES, "only has a meaning for a sweep; add --sweep")
+        arguments.refuse(sweep.NAMES, "applies only to a sweep; add --sweep")
     if arguments.laser is not None:
         return _check_laser(arguments)
-    names, why = ("arm_noise", *_MOST), "only has a meaning for a laser calibration; add --laser LASER.yaml"
+    names, why = ("arm_noise", *_MOST), "applies only to a laser calibration; add --laser LASER.yaml"
     arguments.refuse(names, why)
     if len(arguments.config) != 1:
         raise InputError(f"check: {len(arguments.config)} configurations; one, or --laser LASER.yaml")

@@ -1,4 +1,4 @@
-"""What ``gripmon check`` says of a laser calibration, and of the second camera that watches one, in words."""
+"""The output of ``gripmon check`` for a laser calibration, and for a second camera that monitors one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _calibration_line(calibration: dict[str, Any]) -> str:
 
 
 def _known_line(sigmas: dict[str, float]) -> str:
-    """By the parameters' names; those of a file that has others are left out."""
+    """Standard deviations of known parameters; a file may have others."""
     place = [1e3 * sigmas[f"base_T_cam.{axis}_m"] for axis in "xyz" if f"base_T_cam.{axis}_m" in sigmas]
     turn = [math.degrees(sigmas[f"base_T_cam.r{axis}_rad"]) for axis in "xyz" if f"base_T_cam.r{axis}_rad" in sigmas]
     return (
@@ -55,7 +55,7 @@ def _pulses_line(pulses: dict[str, Any]) -> str:
 
 
 def expectation_lines(report: dict[str, Any]) -> list[str]:
-    """What fresh spots would tell, the calibration's own line first."""
+    """Which motions fresh spots would detect, the calibration's own line first."""
     assumed, sigma, weakest = report["assumed"], report["spot_sigma"], report["weakest"]
     tilt = math.degrees(assumed["tilt_rad"])
     low_px, high_px = sigma["px"]
@@ -65,9 +65,9 @@ def expectation_lines(report: dict[str, Any]) -> list[str]:
     alarms = f"{report['false_alarms_per_1000_pulses']:g} false alarms in 1000 pulses"
     lines = [
         *_header_lines(report),
-        f"foreseen   {poses}, the laser {assumed['distance_m']:g} m away:",
+        f"forecast   {poses}, the laser {assumed['distance_m']:g} m away:",
         f"           {each} (one standard deviation, worst direction)",
-        f"noticed    with {alarms}, motions of the camera, base axes:",
+        f"detects    with {alarms}, motions of the camera, base axes:",
     ]
     for row in report["noticed"]:
         place = ", ".join(f"{a} {1e3 * v:.2f}" for a, v in zip(_AXES, row["position_m"], strict=True))
@@ -84,9 +84,9 @@ def _header_lines(report: dict[str, Any]) -> list[str]:
 
 
 def judged_lines(report: dict[str, Any]) -> list[str]:
-    """What fresh spots do tell."""
+    """What fresh spots show."""
     lines = _header_lines(report)
-    lines.append("mm (sigma) by which two ways to the spot disagree; px off where the calibration has it")
+    lines.append("mm (sigma) by which two ways to the spot disagree; px off the predicted position")
     width = max(len(row["name"]) for row in report["spots_judged"])
     lines.append(f"{'spot':<{width}}  beam and plane   ray and plane         beam            off")
     lines.append(f"{'':<{width}}  / ray and plane  / beam and ray         / ray             px")

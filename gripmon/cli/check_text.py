@@ -1,4 +1,4 @@
-"""What ``gripmon check`` finds, in words: the findings, and with ``--verbose`` the forecast in mm, degrees and px."""
+"""The output of ``gripmon check``: the findings, and with ``--verbose`` the forecast in mm, degrees and px."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from gripmon.daemon.findings import Finding, Surroundings
     from gripmon.io.wire import Joining
 
-_POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
-_JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given
+_POORLY = 2.0  # growth of the standard deviation without a known opening above which the two are hardly separable
+_JAW_ERROR_M = 1e-5  # the error of the opening whose effect is printed
 _AXES = ("x", "y", "z")
 _DOES = {"listen": "listens on", "connect": "connects to"}
 
 
 def lines(path: str, findings: Sequence[Finding]) -> list[str]:
-    """A headline, then a line each."""
+    """A headline, then one line per finding."""
     counts = {level: sum(each.level == level for each in findings) for level in ("FAIL", "WARN")}
     parts = [_counted(counts["FAIL"], "failure")] if counts["FAIL"] else ["sound"]
     parts += [_counted(counts["WARN"], "warning")] if counts["WARN"] else []
@@ -34,7 +34,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def details(report: forecasts.Forecast) -> list[str]:
-    """The forecast for a person: px, mm, degrees."""
+    """The forecast as text: px, mm, degrees."""
     edges = [edge.id for edge in report.edges if edge.visible]
     seen = sum(corner.visible for corner in report.corners)
     sections = {
@@ -48,7 +48,7 @@ def details(report: forecasts.Forecast) -> list[str]:
     lines = [f"{name:<10} {text}" for name, text in sections.items()]
     if not report.gripper.faces:
         # Before the corners, whose list follows.
-        lines.insert(-1, " " * 11 + "the gripper file has no faces: what the finger itself hides isn't known")
+        lines.insert(-1, " " * 11 + "the gripper file has no faces: which of its own edges a finger hides is unknown")
     lines[2:2] = [" " * 11 + note for note in report.gripper.notes]
     width = max(len(corner.id) for corner in report.corners)
     lines += [_corner_line(corner, width) for corner in report.corners]
@@ -84,10 +84,10 @@ def _reference_line(reference: forecasts.ReferenceValues) -> str:
 
 def _taught_line(taught: forecasts.TaughtValues | None, visible: list[str]) -> str:
     if taught is None:
-        return "nothing; `gripmon teach` takes out what bevels, rounded edges and shading shift the edges by"
+        return "nothing; `gripmon teach` removes the bias of bevels, rounded edges and shading"
     largest, images = taught.largest, "1 image" if taught.images == 1 else f"{taught.images} images"
     count = f"{len(taught.edges)} edges from {images} ({taught.file}, {taught.time})"
-    farthest = f"farthest off {largest.edge}, {1e6 * largest.offset_m:+.0f} µm ({largest.offset_px:+.2f} px)"
+    farthest = f"largest offset {largest.edge}, {1e6 * largest.offset_m:+.0f} µm ({largest.offset_px:+.2f} px)"
     missing = [name for name in visible if name not in taught.edges]
     return f"{count}; {farthest}" + (f"; visible, but not taught: {', '.join(missing)}" if missing else "")
 
@@ -211,7 +211,7 @@ def _camera_lines(values: forecasts.InView) -> list[str]:
 
 
 def _span(amounts: Sequence[float | None], factor: float, sought: float) -> str:
-    """None: it wasn't found as far as was sought."""
+    """None: the limit is beyond the range searched."""
     low, high = (f"{'' if a is not None else 'beyond '}{sign}" for a, sign in zip(amounts, "-+", strict=True))
     low_amount, high_amount = (f"{factor * (sought if a is None else a):.1f}" for a in amounts)
     return f"{low}{low_amount} to {high}{high_amount}"
@@ -247,7 +247,7 @@ def _certainty_lines(values: forecasts.OpeningCertainty) -> list[str]:
 
 
 def _percent(share: float) -> str:
-    """All or nothing only where it is."""
+    """100 % and 0 % only if exact."""
     rounded = f"{100.0 * share:.1f}"
     if (rounded == "100.0" and share < 1.0) or (rounded == "0.0" and share > 0.0):
         return f"{'over 99.9' if share > 0.5 else 'under 0.1'} %"
@@ -255,7 +255,7 @@ def _percent(share: float) -> str:
 
 
 def surrounding_lines(around: Surroundings) -> list[str]:
-    """Where frames come from, and where messages, recording and metrics go."""
+    """The source of frames, and the destinations of messages, recording and metrics."""
     source = around.source
     sections = {
         "source": f"{source.kind}: {'NOT REACHABLE: ' if source.reachable is False else ''}{source.detail}",

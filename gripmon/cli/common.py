@@ -1,6 +1,6 @@
-"""What all commands share: how they are declared, the files that they write, progress bars.
+"""Shared by all commands: their declaration, the files that they write, progress bars.
 
-Nothing heavy at the top: this is imported for ``--help``.
+No heavy imports at the top: this is imported for ``--help``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _T = TypeVar("_T")
 REQUIRED = {"required": True}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
 NETWORK_OPTIONS = f"""
---connect ENDPOINT...  {{}} or a router's Zenoh endpoint, several times if need be; default: {DEFAULT_ENDPOINT}
---zenoh-config FILE    a configuration file of Zenoh's instead of --connect
+--connect ENDPOINT...  {{}} or a router's Zenoh endpoint; may be repeated; default: {DEFAULT_ENDPOINT}
+--zenoh-config FILE    a Zenoh configuration file instead of --connect
 """
-"""Of the commands that join the network as a client, which say whose endpoint it is."""
+"""Options of the commands that join the network as a client; the placeholder says whose endpoint it is."""
 
 _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
@@ -40,13 +40,12 @@ PORT_OPTIONS = """
 
 
 class Command:
-    """A command's declaration, and the decorator of the function that carries it out, whose docstring is the
-    description in ``--help``.
+    """A command's declaration, and the decorator of its function, whose docstring is the description in ``--help``.
 
-    ``options`` is a table like that of ``--help``.  A row is what is typed, two blanks or a new line, and its meaning,
-    which goes on in lines that are indented: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most
-    one, some, any number; ``--flag``, ``--option VALUE``, ``--option VALUE...`` for one that may be repeated.  A row
-    that begins with ``|`` excludes the row before.  ``groups``: more such tables by title, each with a description.
+    ``options`` is a table like that of ``--help``.  A row has the argument, two blanks or a new line, and its meaning,
+    which continues in indented lines: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most one,
+    one or more, any number; ``--flag``, ``--option VALUE``, ``--option VALUE...`` for one that may be repeated.  A row
+    that begins with ``|`` excludes the previous row.  ``groups``: further tables by title, each with a description.
     Values called FILE, DIR and the like are paths.  ``more``: keywords of ``add_argument`` for single arguments, or
     only a type.
     """
@@ -72,11 +71,11 @@ class Command:
         return self
 
     def run(self, arguments: Arguments) -> int:
-        """Carry it out; the exit code."""
+        """Run the command; return the exit code."""
         return self._handler(arguments) or 0
 
     def add_to(self, commands: Any) -> None:
-        """Add it below a parser."""
+        """Add the command below a parser."""
         raw, description = argparse.RawDescriptionHelpFormatter, inspect.getdoc(self._handler)
         parser: argparse.ArgumentParser = commands.add_parser(
             self._name, help=self._summary, description=description, epilog=self._epilog, formatter_class=raw
@@ -117,7 +116,7 @@ class Command:
 
 
 def _rows(table: str) -> list[tuple[str, str]]:
-    """What is typed and what it means."""
+    """The arguments and their meanings."""
     rows: list[tuple[str, str]] = []
     for line in table.strip("\n").splitlines():
         typed, _, text = line.partition("  ")
@@ -129,10 +128,10 @@ def _rows(table: str) -> list[tuple[str, str]]:
 
 
 class Arguments(argparse.Namespace):
-    """What was given to a command, and what commands do with it; a file or folder is named by its option."""
+    """The arguments of a command, with helpers; errors name a file or folder by its option."""
 
     def command_line(self, **instead: Any) -> str:
-        """The command with what was given to it, for a file's provenance; ``instead``: values in place of those."""
+        """The command line, for a file's provenance; ``instead``: values that replace those given."""
         command: Command = self.command
         words = ["gripmon", *command.prog.split()]
         for name, option in command.arguments.items():
@@ -153,21 +152,21 @@ class Arguments(argparse.Namespace):
                 raise InputError(f"{_option(name)}: {why}")
 
     def answer(self, values: Mapping[str, Any], lines: Iterable[str]) -> None:
-        """Print the result: one JSON object with ``--json``, else lines for a person."""
+        """Print the result: one JSON object with ``--json``, otherwise text lines."""
         print(json.dumps(values, indent=2) if self.json else "\n".join(lines))
 
     def metres(self, name: str) -> float | None:
-        """What an option in millimetres says; None where it wasn't given."""
+        """The value of an option in millimetres, in metres; None if it wasn't given."""
         value_mm = getattr(self, name)
         return None if value_mm is None else 1e-3 * float(value_mm)
 
     def radians(self, name: str) -> float | None:
-        """What an option in degrees says; None where it wasn't given."""
+        """The value of an option in degrees, in radians; None if it wasn't given."""
         value_deg = getattr(self, name)
         return None if value_deg is None else math.radians(value_deg)
 
     def network(self) -> dict[str, Any]:
-        """``--connect`` and ``--zenoh-config``, as the clients take them."""
+        """``--connect`` and ``--zenoh-config`` as arguments of the clients."""
         if self.connect and self.zenoh_config:
             raise InputError(f"{self.command.prog}: --connect has no effect beside --zenoh-config; one of them")
         file = None if self.zenoh_config is None else str(self.zenoh_config)
@@ -175,7 +174,7 @@ class Arguments(argparse.Namespace):
 
     @contextmanager
     def network_errors(self) -> Iterator[None]:
-        """Where there is no session, the error names the option: no key was written."""
+        """If there is no session, the error names the option instead of a configuration key."""
         from gripmon.io.wire import PublishError
 
         try:
@@ -185,7 +184,7 @@ class Arguments(argparse.Namespace):
             raise InputError(f"{self.command.prog}: {option}: {error.text}") from None
 
     def check_outputs(self, *names: str) -> None:
-        """Refuse, before any work, files that can't be written, that are there already (without --force), or twice."""
+        """Refuse, before any work, outputs that can't be written, exist (without --force), or are given twice."""
         written: dict[Path, str] = {}
         for name in names:
             path, option = getattr(self, name), _option(name)
@@ -203,8 +202,8 @@ class Arguments(argparse.Namespace):
                 raise InputError(f"{option} {path}: has no known ending; .png or .jpg")
 
     def save(self, name: str, content: Any) -> None:
-        """Write a file, whole or not at all, if it is wanted: bytes, a calibration as YAML, a picture in the format
-        that the file's name ends in; or what a function gives that makes one of them.
+        """Write a file atomically, if its option was given: bytes, a calibration as YAML, a picture in the format of
+        the file's ending; or the result of a function that makes one of them.
         """
         path = getattr(self, name)
         if path is None:
@@ -258,7 +257,7 @@ def _argument(convert: Callable[[str], _T], text: str) -> _T:
 
 
 def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:
-    """The type of an argument within these bounds; ``wrong``: what another text is not, and what would be right."""
+    """The type of an argument within these bounds; ``wrong``: the error for any other text."""
 
     def convert(text: str) -> int:
         if not text.isdecimal() or not low <= int(text) <= high:
@@ -274,7 +273,7 @@ seed = whole_number(0, _LARGEST_SEED, f"isn't a seed; a whole number, 0 to {_LAR
 
 
 def two_numbers(text: str, between: str = ":") -> tuple[float, float] | None:
-    """Both of them; None for another text."""
+    """Both numbers; None for any other text."""
     try:
         first, second = map(float, text.split(between))
     except ValueError:
@@ -291,14 +290,14 @@ def arm_noise(text: str) -> tuple[float, float]:
 
 
 def note(lines: Iterable[str]) -> None:
-    """Tell a person on stderr, beside the results."""
+    """Print notes on stderr, apart from the results."""
     for line in lines:
         print(line, file=sys.stderr)
 
 
 def announcer(verb: str) -> Callable[[str], None]:
-    """What tells a person where the page is."""
-    key = "its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it"
+    """A function that prints the page's address."""
+    key = "anyone with this address can use the page: keep it secret; Ctrl-C, or Done on the page, ends it"
     return lambda url: print(f"{verb} on this page: {url}\n{key}", flush=True)
 
 
@@ -313,14 +312,14 @@ def make_directory(path: Path, option: str = "--out") -> Path:
 
 
 def check_file(path: Path) -> None:
-    """Refuse, before any work, a file that can't be written; it is made but not changed."""
+    """Refuse, before any work, a file that can't be written; it is created if missing, but not changed."""
     with writing(path):
         path.open("ab").close()
 
 
 @contextmanager
 def input_errors(what: str) -> Iterator[None]:
-    """A ValueError is wrong usage, of ``what``; one that says so itself stays as it is."""
+    """Turn a ValueError into wrong usage of ``what``; an InputError stays as it is."""
     try:
         yield
     except InputError:
@@ -331,7 +330,7 @@ def input_errors(what: str) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
-    """A fault of a file for output ends the command with exit code 2."""
+    """Turn a fault of an output file into an error with exit code 2."""
     try:
         yield
     except OSError as error:
@@ -340,8 +339,8 @@ def writing(path: Path, option: str = "--out") -> Iterator[None]:
 
 @contextmanager
 def progress_bar(total: int | None, unit: str) -> Iterator[Callable[..., None]]:
-    """A context that gives a function to call once for each step, with the total if that is known then; it draws on
-    stderr, and only for a person.
+    """A context that yields a function to call once per step, with the total if that is known by then; it draws on
+    stderr, and only on a terminal.
     """
     with _bar(total=total, unit=unit) as bar:
 
@@ -355,7 +354,7 @@ def progress_bar(total: int | None, unit: str) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def reading_bar() -> Iterator[Callable[[int, int], None]]:
-    """The same of bytes: the function takes those that are read and all."""
+    """The same for bytes: the function takes the number read and the total."""
     with _bar(unit="B", unit_scale=True, desc="reading", leave=False) as bar:
 
         def reached(done: int, total: int) -> None:
@@ -375,7 +374,7 @@ def _bar(**shown: Any) -> AbstractContextManager[Any]:
 
 
 def messages_above_bar(logger: str) -> AbstractContextManager[object]:
-    """While it lasts, what this logger writes to a terminal appears above the progress bar."""
+    """Within this context, the logger's messages on a terminal appear above the progress bar."""
     if not sys.stderr.isatty():
         return nullcontext()
     import logging

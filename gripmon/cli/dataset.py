@@ -9,19 +9,19 @@ from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 _OPTIONS = """
-DATASET          folder or URL; below it every episode that is found
---config CONFIG  configuration (YAML) with gripper, camera and a rough reference; of its source section the opening
---out DIR        where the results go; made if it is missing
+DATASET          folder or URL; all episodes below it are measured
+--config CONFIG  configuration (YAML) with gripper, camera and a rough reference; its source section gives the opening
+--out DIR        folder for the results; created if missing
 --camera NAME...  a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one)
---gripper FILE...    other grippers that an episode may show; measured by the one that fits, or by none (a reason)
---own-lens       the configuration's camera calibration, also where a file brings one
---annotate DIR   also in the dataset's own format; DATASET itself: beside its recordings (not of LeRobot)
---engine NAME    local (processes of this machine, the default) or ray (a Ray cluster)
---workers N      processes of --engine local (default: as many as there are cores)
---address HOST   of the Ray cluster, as ray.init takes it (default: the one that Ray finds, or this machine)
---level P        probability that chance parts any stretch from its mounting (default 0.01)
---tolerance-mm MM    transforms as near as this, and --tolerance-deg, share a mounting whatever they claim (mm)
---tolerance-deg DEG  likewise of the turn (degrees)
+--gripper FILE...    other grippers that an episode may show; the one that fits is used; if none does, the row says why
+--own-lens       use the configuration's camera calibration even if a file contains one
+--annotate DIR   also write in the dataset's own format; DATASET itself: beside its recordings (not for LeRobot)
+--engine NAME    local (processes on this machine, the default) or ray (a Ray cluster)
+--workers N      processes of --engine local (default: the number of cores)
+--address HOST   address of the Ray cluster, as for ray.init (default: the one that Ray finds, or this machine)
+--level P        probability that any stretch is separated from its mounting by chance (default 0.01)
+--tolerance-mm MM    transforms within this and --tolerance-deg share a mounting, whatever their covariances (mm)
+--tolerance-deg DEG  the same for the rotation (degrees)
 """
 
 _EXAMPLES = """\
@@ -30,13 +30,13 @@ _EXAMPLES = """\
   gripmon dataset set/ --config wrist.yaml --out extrinsics --engine ray --address auto
 
 exit codes: 0 done, failures are rows with a reason; 2 wrong usage or configuration; 3 no episode gave a
-transform; 130 interrupted (called again it goes on)"""
+transform; 130 interrupted (call again to continue)"""
 
 
 def _probability(text: str) -> float:
     value = positive_number(text)
     if value >= 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is no small probability; below 1")
+        raise argparse.ArgumentTypeError(f"{text} isn't a small probability; below 1")
     return value
 
 
@@ -50,16 +50,16 @@ def _probability(text: str) -> float:
 def dataset(arguments: Arguments) -> int:
     """Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
     its covariance and protection level, whether the camera moved within it (when, how far, why), which
-    episodes share one mounting, and which share of the frames is usable.  DATASET is a folder or a URL
+    episodes share one mounting, and which fraction of the frames is usable.  DATASET is a folder or a URL
     (s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
-    and is only read.  Below DIR:
+    and is never modified.  Below DIR:
 
-      stretches/camera=NAME/part-00000.parquet   a row for each stretch without a motion, failures too
-      report.html                                mountings over time, what failed, the worst episodes
-      journal.jsonl                              what was measured: called again, only the rest is
+      stretches/camera=NAME/part-00000.parquet   a row for each stretch without motion, failures included
+      report.html                                mountings over time, failures, the worst episodes
+      journal.jsonl                              measured episodes: a new call measures only the rest
 
-    With --annotate an MCAP for each recording (NAME.gripmon.mcap), and of LeRobot datasets a copy with columns
-    more, observation.extrinsics.CAMERA and observation.extrinsics_valid.CAMERA, whose videos are links.
+    With --annotate an MCAP for each recording (NAME.gripmon.mcap), and for LeRobot datasets a copy with the
+    columns observation.extrinsics.CAMERA and observation.extrinsics_valid.CAMERA, whose videos are links.
     """
     from gripmon.daemon.dataset import measure_dataset
 

@@ -1,4 +1,4 @@
-"""``gripmon demo``: the whole daemon on a simulated wrist camera, and what it made of it against the truth."""
+"""``gripmon demo``: the whole daemon on a simulated wrist camera, compared with the truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _SHORTEST_S = 4.0
 
 _OPTIONS = f"""
---seconds S  length; its events are spread over it (s; default 20, at least {_SHORTEST_S:g})
+--seconds S  length, over which the events are spread (s; default 20, at least {_SHORTEST_S:g})
 --out DIR    folder for the results (default: gripmon-demo-DATE-TIME here)
 --fps HZ     frame rate of the camera (1/s; default 60)
 --seed N     random seed of the simulation (default 1)
@@ -46,7 +46,7 @@ exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
 
 @Command(
-    "demo", "everything at work on a simulated camera", _OPTIONS, _EXAMPLES,
+    "demo", "the whole system on a simulated camera", _OPTIONS, _EXAMPLES,
     seconds={"type": positive_number, "default": 20.0}, fps=positive_number, seed={"type": seed, "default": 1},
     view=VIEW,
 )  # fmt: skip
@@ -56,7 +56,7 @@ def demo(arguments: Arguments) -> int:
     within this process and received back, everything is recorded, and at the end the corrected
     position of the tool centre point (TCP) is compared with the truth (mm).
 
-    DIR gets demo-0001.rrd (the recording), estimates.jsonl (one JSON line a frame) and summary.json.
+    DIR gets demo-0001.rrd (the recording), estimates.jsonl (one JSON line per frame) and summary.json.
     """
     if arguments.seconds < _SHORTEST_S:
         raise InputError(f"demo: --seconds {arguments.seconds:g} is too short for its events; at least {_SHORTEST_S:g}")
@@ -96,7 +96,7 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
             f"frames     {summary.frames} ({verdicts}), {summary.frames_dropped} dropped",
             f"Zenoh      {summary.transforms_received} transforms received",
             f"latency    {_latency_line(summary.latency_ms)}, from frame to published transform",
-            f"           {_latency_line(summary.latency_while_tracking_ms)} while tracking (else it searches)",
+            f"           {_latency_line(summary.latency_while_tracking_ms)} while tracking (not searching)",
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
             *(f"look at it {_beside_us('rerun')} {shlex.quote(recording)}" for recording in recordings),
@@ -107,7 +107,7 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
 
 
 def _report_line(recordings: list[str], out: Path) -> str:
-    """How to ask what happened."""
+    """The command for a report."""
     if not recordings:
         return "recording  none was written; the alerts above say why"
     page = shlex.quote(str(out / "report.html"))
@@ -115,7 +115,7 @@ def _report_line(recordings: list[str], out: Path) -> str:
 
 
 def _beside_us(name: str) -> str:
-    """How to start a program of our environment, which is perhaps not on the path."""
+    """How to start a program of our environment, which may not be on the path."""
     beside_us = Path(sys.executable).parent / name
     return name if shutil.which(name) or not beside_us.exists() else shlex.quote(str(beside_us))
 

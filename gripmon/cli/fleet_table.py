@@ -1,4 +1,4 @@
-"""The table of ``gripmon watch``: one row a monitor, for a terminal, a log or a program."""
+"""The table of ``gripmon watch``: one row per monitor, for a terminal, a log or a program."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gripmon.model.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
-_SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
-_FRAME_LINES = 6  # of a terminal: title, head, rule, summary, legend, and one that stays free
+_SPARED, _WIDE = "sigma mm", 100  # the column that is left out on a terminal with fewer characters per line
+_FRAME_LINES = 6  # lines of a terminal for title, head, rule, summary, legend, and one free line
 _STYLES = {
     "gone": "bold red", "silent": "bold red", "several": "bold red", "unknown": "red", "starting": "yellow",
     "suspect": "yellow", "stopped": "dim", "valid": "green"
@@ -30,14 +30,14 @@ LEGEND = "open alerts: !! errors, ! warnings, i notes, with their number and the
 
 
 class Row(NamedTuple):
-    """What is shown of one monitor, as text; ``condition`` colours it."""
+    """One monitor's row, as text; ``condition`` decides its colour."""
 
     condition: str
     cells: tuple[str, ...]
 
 
 def row(status: MonitorStatus) -> Row:
-    """The cells in the order of :data:`COLUMNS`; of a monitor that is gone they are what it reported last."""
+    """The cells in the order of :data:`COLUMNS`; for a monitor that is gone, its last report."""
     state = status.state
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     age_s = status.state_age_s if status.transform_age_s is None else status.transform_age_s
@@ -58,7 +58,7 @@ def row(status: MonitorStatus) -> Row:
 
 
 def summary(statuses: Sequence[MonitorStatus], fault: str) -> str:
-    """How many there are of each condition, and what is wrong beside that."""
+    """The number of monitors in each condition, and any other fault."""
     counts = Counter(status.condition for status in statuses)
     parts = [f"{count} {condition}" for condition, count in sorted(counts.items(), key=lambda item: _order(item[0]))]
     text = f"{len(statuses)} monitor{'s' * (len(statuses) != 1)}" + (f": {', '.join(parts)}" if parts else "")
@@ -82,7 +82,7 @@ def line(status: MonitorStatus) -> str:
 
 
 def event_line(event: Event) -> str:
-    """An alert, or that a monitor came or vanished, in one line of a log."""
+    """An alert, or the appearance or disappearance of a monitor, in one line of a log."""
     head, record = f"{clock(event.stamp_ns)}  {event.name}", event.alert
     if record is None:
         return printable(f"{head}  {event.what}")
@@ -94,7 +94,7 @@ def event_line(event: Event) -> str:
 
 
 def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int) -> RenderableType:
-    """For a terminal of that size: the worst monitors, as many as fit; a narrow one does without sigma."""
+    """For a terminal of that size: the worst monitors, as many as fit; on a narrow one without sigma."""
     from rich.table import Table
     from rich.text import Text
 
@@ -106,11 +106,11 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
         out.add_column(name, justify="right" if number else "left", no_wrap=True, overflow="ellipsis", ratio=ratio)
     for status in shown:
         condition, cells = row(status)
-        # Text, not markup: what came from the network has no say in how it looks.
+        # Text, not markup: input from the network must not affect the formatting.
         named = zip(COLUMNS, cells, strict=True)
         out.add_row(*(Text(cell) for name, cell in named if name in chosen), style=_STYLES[condition])
     rest = len(statuses) - len(shown)
-    out.caption = Text(summary(statuses, fault) + (f"; {rest} more than fit here, none in more trouble" * (rest > 0)))
+    out.caption = Text(summary(statuses, fault) + (f"; {rest} more not shown, none of them worse" * (rest > 0)))
     if any(status.alerts for status in shown):
         out.caption.append(f"\n{LEGEND}")
     out.caption_justify = "left"
@@ -118,14 +118,14 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
 
 
 def as_data(status: MonitorStatus) -> dict[str, Any]:
-    """For ``--json``: what the table is made from."""
+    """The table's values, for ``--json``."""
     values = {"robot": status.name.robot, "camera": status.name.camera}
     values |= {name: getattr(status, name) for name in _AS_DATA}
     return values | {"state_age_s": round(status.state_age_s, 3)}
 
 
 def local_time(stamp_ns: int) -> datetime.datetime | None:
-    """A stamp's local time; None for one from the network that is none."""
+    """A stamp's local time; None for an invalid one from the network."""
     try:
         return datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
     except (OverflowError, ValueError, OSError):
@@ -133,21 +133,21 @@ def local_time(stamp_ns: int) -> datetime.datetime | None:
 
 
 def clock(stamp_ns: int) -> str:
-    """Local time of day with the date if that isn't today's; a stamp from the network may also be none."""
+    """Local time of day, with the date if that isn't today's; a stamp from the network may be invalid."""
     if (when := local_time(stamp_ns)) is None:
         return "at no time"
     return when.strftime("%H:%M:%S" if _is_today(stamp_ns) else "%Y-%m-%d %H:%M:%S")
 
 
 def _is_today(stamp_ns: int) -> bool:
-    """Of a stamp that is none, too: no."""
+    """False for an invalid stamp."""
     with contextlib.suppress(OverflowError, ValueError, OSError):
         return datetime.datetime.fromtimestamp(1e-9 * stamp_ns).date() == datetime.datetime.now().date()
     return False
 
 
 def printable(text: str) -> str:
-    """The text without what a terminal would obey: it came from the network."""
+    """The text without control characters for a terminal: it came from the network."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
@@ -166,8 +166,8 @@ def _what(status: MonitorStatus) -> str:
 
 
 def _alerts(status: MonitorStatus) -> str:
-    """What waits for an operator; how many of which severity, and the worst one's text; without one, what the monitor
-    says is wrong.
+    """The proposal that waits for an operator; the number of alerts of each severity, and the worst one's text; without
+    an alert, the state's message.
     """
     waits = _waits(status)
     if not status.alerts:
@@ -180,7 +180,7 @@ def _alerts(status: MonitorStatus) -> str:
 
 
 def _waits(status: MonitorStatus) -> str:
-    """The command to type where a new reference waits for an operator; empty if none does."""
+    """The command to type if a new reference waits for an operator; otherwise empty."""
     from gripmon.model.records import accepting
 
     if status.state is None or not status.state.proposal_id or status.gone_since_ns is not None:
@@ -189,7 +189,7 @@ def _waits(status: MonitorStatus) -> str:
 
 
 def _bound(state: StateRecord | None) -> str:
-    """The protection level over the alert limit, as far as they are known."""
+    """The protection level over the alert limit, if known."""
     if state is None or state.protection_m is None:
         return "-"
     limit = "" if state.alert_limit_m is None else f"/{1e3 * state.alert_limit_m:g}"

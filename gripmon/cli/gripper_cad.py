@@ -17,25 +17,25 @@ from gripmon.cli.common import (
 from gripmon.model.errors import InputError
 
 _OPTIONS = """
-FILE...                 .stl, .obj, .ply, .cao: one a finger, or both in one; or one .urdf
+FILE...                 .stl, .obj, .ply, .cao: one per finger, or both in one; or one .urdf
 --out FILE.yaml         gripper file to write
---unit UNIT             of meshes: m, cm, mm or in
---approach AXIS         axis of the CAD frame that points out of the gripper: +x, -x, +y, -y, +z or -z (default: +z, of
-                        a URDF where its fingers reach to); -x and the like as --approach=-x
+--unit UNIT             unit of meshes: m, cm, mm or in
+--approach AXIS         axis of the CAD frame that points out of the gripper: +x, -x, +y, -y, +z or -z (default: +z, for
+                        a URDF the direction of its fingers); write negative ones as --approach=-x
 --frame FRAME           tcp: origin between the fingertips; cad: the CAD's own (default tcp)
---length M              use only so much of the fingers, from the tips (m)
---jaw-range MIN:MAX     of meshes: the jaws move in this range (m)
---jaw-opening M         what the robot reports for the fingers as they are drawn (default: the tips' distance, m)
---joint NAME            of a URDF: the joint that opens the jaws, where several could
+--length M              use only this length of the fingers, from the tips (m)
+--jaw-range MIN:MAX     for meshes: range of the jaw opening (m)
+--jaw-opening M         reported opening of the jaws as drawn (default: the tips' distance, m)
+--joint NAME            for a URDF: the joint that opens the jaws, if several are possible
 --bevel M               width of the bevels on real edges that are sharp in the CAD (default: 0.0002 m); 0: the edges
                         are known to be sharp to 0.02 mm
 --camera FILE.yaml      the view's camera: a file of gripmon calibrate intrinsics, or a configuration
---reference FILE.yaml   where the gripper stands before it: a file of gripmon calibrate plane, or a configuration
-| --view D:TILT         the same roughly: the TCP at distance D (m) in the image's middle, the camera at -y and tilted
+--reference FILE.yaml   the gripper's pose in the view: a file of gripmon calibrate plane, or a configuration
+| --view D:TILT         a rough pose: the TCP at distance D (m) in the image's middle, the camera at -y and tilted
                         by TILT (degrees) against z
---name NAME             the gripper's name (default: FILE's; of several FILEs that of --out)
+--name NAME             the gripper's name (default: FILE's; for several FILEs that of --out)
 --picture FILE.png      also draw the model in the view
---force                 replace files that are there
+--force                 replace existing files
 """
 
 _EXAMPLES = """\
@@ -70,22 +70,22 @@ def _bevel(text: str) -> float:
     bevel=_bevel,
 )  # fmt: skip
 def from_cad(arguments: Arguments) -> None:
-    """A gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one that holds
-    both, or one URDF.  Meshes don't say their unit: --unit.  URDF and .cao are metres.
+    """Make a gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one with
+    both, or one URDF.  Meshes need --unit; URDF and .cao are in metres.
 
-    The origin is put at the TCP, the middle of the four innermost fingertip corners: x across the jaws, z
-    along --approach, an axis of the CAD frame.  --frame cad leaves the CAD's axes as they are.
+    The origin is the TCP, the middle of the four innermost fingertip corners: x across the jaws, z along
+    --approach, an axis of the CAD frame.  --frame cad keeps the CAD's axes.
 
-    How the jaws move comes from the URDF's joint; of meshes, both fingers move by half of an opening in
+    The jaws' motion comes from the URDF's joint; for meshes, both fingers move by half of an opening in
     --jaw-range.
 
-    Real edges are broken, by 0.1 to 0.3 mm where a drawing says no more (ISO 13715); CAD draws them sharp.
-    --bevel says by how much.  It makes the bounds of a gripper that isn't taught so wide that hardly any
-    transform is valid at an alert limit of 1 mm: gripmon teach measures the edges as they are.
+    Real edges are broken, by 0.1 to 0.3 mm if the drawing leaves it open (ISO 13715); CAD draws them sharp.
+    --bevel states the width.  The default makes the bounds of an untaught gripper so wide that hardly any
+    transform is valid at an alert limit of 1 mm: gripmon teach measures the real edges.
 
-    Convex fingers with flat faces hold for every view.  Of round, hollow or open ones the edges and
-    outlines are those that one view shows: --camera with --reference, or with a rough --view.  Make such a
-    file again when the camera moves by more than some degrees.
+    Convex fingers with flat faces are valid for every view.  For round, hollow or open ones the edges and
+    outlines are those of one view: --camera with --reference, or with a rough --view.  Make such a file
+    again when the camera moves by more than some degrees.
     """
     from gripmon.daemon.teaching.views import read_view
     from gripmon.model.gripper import UNTOLD_BEVEL_M
@@ -95,7 +95,7 @@ def from_cad(arguments: Arguments) -> None:
     arguments.check_outputs("out", "picture")
     camera, cam_T_grip = read_view(arguments.camera, arguments.reference, arguments.view)
     if arguments.picture is not None and (camera is None or cam_T_grip is None):
-        raise InputError("--picture: a picture is of a view; with --camera and --reference or --view")
+        raise InputError("--picture: needs a view; add --camera and --reference or --view")
     missing = [path for path in arguments.file if not path.is_file()]
     if missing:
         raise InputError(f"{missing[0]}: there is no such file; a mesh, URDF or .cao")

@@ -13,13 +13,13 @@ IMAGE...                image file, or folder with images
 | --finger-width M:SIGMA
                         width of a fingertip across the jaws, with its standard deviation (m)
 | --reference FILE.yaml
-                        calibration of hand and eye, of gripmon calibrate plane or another one: its frame is kept
+                        hand/eye calibration, of gripmon calibrate plane or another one: its frame is kept
 --name NAME             the gripper's name (default: gripper)
 --out FILE.yaml         gripper file to write
 --reference-out FILE.yaml
                         reference to write, for a configuration's `reference:`
 --picture FILE.png      also draw outline, scatter and fingers over the first image
---force                 replace files that are there
+--force                 replace existing files
 --json                  one JSON object instead of text; m, rad, px
 """
 
@@ -29,22 +29,22 @@ _EXAMPLES = """\
   gripmon gripper from-images openings/ --camera camera.yaml --out gripper.yaml \\
       --reference-out reference.yaml
 
-exit codes: 0 written; 2 wrong usage or files; 3 the images show no gripper, and why: nothing is
-written then"""
+exit codes: 0 written; 2 wrong usage or files; 3 no gripper found in the images, with the reason:
+nothing is written then"""
 
 
 def _length(text: str) -> tuple[float, float]:
     value, colon, sigma = text.partition(":")
     if not colon:
         raise argparse.ArgumentTypeError(
-            f"'{text}' doesn't say how exact it is; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
+            f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
         )
     found = positive_number(value), positive_number(sigma)
     if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is not a distance at a wrist (millimetres?); metres")
+        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
     if found[1] > 0.5 * found[0]:
         raise argparse.ArgumentTypeError(
-            f"'{text}': a standard deviation of more than half of it says nothing; smaller"
+            f"'{text}': the standard deviation is more than half of the length; a smaller one"
         )
     return found
 
@@ -54,18 +54,18 @@ def _length(text: str) -> tuple[float, float]:
     finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
-    """The outline of a gripper, its inner edges and its place, from ten to a hundred images of the wrist
-    camera: the robot moves, so that the background changes, and the gripper stays.  No dimensions, no
-    straight edges, no plate are needed; one length is: the distance of the fingertips from the camera, or
-    the width of a finger.  Images at several jaw openings tell how the fingers move, and with the openings
-    in metres in a timestamps.csv beside them, as gripmon replay takes it, the length, too.
+    """Measure a gripper's outline, inner edges and pose in ten to a hundred images of the wrist camera: the
+    robot moves, so that the background changes and the gripper stays.  This needs no dimensions, straight
+    edges or plate, but one length: the distance of the fingertips from the camera, or the width of a
+    finger.  Images at several jaw openings show how the fingers move; with the openings in metres in a
+    timestamps.csv beside them, as for gripmon replay, they also give the length.
 
-    Ten images at least of each opening, in focus, each before another background, lit as in use.  Where
-    the fingers' long edges meet in one point (their vanishing point) they are placed in space, else by how
-    both fingers move between openings; with one opening the outline is then taken as flat, facing the
-    camera.  What isn't known is said and in the reference's covariance.
+    Use at least ten images of each opening, in focus, each before another background, lit as in use.  If
+    the fingers' long edges meet in one point (their vanishing point), it gives the fingers' pose in space,
+    otherwise the motion of both fingers between openings; with one opening the outline is then assumed to
+    be flat and facing the camera.  The uncertainty is printed and in the reference's covariance.
 
-    Written are the gripper file and, with --reference-out, the reference that belongs to it.
+    The command writes the gripper file and, with --reference-out, its reference.
     """
     import cv2
 

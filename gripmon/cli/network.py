@@ -1,4 +1,4 @@
-"""What belongs to the network: ``gripmon feed``, ``router`` and ``schema``."""
+"""Network commands: ``gripmon feed``, ``router`` and ``schema``."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _FEED_OPTIONS = f"""
 SOURCE             a folder of images, a video file, or a camera (0, /dev/…, URL)
 --robot NAME       the robot's name in the Zenoh keys
 --camera NAME      the camera's name there (default wrist)
---key KEY          another key than gripmon/<robot>/<camera>/image
+--key KEY          key to use instead of gripmon/<robot>/<camera>/image
 {NETWORK_OPTIONS.format("the monitor's").strip()}
---format           how (default raw)
---quality Q        of JPEG, 1 to 100 (default 90)
---fps HZ           frames a second; default: as the input's stamps say
---loop             begin again at the end, until interrupted
+--format           encoding of the images (default raw)
+--quality Q        JPEG quality, 1 to 100 (default 90)
+--fps HZ           frames per second; default: by the input's stamps
+--loop             repeat the input until interrupted
 --recorded-stamps  send the input's time stamps instead of the time of sending
 """
 
@@ -34,12 +34,12 @@ _FEED_EXAMPLES = """\
   gripmon feed /dev/video0 --robot arm1 --connect tcp/192.168.1.2:7447
   gripmon feed images/ --robot arm1 --zenoh-config mine/zenoh/robot.json5    docs/howto/security.md
 
-exit codes: 0 the images are at their end; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
+exit codes: 0 all images sent; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
 
 _ROUTER_EXAMPLES = """\
   gripmon certificates --out certificates              once: keys for everyone
-  gripmon router configs/zenoh/router.json5            mutual TLS, and who may do what
-  gripmon router configs/zenoh/local.json5             without security, on this machine alone
+  gripmon router configs/zenoh/router.json5            mutual TLS and access rules
+  gripmon router configs/zenoh/local.json5             without security, on this machine only
 
 exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""
 
@@ -60,9 +60,9 @@ _LOOK_EVERY_S = 1.0
     fps=positive_number,
 )  # fmt: skip
 def feed(arguments: Arguments) -> int:
-    """Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
-    configuration says source: {kind: zenoh}.  For trying things out, and as an example of a driver:
-    docs/howto/network_camera.md says what is on the wire.
+    """Publish images over Zenoh in real time, like the driver of a wrist camera, for a monitor configured
+    with source: {kind: zenoh}.  For trying things out, and as an example of a driver:
+    docs/howto/network_camera.md describes the protocol.
     """
     from gripmon.io.publish.feeding import Feeder
     from gripmon.io.sources import SourceError, open_source, settings_for_text
@@ -73,7 +73,7 @@ def feed(arguments: Arguments) -> int:
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     try:
         settings = settings_for_text(arguments.source, arguments.fps)
-        sources = [open_source(settings)]  # before anything is sent: what can't be opened is reported at once
+        sources = [open_source(settings)]  # before anything is sent, to report at once what can't be opened
     except SourceError as error:
         raise InputError(f"feed: {arguments.source}: {error}") from None
     try:
@@ -102,15 +102,15 @@ def feed(arguments: Arguments) -> int:
 
 
 @Command(
-    "router", "a Zenoh router between monitors and their readers", "FILE  Zenoh's configuration (json5, yaml)",
+    "router", "a Zenoh router between monitors and their readers", "FILE  Zenoh configuration (json5, yaml)",
     _ROUTER_EXAMPLES,
 )  # fmt: skip
 def router(arguments: Arguments) -> None:
     """Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
 
-    FILE is a configuration of Zenoh's (json5 or yaml); zenohd, Zenoh's own router, takes the same one.
-    Paths of certificates in it count from its folder. A router that is to connect to another one tries
-    again for ever, and says so.
+    FILE is a Zenoh configuration (json5 or yaml), the same as for zenohd, Zenoh's own router. Its paths of
+    certificates are relative to its folder. A router that connects to another one retries forever, and
+    reports it.
     """
     from gripmon.io.wire import Router, ZenohFileError
 
@@ -147,16 +147,16 @@ _SCHEMA_OPTIONS = f"""
     message={"choices": _MESSAGES},
 )  # fmt: skip
 def schema(arguments: Arguments) -> None:
-    """Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames
+    """Print the JSON Schema (draft 2020-12) of one message, or of all messages: fields with units and frames,
     and when they are null.
 
-    Every message says its own schema and that one's major version: "schema": "gripmon.transform/1".  Within
-    a major version fields and names may be added, and nothing else changes.
+    Every message names its schema with the major version: "schema": "gripmon.transform/1".  Within a major
+    version fields and names may be added, and nothing else changes.
     """
     from gripmon.model.records import MESSAGES, json_schema, schema_name, summary
 
     if arguments.list and arguments.message:
-        raise InputError(f"schema: --list is about all messages, but {arguments.message} is given; one of them")
+        raise InputError(f"schema: --list lists all messages, but {arguments.message} is given; one of them")
     names = tuple(MESSAGES) if arguments.message is None else (arguments.message,)
     if arguments.list:
         for name in names:

@@ -1,4 +1,4 @@
-"""What is done with recordings: ``gripmon report``, ``export``, ``correct`` and ``view``."""
+"""Commands on recordings: ``gripmon report``, ``export``, ``correct`` and ``view``."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
 
 _REPORT_OPTIONS = """
-RECORDING...     .rrd files, folders of them with all below, or estimates.jsonl
---out FILE.html  the page (default: report.html; none if there is only --json)
+RECORDING...     .rrd files, folders of them (searched recursively), or estimates.jsonl
+--out FILE.html  the page (default: report.html; none with --json alone)
 --json FILE      the same as data (SI units); - for stdout
---limit-mm MM    a calibration that is off by more at the TCP counts as affected (mm; default: what the recording's
-                 configuration calls worth a warning, monitor.policy.warn_m)
---limit-deg DEG  likewise for its turn (degrees; warn_rad)
+--limit-mm MM    offset of the TCP above which a calibration counts as affected (mm; default: the recorded
+                 configuration's limit for a warning, monitor.policy.warn_m)
+--limit-deg DEG  the same for the rotation (degrees; warn_rad)
 """
 
 _REPORT_EXAMPLES = """\
   gripmon demo --out demo && gripmon report demo/*.rrd --out demo/report.html
-  gripmon report recordings/ --limit-mm 0.5      what is off by less than 0.5 mm doesn't matter
+  gripmon report recordings/ --limit-mm 0.5      offsets below 0.5 mm don't matter
   gripmon report recordings/ --json - | jq .recordings[].affected
 
-exit codes: 0 done, if only a part could be used, too (stderr says which); 2 wrong usage, no such file,
+exit codes: 0 done, also if only a part could be used (stderr says which); 2 wrong usage, no such file,
 or no recording; 3 nothing in them can be used; 130 interrupted"""
 
 _EXPORT_OPTIONS = """
-RECORDING...  recordings (.rrd), folders of them with all below, or estimates.jsonl
---out DIR     where the tables go; made if it is missing
+RECORDING...  recordings (.rrd), folders of them (searched recursively), or estimates.jsonl
+--out DIR     folder for the tables; created if missing
 """
 
 _EXPORT_EXAMPLES = """\
   gripmon export recordings/ --out fleet
   gripmon export recordings/arm1-*.rrd recordings/arm2-*.rrd --out fleet
 
-exit codes: 0 done, also where a part of a recording could not be used (one line each on stderr);
+exit codes: 0 done, also if a part of a recording could not be used (one line each on stderr);
 2 wrong usage; 3 nothing in it could be used, or the folder could not be written"""
 
 _CORRECT_OPTIONS = """
-RECORDING...       recordings (.rrd), folders of them with all below, or estimates.jsonl
+RECORDING...       recordings (.rrd), folders of them (searched recursively), or estimates.jsonl
 --out FILE         FILE.jsonl, FILE.parquet or FILE.rrd
 --stamps FILE.csv  give the transform at these capture times instead of the frames': a column stamp_ns (Unix ns)
 """
@@ -63,9 +63,9 @@ _CORRECT_EXAMPLES = """\
 exit codes: 0 done; 2 wrong usage; 3 nothing measured in the recordings; 130 interrupted"""
 
 _VIEW_OPTIONS = """
-RECORDING...  .rrd files, or folders of them with all below
---web         as a page; the default where there is no display
-| --native    in a window; the default where there is a display
+RECORDING...  .rrd files, or folders of them (searched recursively)
+--web         as a page; the default without a display
+| --native    in a window; the default with a display
 --port N      TCP port of the page (default 9090, or another if that is in use)
 """
 
@@ -74,8 +74,7 @@ _VIEW_EXAMPLES = """\
   gripmon view arm1-wrist-20260101T060000Z-000*.rrd --web
   gripmon view shift.rrd --web --port 9091
 
-A page for another machine: ssh -L, for the page's port and the one of the files, which its address
-names.
+To view the page on another machine: ssh -L, for the page's port and the data port in its address.
 
 exit codes: 0 the window was closed; 2 wrong usage or no such recording; 3 no viewer could be started;
 130 Ctrl-C"""
@@ -89,10 +88,10 @@ _TO_STDOUT = Path("-")
     limit_mm=positive_number, limit_deg=positive_number,
 )  # fmt: skip
 def report(arguments: Arguments) -> None:
-    """Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
-    with it, what did it, whether it is still so, and which times are affected. The answer in one
-    paragraph is printed; FILE.html shows it with plots, pictures and tables, in one file that needs no
-    network. Recordings of several runs and robots go on one time axis.
+    """Report what happened in recordings: when the camera moved, how far the tool centre point (TCP) moved
+    with it, the cause, whether it has returned, and which times are affected. One paragraph is printed;
+    FILE.html adds plots, pictures and tables, in one file that needs no network. Recordings of several
+    runs and robots are shown on one time axis.
     """
     data_path, to_stdout = arguments.json, arguments.json == _TO_STDOUT
     if arguments.out is None and data_path is None:
@@ -119,14 +118,14 @@ def report(arguments: Arguments) -> None:
 
 @Command("export", "write recordings as Parquet, by robot and day", _EXPORT_OPTIONS, _EXPORT_EXAMPLES, out=REQUIRED)
 def export(arguments: Arguments) -> None:
-    """Write what recordings hold as Parquet, partitioned by robot, camera and day (UTC), so that months of
-    a whole fleet can be asked by any engine:
+    """Write recordings as Parquet, partitioned by robot, camera and day (UTC), so that any query engine can
+    evaluate months of a whole fleet:
 
       DIR/frames/robot=arm1/camera=wrist/date=2026-03-14/RUN-0000.parquet
 
     and likewise alerts, states and commands; references by robot and camera.  Columns, units and one
-    query each for DuckDB and Polars: docs/howto/export.md.  A file that is exported again replaces its rows;
-    it may be done every hour, also while the monitor writes.  Images stay in the recording.
+    query each for DuckDB and Polars: docs/howto/export.md.  Exporting a file again replaces its rows; this
+    may be done every hour, also while the monitor writes.  Images stay in the recording.
     """
     from gripmon.record.export import export
     from gripmon.record.read import recording_files
@@ -141,23 +140,23 @@ def export(arguments: Arguments) -> None:
 
 
 @Command(
-    "correct", "the best transform for every instant, knowing the whole recording", _CORRECT_OPTIONS, _CORRECT_EXAMPLES,
+    "correct", "the best transform for every frame, from the whole recording", _CORRECT_OPTIONS, _CORRECT_EXAMPLES,
     out=REQUIRED,
 )  # fmt: skip
 def correct(arguments: Arguments) -> None:
-    """Estimate cam_T_grip for every frame of a recording once more, from all frames before and after it:
-    for data that was recorded with a stale calibration.  A step stays a step, and is placed in the
-    frame in which it happened.  FILE's suffix says what is written:
+    """Estimate cam_T_grip for every frame of a recording again, from all frames before and after it: for
+    data that was recorded with a stale calibration.  A step is not smoothed, and is localised to its
+    frame.  FILE's suffix decides the format:
 
-      .jsonl    one line about the recordings and the change points, then one line a frame
-      .parquet  the same as a table, units in the columns' names
-      .rrd      a track of transforms that a viewer lays over the recording (open both); several runs
-                get a file each, FILE-1.rrd and on
+      .jsonl    one line about the recordings and the change points, then one line per frame
+      .parquet  the same as a table, with units in the columns' names
+      .rrd      a track of transforms that a viewer overlays on the recording (open both); several runs
+                get a file each, FILE-1.rrd and so on
 
-    Covariances say what is left: also what frames claim and averaging can't take away.
+    Covariances include reported variance that averaging can't reduce.
     """
     if arguments.out.suffix.lower() == ".rrd" and arguments.stamps is not None:
-        raise InputError("--stamps: a track has its frames' times; .jsonl or .parquet")
+        raise InputError("--stamps: a track in an .rrd has only its frames' times; .jsonl or .parquet")
     arguments.check_outputs("out")
     from gripmon.analyse.api import correct
 
@@ -168,9 +167,9 @@ def correct(arguments: Arguments) -> None:
 
 @Command("view", "recordings in rerun's viewer, native or in a browser", _VIEW_OPTIONS, _VIEW_EXAMPLES, port=port)
 def view(arguments: Arguments) -> int:
-    """Show recordings in rerun's viewer: in a window where there is a display, else as a page for a browser
-    on this machine, whose address is printed.  The files of one run appear as one recording.  It ends
-    with Ctrl-C, or when the window is closed, and leaves nothing running.
+    """Show recordings in rerun's viewer: in a window if there is a display, otherwise as a page for a browser
+    on this machine, whose address is printed.  The files of one run appear as one recording.  The command
+    ends with Ctrl-C, or when the window is closed, and leaves nothing running.
     """
     from gripmon.record.read import rrd_files
     from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
@@ -185,7 +184,7 @@ def view(arguments: Arguments) -> int:
                 opened.callback(viewer.close)
                 return EXIT_FAILED if viewer.wait() else EXIT_DONE
             page = opened.enter_context(serve_files(files, arguments.port or free_port(_PORT)))
-            print(f"{page.url}\n(Ctrl-C ends it)", flush=True)
+            print(f"{page.url}\n(stop with Ctrl-C)", flush=True)
             threading.Event().wait()
     except ViewerError as error:
         raise NoResultError(f"view: {error}") from None

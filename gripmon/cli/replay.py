@@ -1,4 +1,4 @@
-"""``gripmon replay``: recorded frames through the same core as the daemon's, one JSON line a frame."""
+"""``gripmon replay``: recorded frames through the daemon's core, one JSON line per frame."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 _OPTIONS = """
-INPUT...              a folder of images, taken in the order of their names, a video file, or a recording of ours: an
-                      .rrd file, all files of one run, or a folder of them with all below; an .mcap file, a rosbag2
-                      folder or a LeRobot dataset; a timestamps.csv may lie beside images, with the columns
+INPUT...              a folder of images, in the order of their names, a video file, or a gripmon recording: an .rrd
+                      file, all files of one run, or a folder of them (searched recursively); an .mcap file, a rosbag2
+                      folder or a LeRobot dataset; a folder of images may contain a timestamps.csv with the columns
                       file,stamp_ns[,jaw_opening_m] (Unix ns, m)
---config CONFIG       configuration (YAML); of its source section camera and opening count for an .mcap, a rosbag2 and a
-                      LeRobot dataset, nothing for others; left out for a recording: its own
---out FILE            JSON lines go here; - is standard output
---recording FILE.rrd  also write a rerun recording (open it with: gripmon view FILE.rrd); of a recording it shows both
+--config CONFIG       configuration (YAML); its source section is used only for the camera and opening of an .mcap, a
+                      rosbag2 or a LeRobot dataset; without it a recording's own configuration is used
+--out FILE            file for the JSON lines; - is standard output
+--recording FILE.rrd  also write a rerun recording (open it with: gripmon view FILE.rrd); for a recording it shows both
                       runs, recorded and replayed
 --camera NAME         which images: topic of an .mcap or rosbag2, feature of a LeRobot dataset (default: the only one)
 --episode N           which episode of a LeRobot dataset (default: the only one)
---fps HZ              frames a second where the input has no time stamps (1/s)
+--fps HZ              frames per second if the input has no time stamps (1/s)
 """
 
 _EXAMPLES = """\
@@ -37,8 +37,8 @@ _EXAMPLES = """\
   gripmon replay pulses/images --config second.yaml --out spots.jsonl      a second camera's pulses
   gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
-exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used, or writing failed (a
-FILE.rrd from before stays then); 130 interrupted (what was done until then is in FILE)"""
+exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used, or writing failed (an
+existing FILE.rrd is kept then); 130 interrupted (FILE has the lines so far)"""
 
 
 @Command(
@@ -49,14 +49,14 @@ def replay(arguments: Arguments) -> int:
     """Run recorded frames through the monitor and write one JSON line for every input frame, in input
     order, refused ones included.  The same input gives the same bytes, except for latency_ns.
 
-    A recording of gripmon's brings its own configuration, the state that the monitor began with and the
-    commands that it got: without --config the same core decides again what it decided then, to the byte
-    where every frame was recorded as PNG (image_format: png and an image rate of every frame), else
-    closely.  With another --config one sees what that would have done; --recording then shows both, named
-    recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end.
+    A gripmon recording contains its configuration, the monitor's initial state and the commands received:
+    without --config the replay reproduces the decisions, to the byte if every frame was recorded as PNG
+    (image_format: png and image_every: 1), otherwise closely.  Another --config shows what it would have
+    changed; --recording then shows both runs, recorded and replayed, in one view.  The last line reports
+    how many frames were judged differently.
 
     With the configuration of a second camera (a section laser) INPUT is a folder or a video, its pulses
-    are those of the table laser.pulses, and every pulse gets a line.
+    come from the table laser.pulses, and every pulse gets a line.
     """
     import cv2
 
@@ -84,7 +84,7 @@ def _say(*lines: str) -> None:
 
 @contextmanager
 def _output(arguments: Arguments) -> Iterator[Callable[[bytes], None]]:
-    """What writes a line; a fault ends the command with one line and exit code 3."""
+    """A function that writes a line; a fault ends the command with one line and exit code 3."""
     path: Path = arguments.out
     if path == Path("-"):
         file: Any = sys.stdout.buffer
@@ -97,7 +97,7 @@ def _output(arguments: Arguments) -> Iterator[Callable[[bytes], None]]:
         try:
             act(*values)
         except BrokenPipeError:
-            raise  # a reader that has seen enough isn't a fault
+            raise  # a reader that closes the pipe isn't a fault
         except OSError as error:
             raise NoResultError(f"--out {path}: writing failed ({error.strerror})") from None
 
@@ -106,5 +106,5 @@ def _output(arguments: Arguments) -> Iterator[Callable[[bytes], None]]:
         put(file.flush)
     finally:
         if file is not sys.stdout.buffer:
-            with suppress(OSError):  # the same fault once more
+            with suppress(OSError):  # the same fault again
                 file.close()

@@ -1,4 +1,4 @@
-"""``gripmon send``: what an operator tells a running monitor."""
+"""``gripmon send``: an operator's commands to a running monitor."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
 
 _OPTIONS = f"""
 NAME               {", ".join(_NAMES)}
-[ID]               the reference, proposal or alert that is meant
+[ID]               id of the reference, proposal or alert
 --robot NAME       the robot's name in the configuration
 --camera NAME      the camera's name; needed if the robot has several
---monitor ID       which one, where two monitors have one name: its id, as printed
+--monitor ID       id of the monitor, as printed, if two have the same name
 {NETWORK_OPTIONS.format("the monitor's").strip()}
 --timeout S        how long to wait (s); default: 5
---out DIR          where a snapshot goes; made if it is missing
---request REQUEST  id of an earlier request that got no answer
---json             print the whole answer as one line of JSON
+--out DIR          folder for a snapshot; created if missing
+--request REQUEST  id of an earlier request that got no reply
+--json             print the whole reply as one line of JSON
 """
 
 _EXAMPLES = """\
@@ -43,30 +43,30 @@ _EXAMPLES = """\
   gripmon send undo recalibration-3-1f0c9a2b --robot arm1 --camera wrist
   gripmon send snapshot --robot arm1 --out now        now/snapshot-1.png, -1.json, timestamps.csv
 
-exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
+exit codes: 0 done; 2 wrong usage; 3 refused, or no reply; 130 Ctrl-C"""
 
 
 @Command(
-    "send", "tell a running monitor something: undo, accept, state, …", _OPTIONS, _EXAMPLES,
+    "send", "send a command to a running monitor: undo, accept, state, …", _OPTIONS, _EXAMPLES,
     name={"choices": _NAMES, "metavar": "COMMAND"}, id={"default": ""}, robot=REQUIRED, monitor={"default": ""},
     timeout={"type": positive_number, "default": 5.0},
 )  # fmt: skip
 def send(arguments: Arguments) -> int:
-    """Tell a running monitor something, and print its answer.
+    """Send a command to a running monitor, and print its reply.
 
-      recalibrate       measure the reference again from what the camera sees
-      accept [ID]       take the proposed reference
-      reject [ID]       forget the proposed reference
-      undo [ID]         go back to the reference before, or to the one named: a new revision with that
+      recalibrate       measure a new reference from the camera's images
+      accept [ID]       accept the proposed reference
+      reject [ID]       discard the proposed reference
+      undo [ID]         restore the previous reference, or the one named: a new revision with that
                         transform
-      reset             go back to the configured reference, likewise
-      acknowledge [ID]  take note of an open alert, or of all
+      reset             restore the configured reference, likewise
+      acknowledge [ID]  acknowledge an open alert, or all
       state             print the references, a proposal and the open alerts
-      snapshot          write the newest frame's image, and what the monitor made of it, to --out,
-                        numbered, with a row in timestamps.csv: ready for replay and teach
+      snapshot          write the newest frame's image and record to --out, numbered, with a row in
+                        timestamps.csv: ready for replay and teach
 
-    What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
-    answer came, --request with that id asks for the same again, which is not carried out twice.
+    An impossible command is refused with a reason, and changes nothing.  Every request has an id: if no
+    reply came, --request with that id repeats the request, which is not carried out twice.
     """
     from gripmon.client import snapshots
 
@@ -92,12 +92,12 @@ def send(arguments: Arguments) -> int:
 
 
 def _misuse(arguments: Arguments) -> str:
-    """What can't go together, and what would be right."""
+    """Options that exclude each other, and what would be right; empty if none."""
     name = arguments.name
     if arguments.id and name not in _WITH_ARGUMENT:
         return f"{name} takes no ID, but {arguments.id} is given; leave it out"
     if name == "snapshot" and arguments.out is None:
-        return "snapshot has nowhere to go; --out DIR"
+        return "snapshot needs a folder; --out DIR"
     if name != "snapshot" and arguments.out is not None:
         return f"{name} writes nothing; leave --out out"
     if name in ("state", "snapshot") and arguments.request is not None:

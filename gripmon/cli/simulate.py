@@ -7,12 +7,12 @@ from gripmon.model.errors import InputError
 
 _OPTIONS = """
 [SCENARIO]       a built-in name (see --list) or a YAML file
---out DIR        folder to write to; made if it is missing, refused if not empty
+--out DIR        folder to write to; created if missing, refused if not empty
 --seed N         random seed, 0 or more (default 0)
 --config CONFIG  take camera, gripper and calibration from this configuration (default: those of gripmon demo)
 --seconds S      scale a built-in scenario to this length (s)
---fps HZ         frames a second of a built-in one (1/s)
---list           print the names of the built-in scenarios, and stop
+--fps HZ         frame rate of a built-in scenario (1/s)
+--list           print the names of the built-in scenarios
 """
 
 _EXAMPLES = """\
@@ -33,14 +33,14 @@ inputs for every step from a new gripper to a running monitor
     seconds=positive_number, fps=positive_number,
 )  # fmt: skip
 def simulate(arguments: Arguments) -> None:
-    """Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
-    reports it), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
-    them; m, px), and config.yaml with gripper.yaml, so that gripmon replay works at once.  The same seed
-    gives the same images.
+    """Write a simulated sequence: one PNG per frame, timestamps.csv (file, stamp_ns, jaw_opening_m as reported
+    by the robot), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
+    them; m, px), and config.yaml with gripper.yaml, ready for gripmon replay.  The same seed gives the same
+    images.
 
-    For the way from a new gripper to a running monitor without any hardware, all of one camera and gripper:
+    For all steps from a new gripper to a running monitor without hardware, with one camera and gripper:
     plate        a calibration plate, tilted to all sides, for gripmon calibrate intrinsics
-    standing     the gripper stands on the plate; rough.yaml has its corners as a person would put them
+    standing     the gripper stands on the plate; rough.yaml has its corners as a person would mark them
     work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
     robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
     spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)

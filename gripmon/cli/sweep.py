@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 ABOUT = """\
 RANGE is FIRST:LAST:COUNT, or single values with commas; write --roll=-90:90:3 where it begins with a minus. \
-What isn't given stays as in the configuration, but for distance (0.6 to 1.8 times) and tilt (0 to 75°)."""
+Defaults are the configuration's values, except for distance (0.6 to 1.8 times) and tilt (0 to 75°)."""
 
 OPTIONS = """
---sweep           try other camera mounts, and lenses; the source is left out
+--sweep           evaluate other camera mounts and lenses; the source is not used
 --distance RANGE  from the camera's centre to the TCP (m)
 --tilt RANGE      of the optical axis against the gripper's z axis (degrees, 0 along the fingers)
---side RANGE      where the camera sits about the gripper's z axis (degrees; 0 at -y, 90 at +x)
---roll RANGE      about the optical axis: how far the picture is turned clockwise (degrees)
+--side RANGE      direction of the camera about the gripper's z axis (degrees; 0 at -y, 90 at +x)
+--roll RANGE      about the optical axis: clockwise rotation of the picture (degrees)
 --focal RANGE     focal length, same sensor (px); any but the calibrated one without distortion
 | --fov RANGE     the same by the image's width (degrees)
 | --lens FILE...  a calibrated one, by gripmon calibrate intrinsics; may be repeated
---at U,V          where the TCP shows in the present camera's image (px; default: as now)
---jaw MIN:MAX     openings at which it has to work (m; default: all)
+--at U,V          position of the TCP in the present camera's image (px; default: as now)
+--jaw MIN:MAX     openings at which the mount has to work (m; default: all)
 --picture FILE    draw the sweep (.png, .jpg)
 """
 _RANGES = ("distance", "tilt", "side", "roll", "focal", "fov")
@@ -38,7 +38,7 @@ NAMES = (*_RANGES, "lens", "at", "jaw", "picture")
 
 
 def run(arguments: Arguments) -> int:
-    """Try the mounts, print the table, draw the picture."""
+    """Evaluate the mounts, print the table, draw the picture."""
     from gripmon.daemon.config import load_config
     from gripmon.daemon.forecast import rig_of
     from gripmon.daemon.sweeping import as_plain, make_grid, sweep, values_in
@@ -72,7 +72,7 @@ _SHOWN, _REASONS_SHOWN = 8, 4
 _COLUMNS = (
     ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
     ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 8),
-    ("bound", "mm", 8), ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
+    ("bound", "mm", 8), ("detects", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
 )  # fmt: skip
 
 
@@ -101,16 +101,16 @@ def _as_text(swept: Sweep) -> list[str]:
     lines += [
         "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
         "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
-        "           worst opening; bound: on its error at the worst opening, which alert_limit_m is held against;",
-        "           notices: the smallest step that is noticed along every axis; in: frames until",
+        "           worst opening; bound: on its error at the worst opening, compared with alert_limit_m;",
+        "           detects: the smallest step detected along every axis; in: frames until",
         f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
-        "           until too little is in view.  Not known here: focus, light, what is in the camera's way, and what",
-        "           hides the fingers without being in the gripper file.",
+        "           until too little is in view.  Not included: focus, light, obstacles, and what hides the fingers",
+        "           without being in the gripper file.",
     ]
     if not config.gripper.faces:
         lines += [
-            "no faces   The gripper file has none, as an inferred one: every edge counts as seen from everywhere, also",
-            "           where the finger itself hides it. Trust mounts near the present one only.",
+            "no faces   The gripper file has none, like an inferred one: every edge counts as visible from everywhere,",
+            "           even if the finger itself hides it. Trust only mounts near the present one.",
         ]
     if ranked[0].works:
         lines += _to_copy(ranked[0])
@@ -118,16 +118,16 @@ def _as_text(swept: Sweep) -> list[str]:
 
 
 def _looked_at(config: Config, present: Trial) -> list[str]:
-    """Which openings count, and how taught edges do."""
+    """Which openings count, and how taught edges are used."""
     lines = []
     low_mm, high_mm = 1e3 * present.openings_m[0], 1e3 * present.openings_m[-1]
     if high_mm > low_mm:
         usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
         lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
     if config.taught is not None:
-        lines.append("taught     as seen from the present mount; taught again at another one it gets more exact there")
+        lines.append("taught     at the present mount; teaching again at another mount is more accurate there")
     elif config.gripper.edge_bevel_m[~config.gripper.edge_curved].any():
-        lines.append("taught     not yet: the gripper file's bevels count as taught, without which bounds are wider")
+        lines.append("taught     not yet: the gripper file's bevels count as taught; until they are, bounds are wider")
     return lines
 
 
@@ -152,7 +152,7 @@ def _number(value: float, factor: float, digits: int) -> str:
 
 
 def _failing(ranked: list[Trial]) -> list[str]:
-    """The commonest first reasons."""
+    """The most common first reasons."""
     kinds = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
     return [f"{'' if k else 'others':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(kinds)]
 

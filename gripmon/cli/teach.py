@@ -1,4 +1,4 @@
-"""``gripmon teach``: what the gripper's edges look like, from images at the reference or from corners put by hand."""
+"""``gripmon teach``: how the gripper's edges look, from images at the reference or from corners placed by hand."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
 _OPTIONS = """
 [IMAGE...]          image file at the reference calibration, or a folder of them
 --config CONFIG     configuration (YAML); its source section is not used
---out FILE          file to write (default: what the configuration names under taught, else taught.yaml beside it);
-                    with --page or --corners the folder to write to (default: the configuration's, else this one)
+--out FILE          file to write (default: the configuration's `taught`, else taught.yaml beside it); with --page or
+                    --corners the folder to write to (default: the configuration's, else this one)
 --jaw-opening M     jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's
-                    nominal if that is absent, else from a timestamps.csv beside each image
---picture FILE.png  also draw the first image with what was taught, offsets enlarged
---force             replace the file if there is one
---into-config       also write the line that names it into the configuration
+                    nominal opening if that is absent, else from a timestamps.csv beside each image
+--picture FILE.png  also draw the first image with the taught edges, offsets enlarged
+--force             replace an existing file
+--into-config       also add the line `taught:` to the configuration
 """
 
 _BY_HAND = f"""
 --page              teach on a local web page
 --corners FILE      without a page: rough corners, `corners: {{name: [u, v], …}}`
 --live DEVICE       with --page: a camera instead of images, as in source.device
---live-wait S       give up when this camera has shown nothing for so long (s); default: never, the page says what is
-                    wrong
+--live-wait S       give up if the camera has sent no image for this long (s); default: never, the page reports the
+                    fault
 --camera FILE       without --config: the camera's calibration
 --gripper FILE      without --config: the gripper file
---reference FILE    without --config: calibration of hand and eye, if there is
---jaw-source        in the configuration written: where jaw openings come from; zenoh: the robot says them (default:
-                    frames with a timestamps.csv that has them, else fixed)
---source SOURCE     in the configuration written: where frames come from, a folder, a video, a device,
+--reference FILE    without --config: hand/eye calibration, if there is one
+--jaw-source        in the configuration written: source of the jaw openings; zenoh: the robot reports them (default:
+                    frames if a timestamps.csv has them, else fixed)
+--source SOURCE     in the configuration written: source of the frames, a folder, a video, a device,
                     zenoh:WIDTHxHEIGHT[:KEY] or ros2:WIDTHxHEIGHT:TOPIC (default: the images' folder)
 --robot NAME        the robot's name in the configuration written
 --camera-name NAME  the camera's name in it
@@ -58,45 +58,45 @@ _EXAMPLES = """\
 a gripper without a file: rough.yaml for gripmon calibrate plane --infer
   gripmon teach --page on_plate.png --camera camera.yaml
 
-a new robot, without any configuration: put corners on the fingertips, on a page in your browser
+a new robot, without any configuration: drag corners onto the fingertips, on a page in your browser
   gripmon teach --page first/*.png --camera camera.yaml --gripper gripper.yaml --out mine
   gripmon teach --page --live 0 --camera camera.yaml --gripper gripper.yaml --reference hand_eye.yaml
   gripmon teach first.png --corners rough.yaml --camera camera.yaml --gripper gripper.yaml --out mine
 
-exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
-from, and why: nothing is written then"""
+exit codes: 0 written; 2 wrong usage, configuration or image files; 3 no model from these images, with
+the reason: nothing is written then"""
 
 _NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source")
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
 
 
 def _key(text: str) -> str:
-    """A name that may stand in a key on the network."""
+    """A name that is valid in a Zenoh key."""
     if not text or re.fullmatch(r"[^/*$#?@\s][^/*$#?\s]*", text) is None:
         raise argparse.ArgumentTypeError(f"'{text}' isn't a name; no blank, none of / * $ # ?, no @ in front")
     return text
 
 
 @Command(
-    "teach", "learn how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
+    "teach", "measure how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
     camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT,
 )  # fmt: skip
 def teach(arguments: Arguments) -> None:
-    """Measure where each edge of the gripper really shows, in images taken at the reference calibration,
-    and write it as a taught model.  Named in the configuration (`taught: taught.yaml`), it makes the
-    monitor compare like with like: what bevels, rounded edges, shading and blur shift the edges by
-    cancels.  The reference is by definition the gripper's pose in these images.
+    """Measure where each edge of the gripper really appears, in images taken at the reference calibration,
+    and write it as a taught model.  With this model in the configuration (`taught: taught.yaml`), the bias
+    of bevels, rounded edges, shading and blur cancels.  The reference is by definition the gripper's pose
+    in these images.
 
-    With --page a person drags rough corners onto the fingertips, on a web page that only this machine
-    can open, sees the edges snap and what accuracy to expect, and saves the taught model together with
-    a configuration for gripmon check and gripmon run; no configuration is needed for that, only the
-    camera's calibration and the gripper file.  Without --reference the pose comes from the corners,
-    less exactly than from a plate (gripmon calibrate plane).  --corners does the same without a page.
-    With neither --gripper nor --config the page writes rough.yaml, for gripmon calibrate plane --infer.
+    With --page you drag rough corners onto the fingertips, on a web page that only this machine can open,
+    see the edges snap and the expected accuracy, and save the taught model with a configuration for
+    gripmon check and gripmon run; this needs no configuration, only the camera's calibration and the
+    gripper file.  Without --reference the pose comes from the corners, less accurately than from a plate
+    (gripmon calibrate plane).  --corners does the same without a page.  With neither --gripper nor
+    --config the page writes rough.yaml, for gripmon calibrate plane --infer.
 
     Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
-    in use, each before another background, some with the jaws opened otherwise.
+    in use, each before another background, some with another jaw opening.
     """
     if arguments.page or arguments.corners is not None or arguments.live is not None:
         _teach_by_hand(arguments)
@@ -132,11 +132,11 @@ def _summary(config: Config, taught: Taught, out: Path) -> str:
     lines += [f"{name:<{width}}  not taught: {reason}" for name, reason in taught.untaught.items()]
     lines += [f"left out: {why}" for why in taught.left_out.values()]
     lines += [f"note: {note}" for note in taught.notes]
-    lines.append(f"measured again with this, the gripper shows at most {taught.closure_px:.2f} px from the reference")
+    lines.append(f"measured again with this, the gripper is at most {taught.closure_px:.2f} px from the reference")
     lines.append(f"written: {out}")
     if config.taught_path is None or config.taught_path.resolve() != out.resolve():
         name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
-        lines.append(f"next: put the line `taught: {name}` into {config.path} (--into-config --force does)")
+        lines.append(f"next: add the line `taught: {name}` to {config.path} (or use --into-config --force)")
     return "\n".join(lines)
 
 
@@ -149,7 +149,7 @@ def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
 
 
 def _teach_by_hand(arguments: Arguments) -> None:
-    """Handle ``gripmon teach --page`` and ``--corners``."""
+    """Run ``gripmon teach --page`` and ``--corners``."""
     arguments.image = image_paths(arguments.image)
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
@@ -158,7 +158,7 @@ def _teach_by_hand(arguments: Arguments) -> None:
     images = arguments.image
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
         if len(images) > 1:
-            right = "one image, to put rough corners in, or --gripper FILE"
+            right = "one image, to mark rough corners in, or --gripper FILE"
             raise InputError(f"teach: {len(images)} images, and no gripper; {right}")
         folder = arguments.out or Path()
         session = outline_session(images[0], arguments.camera, folder)
@@ -188,12 +188,12 @@ def _teach_by_hand(arguments: Arguments) -> None:
 
 
 def _misuse(arguments: Arguments) -> str:
-    """Which options contradict each other, and what would be right."""
+    """Options that exclude each other, and what would be right; empty if none."""
     images, page, config, live = arguments.image, arguments.page, arguments.config, arguments.live
     if page and arguments.corners is not None:
-        return "--page and --corners are two ways of the same; one of them"
+        return "--page and --corners exclude each other; one of them"
     if arguments.source is not None and (live is not None or config is not None):
-        return "--source: --live or --config says where frames come from; leave it out"
+        return "--source: --live or --config gives the source of frames; leave it out"
     if live is not None and (images or not page):
         return "--live goes with --page, without images; image files otherwise"
     if arguments.live_wait is not None and live is None:
@@ -201,15 +201,15 @@ def _misuse(arguments: Arguments) -> str:
     if not images and live is None:
         return "no image; image files, or --page --live DEVICE"
     if arguments.corners is not None and len(images) > 1:
-        return f"{len(images)} images; with --corners one, the image that they were put in"
+        return f"{len(images)} images; with --corners one, the image in which they were marked"
     if arguments.into_config:
-        return "--into-config: with --page and --corners the configuration gets its line anyway; leave it out"
+        return "--into-config: --page and --corners add the line anyway; leave it out"
     if arguments.picture is not None:
         return "--picture goes with --config alone; look at the page"
     if config is not None and arguments.jaw_source is not None:
-        return "--jaw-source: --config says where jaw openings come from; leave it out"
+        return "--jaw-source: --config gives the source of jaw openings; leave it out"
     if config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
-        return "--config has camera, gripper and reference already; either that, or --camera and --gripper"
+        return "--config names camera, gripper and reference already; either it, or --camera and --gripper"
     return ""
 
 
@@ -221,7 +221,7 @@ def _say(saved: Saved) -> None:
 
 
 def _serve(arguments: Arguments, session: TeachSession | OutlineSession) -> None:
-    """Until the person is done."""
+    """Serve the page until the person is done."""
     from gripmon.teach.page_server import TeachSite, serve
 
     def look() -> None:

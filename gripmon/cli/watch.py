@@ -1,4 +1,4 @@
-"""``gripmon watch``: how every monitor on the network is, and what they say."""
+"""``gripmon watch``: the state and the alerts of every monitor on the network."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _OPTIONS = f"""
 {NETWORK_OPTIONS.format("a monitor's").strip()}
 --alerts      print the alerts instead of the table
 --out FILE    with --alerts: append them to this file, JSON lines
---transforms  listen to every frame's transform for rate and age
+--transforms  subscribe to all transforms for rate and age
 --once        print the table once, after --seconds, and end
 --json        JSON lines instead of text
---period S    between two tables (s); default: 1
---seconds S   end after so long (s); with --once 3 by default
+--period S    time between two tables (s); default: 1
+--seconds S   end after this time (s); with --once 3 by default
 """
 
 _PAGE = f"""
 --web              show a page in the browser: pictures, alerts, proposals, and buttons for them
---address ADDRESS  an address of this machine by which others reach the page; default: this machine only
+--address ADDRESS  address of this machine at which others reach the page; default: this machine only
 {PORT_OPTIONS.strip()}
 """
 
@@ -62,30 +62,30 @@ def watch(arguments: Arguments) -> None:
     transform, then the suspect ones, then by the severest open alert and by drift. A monitor that
     vanished stays listed.
 
-    The last column begins with the command to type where a new reference waits for an operator, then has
+    The last column begins with the command to type if a new reference waits for an operator, then lists
     the open alerts: !! is for errors, ! for warnings, i for notes, each with their number, so that
     "!!1 !1" is one error and one warning; after them the text of the worst one.
 
-    On a terminal the table is drawn again with every period. Elsewhere one line is printed whenever a
-    monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
+    On a terminal the table is redrawn every period. Otherwise one line is printed whenever a monitor's
+    state, verdict, reference or alerts change; with --json one line of JSON every period.
 
-    With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
+    With --alerts every alert of every monitor is printed as it comes, including the last earlier ones, and
     when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.  An alert has
-    the time of the frame that it is about: where that is recorded or simulated, the recording's own clock.
+    the time of its frame: for recorded or simulated frames, the recording's own clock.
 
-    With --web the same is a page, with what each monitor sees.  Its buttons send what gripmon send does:
-    where a router has rules they need an operator's certificate (--zenoh-config).
+    With --web the same is a page, with each monitor's image.  Its buttons send the commands of gripmon
+    send: if a router has rules, they need an operator's certificate (--zenoh-config).
     """
     joined = arguments.network()
-    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # a missing connection stands in the table or the page
+    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # the table or page shows a missing connection
     if arguments.web:
         _serve(arguments, joined)
         return
-    arguments.refuse(("address", "no_browser"), "is for the page; add --web")
+    arguments.refuse(("address", "no_browser"), "applies only to the page; add --web")
     if arguments.out and not arguments.alerts:
         raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
     if arguments.alerts and (arguments.once or arguments.transforms):
-        raise InputError("watch: --alerts prints alerts alone; leave out --once and --transforms")
+        raise InputError("watch: --alerts prints only alerts; leave out --once and --transforms")
     from gripmon.client import Fleet
 
     log = _open_log(arguments) if arguments.alerts else None
@@ -118,7 +118,7 @@ def _serve(arguments: Arguments, joined: dict[str, Any]) -> None:
 
     address = arguments.address or ADDRESS
     if address in ("0.0.0.0", "::"):
-        raise InputError(f"--address {address}: names no machine; the address by which others reach this one")
+        raise InputError(f"--address {address}: isn't a machine's address; the one at which others reach this machine")
     with arguments.network_errors():
         opened = Fleet(**joined)
     with opened as fleet:
@@ -148,7 +148,7 @@ def _print_alerts(log: AlertLog, arguments: Arguments) -> None:
 
 
 def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> None:
-    """Act now and after every period, once more at the end."""
+    """Act now, after every period, and at the end."""
     while True:
         act()
         now_s = time.monotonic()
@@ -176,7 +176,7 @@ def _show_once(fleet: Fleet, arguments: Arguments) -> None:
         print(fleet_table.plain(statuses, _fault(fleet)))
     if not statuses:
         doubt = "is --connect right?"
-        if arguments.zenoh_config:  # a router's rules drop without a word what they don't allow
+        if arguments.zenoh_config:  # a router silently drops what its rules forbid
             doubt = f"is {arguments.zenoh_config} for the right router, and may its certificate read there?"
         raise NoResultError(f"watch: no monitor is on the network; {fleet.fault() or doubt}")
 
@@ -208,7 +208,7 @@ def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
 
 
 class _Changes:
-    """One line for each monitor that is another way than when it was printed last."""
+    """Prints one line for each monitor that has changed since it was last printed."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -216,7 +216,7 @@ class _Changes:
         self._fault = ""
 
     def show(self) -> None:
-        """Print what has changed."""
+        """Print the changes."""
         if (fault := self._fleet.fault()) != self._fault:
             self._fault = fault
             print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.printable(fault) or 'connected'}", flush=True)

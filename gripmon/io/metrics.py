@@ -207,7 +207,7 @@ class Families:
             yield family
         latency = HistogramMetricFamily(
             "gripmon_latency_seconds",
-            "From when a frame came to the machine until it is judged",
+            "Time from a frame's arrival at the machine to its verdict",
             labels=("robot", "camera"),
         )
         latency.add_metric(self._who, _cumulative(self._tally.latencies[:]), 1e-9 * self._tally.latency_sum_ns)
@@ -216,34 +216,34 @@ class Families:
 
 def _of_state(state: StateRecord) -> Iterator[_Family]:
     for name, text, count in (
-        ("gripmon_frames", "Frames handled", state.frames),
+        ("gripmon_frames", "Frames processed", state.frames),
         ("gripmon_frames_refused", "Frames that could not be measured at all", state.frames_refused),
-        ("gripmon_frames_dropped", "Frames that came while another one was worked on", state.frames_dropped),
-        ("gripmon_recording_dropped", "Frames that the recording had no time for", state.recording_dropped),
-        ("gripmon_recording_images_dropped", "Images of recorded frames without", state.recording_images_dropped),
-        ("gripmon_transforms_unsent", "Transforms from before there was a session", state.transforms_unsent),
-        ("gripmon_messages_malformed", "Messages received that were none", state.malformed),
+        ("gripmon_frames_dropped", "Frames dropped because another one was being processed", state.frames_dropped),
+        ("gripmon_recording_dropped", "Frames missing in the recording", state.recording_dropped),
+        ("gripmon_recording_images_dropped", "Images missing in the recording", state.recording_images_dropped),
+        ("gripmon_transforms_unsent", "Transforms not sent because there was no session yet", state.transforms_unsent),
+        ("gripmon_messages_malformed", "Malformed messages received", state.malformed),
     ):
         yield _Family("counter", name, text, {} if count is None else {(): count})
     for name, text, value in (
-        ("gripmon_frames_per_second", "Rate of the last frames; 0 while none come", state.frames_per_s),
-        ("gripmon_uptime_seconds", "Since the monitor's start", state.uptime_s),
+        ("gripmon_frames_per_second", "Recent frame rate; 0 without frames", state.frames_per_s),
+        ("gripmon_uptime_seconds", "Time since the monitor's start", state.uptime_s),
         ("gripmon_camera_connected", "1 while the source is open", float(state.camera_connected)),
-        ("gripmon_reference_revision", "Of the reference in force", state.revision),
-        ("gripmon_state_timestamp_seconds", "When the state was said, Unix time", 1e-9 * state.stamp_ns),
+        ("gripmon_reference_revision", "Revision of the reference in force", state.revision),
+        ("gripmon_state_timestamp_seconds", "Time of the last state message, Unix time", 1e-9 * state.stamp_ns),
         ("gripmon_sigma_meters", "Largest standard deviation of the TCP along a camera axis", state.sigma_m),
         ("gripmon_protection_meters", "Bound on the TCP's position error", state.protection_m),
-        ("gripmon_alert_limit_meters", "Error of the TCP's position that the task bears", state.alert_limit_m),
+        ("gripmon_alert_limit_meters", "Position error of the TCP that the task tolerates", state.alert_limit_m),
     ):
         yield _Family("gauge", name, text, {} if value is None else {(): value})
     shift = {(axis,): value for axis, value in zip("xyz", state.tcp_shift_m or (), strict=False)}
-    text = "Displacement of the TCP along the camera's axes against the reference"
+    text = "Displacement of the TCP from the reference, along the camera's axes"
     yield _Family("gauge", "gripmon_tcp_shift_meters", text, shift, ("axis",))
     text, version = "Always 1: the version and the reference", {(state.version, state.reference_id): 1.0}
     yield _Family("gauge", "gripmon_info", text, version, ("version", "reference"))
     # One sample per state, 1 for the current one, even if this version doesn't know that state's name.
     states = {(each.value,): 0.0 for each in State} | {(str(state.state),): 1.0}
-    yield _Family("gauge", "gripmon_state", "1 for what the monitor is doing", states, ("state",))
+    yield _Family("gauge", "gripmon_state", "1 for the monitor's current state", states, ("state",))
     verdicts = {(each.value,): 0.0 for each in Verdict} | {(str(state.verdict),): 1.0}
     yield _Family("gauge", "gripmon_verdict", "1 for the last transform's verdict", verdicts, ("verdict",))
     severities = [alert.severity for alert in state.open_alerts]
@@ -257,7 +257,7 @@ def _of_frames(tally: Tally) -> Iterator[_Family]:
     record = tally.record
     known = record is not None and record.verdict is not Verdict.UNKNOWN and record.drift is not None
     turn = {(): record.drift.rotation_rad} if known and record and record.drift else {}
-    yield _Family("gauge", "gripmon_rotation_radians", "Turn of the camera against the reference", turn)
+    yield _Family("gauge", "gripmon_rotation_radians", "Rotation of the camera from the reference", turn)
     # Copied, because the loop may add an entry meanwhile.
     alerts = {tuple(n.value for n in names): float(count) for names, count in dict(tally.alerts).items()}
     yield _Family("counter", "gripmon_alerts", "Alerts raised or noted", alerts, ("kind", "cause", "severity"))

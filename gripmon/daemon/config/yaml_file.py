@@ -57,7 +57,7 @@ def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = No
 
 _LOOKS_LIKE = {
     "edge_settings": "a taught model", "gripper": "a configuration", "points": "a gripper file",
-    "corners": "a file with corners", "accepted": "what was said to gripmon setup",
+    "corners": "a file with corners", "accepted": "the entries of gripmon setup",
 }  # fmt: skip
 _SCHEMAS = {
     "gripmon.camera_calibration": "a file of gripmon calibrate intrinsics",

@@ -1,4 +1,4 @@
-"""Images from a camera into a folder, taken by themselves or by a person, while someone watches."""
+"""Images from a camera into a folder, taken automatically or by a person, with a live view."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _READY = "ready to be taken"
 
 
 class Captured(msgspec.Struct, frozen=True, kw_only=True):
-    """``note``: what becomes of the newest image; ``ended``: a folder or video has no more; ``shown`` counts what the
-    live image has been."""
+    """``note``: what happened to the newest image; ``ended``: a folder or video has no more images; ``shown`` counts
+    the live images; ``itself``: images are taken automatically."""
 
     images: tuple[str, ...]
     running: bool
@@ -44,11 +44,11 @@ class Captured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Capture:
-    """Writes images of a source to ``folder``: ``000.png``, ``001.png`` …, with what is known of their time and jaw.
+    """Writes images of a source to ``folder``: ``000.png``, ``001.png`` …, with their time stamps and jaw openings.
 
-    From a live camera an image is taken by itself when it is sharp, nothing in it has moved since the frame before, and
-    something has since the image that was taken last; with a ``target``, when that is seen.  Images of a folder or a
-    video are taken as they come, where they are sharp and show the target: whoever recorded them has chosen.
+    From a live camera an image is taken automatically when it is sharp, nothing in it has moved since the previous
+    frame, something has moved since the last image taken, and the ``target``, if any, is detected.  All images of a
+    folder or a video are taken that are sharp and show the target.
     """
 
     def __init__(self, folder: Path, target: Target | None) -> None:
@@ -65,7 +65,7 @@ class Capture:
         self._itself, self._wanted, self._ended = False, 0, False
 
     def start(self, source: Source) -> None:
-        """Look through a source, which belongs to this from now on."""
+        """Start reading a source, which this object owns from now on."""
         self.stop()
         self._viewer, self._newest, self._note, self._ended = (
             Viewer(self._target),
@@ -79,7 +79,7 @@ class Capture:
         self._thread.start()
 
     def stop(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         source, self._source = self._source, None
         if source is not None:
             source.close()
@@ -89,7 +89,7 @@ class Capture:
             self._thread.join(10.0)
 
     def by_itself(self, on: bool) -> None:
-        """Take images by itself from now on, or no longer; what is shown of a folder is the first of them."""
+        """Take images automatically from now on, or no longer; of a folder the image shown is the first."""
         with self._lock:
             if on and not self._itself and self._note == _READY and self._newest is not None:
                 self._note = f"taken: {self._keep(*self._newest)}"
@@ -97,13 +97,13 @@ class Capture:
             self._lock.notify_all()
 
     def go_on(self) -> None:
-        """The next image of a folder or video."""
+        """Read the next image of a folder or video."""
         with self._lock:
             self._wanted += 1
             self._lock.notify_all()
 
     def take(self) -> str:
-        """Keep what is shown; its name.  Raises :class:`BadRequest`."""
+        """Keep the image shown; return its name.  Raises :class:`BadRequest`."""
         with self._lock:
             if self._newest is None:
                 raise BadRequest(self._note or "no image has come yet; start the camera")
@@ -121,14 +121,14 @@ class Capture:
             self._write_rows({n: row for n, row in self._rows().items() if n != name})
 
     def images(self) -> tuple[str, ...]:
-        """Names, in the order in which they were taken."""
+        """Names, in the order of capture."""
         if not self.folder.is_dir():
             return ()
         names = (p.name for p in self.folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         return tuple(sorted(names, key=natural_key))
 
     def preview(self) -> bytes:
-        """JPEG of the newest image, what was found of the target marked.  Raises :class:`BadRequest`."""
+        """JPEG of the newest image, with the target's points marked.  Raises :class:`BadRequest`."""
         newest = self._newest
         if newest is None or newest[0].image is None:
             raise BadRequest(self._note or "no image has come yet")
@@ -154,7 +154,7 @@ class Capture:
             )  # fmt: skip
 
     def notes(self) -> Iterator[str]:
-        """What becomes of the images, each change once, until the source ends or nothing more is wanted."""
+        """What happens to the images, each change once, until the source ends or the coverage is complete."""
         said = ""
         while self._thread is not None and self._thread.is_alive():
             self._thread.join(0.1)
@@ -166,7 +166,7 @@ class Capture:
                 return
 
     def _coverage(self) -> Coverage | None:
-        """Of all that was taken, earlier too."""
+        """The coverage of all images taken, including earlier ones."""
         for name in self.images():
             if name not in self._seen:
                 image, _ = read_image(self.folder / name)
@@ -187,7 +187,7 @@ class Capture:
                 self._see(frame, source.live)
                 if not source.live and not self._wait_for_order(source):
                     return
-        except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
+        except Exception as error:  # noqa: BLE001  the page must report any failure of a driver
             self._note = f"{in_short(error)}; start the camera again"
             return
         with self._lock:
@@ -196,7 +196,7 @@ class Capture:
                 self._note = f"no more images; {len(self.images())} taken"
 
     def _wait_for_order(self, source: Source) -> bool:
-        """A folder goes on when it is told to; False: it was closed."""
+        """Wait until the next image of a folder is requested; False: the source was closed."""
         with self._lock:
             self._wanted -= 1
             self._lock.wait_for(lambda: self._itself or self._wanted > 0 or self._source is not source)
@@ -220,16 +220,16 @@ class Capture:
                     self._note, self._itself = str(error), False
 
     def _hold(self, image: Image, view: View) -> str:
-        """What a live camera has to wait for."""
+        """Why an image of a live camera isn't taken yet; empty if it can be taken."""
         if not view.still:
             return "hold still"
         if self._last_taken is None:
             return ""
         away_px = moved(self._last_taken, to_bytes(to_grey(image)))
-        return "move on: this view is taken" if away_px is not None and away_px < MOVED_PX else ""
+        return "move the camera: this view is taken" if away_px is not None and away_px < MOVED_PX else ""
 
     def _keep(self, frame: Frame, view: View) -> str:
-        """Write it.  The lock is held."""
+        """Write the image.  The lock is held."""
         names = self.images()
         if len(names) >= MOST_IMAGES:
             raise BadRequest(f"{MOST_IMAGES} images are enough")
@@ -237,7 +237,7 @@ class Capture:
         ending = ".tif" if frame.image.dtype.kind == "f" else ".png"
         data = cv2.imencode(ending, frame.image)[1].tobytes()
         if any((self.folder / n).stat().st_size == len(data) and (self.folder / n).read_bytes() == data for n in names):
-            return "there already"  # the same folder once more
+            return "there already"  # the same folder again
         number = 1 + max((int(Path(n).stem) for n in names if Path(n).stem.isdecimal()), default=-1)
         name = f"{number:03d}{ending}"
         try:
@@ -253,7 +253,7 @@ class Capture:
         return name
 
     def _rows(self) -> dict[str, tuple[str, str]]:
-        """The table beside the images."""
+        """Rows of the table beside the images."""
         table: dict[str, tuple[str, str]] = {}
         with contextlib.suppress(InputError):
             for name, row in read_table(self.folder / TIMESTAMPS_NAME).items():

@@ -1,6 +1,6 @@
-"""A folder in which a monitor is set up: what was said so far, which steps are done, and the steps themselves.
+"""A folder in which a monitor is set up: the answers so far, the progress of the steps, and the steps themselves.
 
-A step that computes runs the very command that it names, in this folder.
+A step that computes runs the command that it shows, in this folder.
 """
 
 from __future__ import annotations
@@ -34,20 +34,22 @@ from gripmon.model.units import jaw_range_in
 
 SETUP = "setup.yaml"
 _FIRST_FRAME_S = 20
-"""Half-second answers of a source that a camera has to show something: network cameras take ten seconds to connect."""
+"""Number of reads, half a second each, within which the first image must arrive: network cameras take ten seconds to
+connect.
+"""
 Progress = Literal["done", "stale", "ready", "waits", "skipped"]
 Level = Literal["", "OK", "WARN", "FAIL"]
 
 
 class Line(msgspec.Struct, frozen=True):
-    """What a step said."""
+    """A line of a step's output."""
 
     text: str
     level: Level = ""
 
 
 class StepState(msgspec.Struct, frozen=True, kw_only=True):
-    """``progress`` "stale": something that it was made from is newer; ``note`` why it isn't done, in words."""
+    """``progress`` "stale": an input is newer than the result; ``note``: why the step isn't done, in words."""
 
     name: str
     progress: Progress
@@ -57,15 +59,15 @@ class StepState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Project:
-    """The project in a ``folder``, which is made if it is missing, and is this process's working directory.
+    """The project in a ``folder``, which is created if missing, and is this process's working directory.
 
-    Raises :class:`~gripmon.model.errors.InputError` where it can't be used.
+    Raises :class:`~gripmon.model.errors.InputError` if it can't be used.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = writable_folder(folder).resolve()
         self.values, self._accepted = steps.defaults(), {}
-        with contextlib.suppress(ValueError):  # a folder may have a name that no key can
+        with contextlib.suppress(ValueError):  # the folder's name may be impossible as a key
             check_name("robot", self.folder.name)
             self.values["robot"] = self.folder.name
         path = self.folder / SETUP
@@ -75,7 +77,7 @@ class Project:
             self._accepted = _texts(path, kept, "accepted")
 
     def keep(self, values: Mapping[str, str]) -> None:
-        """Remember what a person has said, also where it turns out wrong.  Raises :class:`InputError`."""
+        """Store a person's answers, even if they turn out wrong.  Raises :class:`InputError`."""
         for name in values:
             if name not in steps.defaults():
                 raise InputError(f"there is no field {name}")
@@ -83,15 +85,15 @@ class Project:
         self._write()
 
     def states(self) -> tuple[StepState, ...]:
-        """Of all steps, in their order."""
+        """The states of all steps, in order."""
         return tuple(self._state(step) for step in STEPS)
 
     def capture(self, step: str) -> Capture:
-        """For one of the steps that take images.  Raises :class:`InputError`."""
+        """A capture for one of the steps that take images.  Raises :class:`InputError`."""
         return Capture(self.folder / step, None if step == "teaching" else target_in(self.values))
 
     def source_field(self, step: str | None) -> str:
-        """Under which name it is kept what a step's images come from, or (None) the monitor's frames.
+        """Name of the field with the source of a step's images, or (None) of the monitor's frames.
 
         Raises :class:`InputError` for a step that takes no images.
         """
@@ -102,14 +104,14 @@ class Project:
         return name
 
     def open_camera(self, step: str) -> Source:
-        """What a step's images come from.  Raises :class:`InputError`."""
+        """Open the source of a step's images.  Raises :class:`InputError`."""
         text = self.values.get(f"{step}_source") or self.values["source"]
         if not text:
             raise InputError("no camera is named; step 1 (--source SOURCE), or a folder with images")
         return open_named(text, self.values["robot"], self.values["camera_name"])
 
     def do(self, name: str) -> list[Line]:
-        """Carry a step out; what it said.  Raises :class:`InputError` and :class:`NoResultError`, one line."""
+        """Carry out a step; return its output.  Raises :class:`InputError` and :class:`NoResultError`, one line."""
         step = BY_NAME[name]
         state = self._state(step)
         if state.progress == "waits":
@@ -125,7 +127,7 @@ class Project:
         return [Line("nothing to do")] if words is None else self._command(words)
 
     def do_here(self, name: str, note: Callable[[str], object]) -> list[Line]:
-        """The same of a person at a terminal: images are taken by themselves, ``note`` hears what becomes of each."""
+        """The same at a terminal: images are taken automatically, and ``note`` is called with the result for each."""
         step = BY_NAME.get(name)
         if step is None:
             names = ", ".join(BY_NAME)
@@ -151,7 +153,7 @@ class Project:
         finally:
             capture.stop()
         if not capture.images():
-            raise NoResultError(f"{name}: no image was taken; images in which that is seen, sharp and still")
+            raise NoResultError(f"{name}: no image was taken; sharp images without motion that show it")
         return [Line(f"{len(capture.images())} images in {name}", "OK")]
 
     def _state(self, step: Step) -> StepState:
@@ -173,7 +175,7 @@ class Project:
         inferred = step.name == "gripper" and self.values["gripper"] == steps.INFERRED
         if inferred or step.name in ("camera", "target"):
             done = self._accepted.get(step.name) == self._said(step)
-            return ("done", "comes with hand and eye" if inferred else "") if done else ("ready", "")
+            return ("done", "made in the step Hand and eye" if inferred else "") if done else ("ready", "")
         if not needs_doing:
             by = "intrinsics_by" if step.name == "plate" else "reference_by"
             return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
@@ -187,12 +189,12 @@ class Project:
             return "ready", ""
         made = min(self._made_ns(name) for name in files)
         newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
-        # What was inferred together with the hand/eye calibration is as old as that.
+        # An inferred gripper is made together with the hand/eye calibration.
         newer = [name for name in newer if name not in files]
         if step.name == "intrinsics" and self.values["intrinsics_by"] != steps.FROM_FILE and not newer:
             made_with, now = read_yaml(self.folder / "camera.yaml").get("target"), name_of(target_in(self.values))
             if made_with != now:
-                return "stale", f"made with {made_with}, and the target is {now}: do this again"
+                return "stale", f"made with {made_with}, but the target is {now}: do this again"
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
 
     def _there(self, name: str) -> bool:
@@ -200,7 +202,7 @@ class Project:
         return self._count(name) > 0 if path.is_dir() else path.exists()
 
     def _made_ns(self, name: str) -> int:
-        """When a file was written; of a folder its newest image."""
+        """When a file was written; for a folder, its newest image."""
         path = self.folder / name
         each = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES] if path.is_dir() else []
         return max((p.stat().st_mtime_ns for p in each), default=path.stat().st_mtime_ns)
@@ -212,7 +214,7 @@ class Project:
         return sum(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir()) if path.is_dir() else 0
 
     def _missing(self, step: Step) -> tuple[str, Step] | None:
-        """The first file that a step needs and that isn't there, and the step that writes it."""
+        """The first missing file that a step needs, and the step that writes it."""
         name = next((name for name in needed(step, self.values) if not self._there(name)), None)
         if name is None:
             return None
@@ -228,7 +230,7 @@ class Project:
         self._write()
 
     def _write(self) -> None:
-        text = "# Written by gripmon setup: what was said on its page, and what of it was tried out.\n" + as_yaml(
+        text = "# Written by gripmon setup: the entries of its page, and those that were tried out.\n" + as_yaml(
             {"values": self.values, "accepted": self._accepted}
         )
         path = self.folder / SETUP
@@ -244,7 +246,7 @@ class Project:
             except ValueError as error:
                 raise InputError(str(error)) from None
         source = self.open_camera("camera")
-        why = "no image came"
+        why = "no image arrived"
         try:
             for _ in range(_FIRST_FRAME_S):
                 frame = source.read()
@@ -260,7 +262,7 @@ class Project:
                     return [Line(f"{width} x {height} px, {8 * frame.image.itemsize} bits", "OK")]
         finally:
             source.close()
-        raise NoResultError(f"{self.values['source']}: {why}; a camera that delivers, or a folder with images")
+        raise NoResultError(f"{self.values['source']}: {why}; a camera that delivers images, or a folder of images")
 
     def _target(self) -> list[Line]:
         target, lines = parse_target(self.values["target"]), []
@@ -277,13 +279,13 @@ class Project:
     def _gripper(self) -> list[Line] | None:
         words = BY_NAME["gripper"].command(self.values)
         if words is None:
-            lines = [_jaws(self.values["jaw_range"]), Line("it comes out of the step Hand and eye", "OK")]
+            lines = [_jaws(self.values["jaw_range"]), Line("the step Hand and eye makes the gripper file", "OK")]
             self._accept("gripper")
             return lines
         if self.values["gripper"] == steps.FROM_IMAGES:
             return self._gripper_from_images(words)
         if self.values["gripper"] == steps.FROM_CAD:
-            # What it notes is for a person to look at: edges that aren't taught, a small finger, an open surface.
+            # Its notes need a person's attention: edges that aren't taught, a small finger, an open surface.
             return [Line(e.text, "WARN") if e.text.startswith("note: ") else e for e in self._command(words)]
         path = Path(words[1])
         if not words[1] or not path.is_file():
@@ -293,19 +295,21 @@ class Project:
         return [Line(f"{gripper.name}: {len(gripper.corner_ids)} corners, {len(gripper.edge_ids)} edges", "OK")]
 
     def _gripper_from_images(self, words: list[str]) -> list[Line]:
-        """Images on the target that are there already stay the reference."""
+        """Existing images on the target stay the reference."""
         lines = self._command(words)
         if self.values["reference_by"] == steps.ON_PLATE and not self._count("standing"):
             self.keep({"reference_by": steps.BY_IMAGES})
-            lines.append(Line("the reference comes with it; another one in the step Gripper on the target", "OK"))
+            lines.append(
+                Line("the reference comes with it; choose another one in the step Gripper on the target", "OK")
+            )
         return lines
 
     def _reference_by(self) -> list[Line]:
         by = self.values["reference_by"]
         if by != steps.ON_PLATE and self.values["gripper"] == steps.INFERRED:
-            raise InputError("a gripper that is inferred needs its images on the target; these, or another gripper")
+            raise InputError("an inferred gripper needs its images on the target; these, or another gripper")
         if by == steps.BY_IMAGES and self.values["gripper"] != steps.FROM_IMAGES:
-            raise InputError("no images gave this gripper; another reference")
+            raise InputError("this gripper wasn't made from images; another reference")
         return [Line(f"reference: {by}", "OK")]
 
     def _reference(self) -> list[Line] | None:
@@ -335,12 +339,12 @@ class Project:
         try:
             found = msgspec.json.decode(done.stdout)["findings"]
         except (msgspec.DecodeError, KeyError):
-            raise NoResultError(_last(done.stderr) or "gripmon check said nothing") from None
+            raise NoResultError(_last(done.stderr) or "gripmon check printed nothing") from None
         write_atomically(self.folder / "check.json", done.stdout.encode())
         return _findings(found)
 
     def checked(self) -> list[Line]:
-        """What the last forecast said; empty if there is none."""
+        """The lines of the last forecast; empty if there is none."""
         with contextlib.suppress(OSError, msgspec.DecodeError, KeyError):
             return _findings(msgspec.json.decode((self.folder / "check.json").read_bytes())["findings"])
         return []
@@ -361,9 +365,9 @@ class Project:
 
 
 def _jaws(text: str) -> Line:
-    """What an inferred gripper will be told of its jaws."""
+    """The jaw range of an inferred gripper, in words."""
     if not text:
-        return Line("no range is written in which the jaws move: they are taken to stand still, always", "WARN")
+        return Line("no jaw range is given: the jaws are assumed never to move", "WARN")
     try:
         low_m, high_m = jaw_range_in(text)
     except ValueError as error:
@@ -376,7 +380,7 @@ def _findings(found: list[dict[str, str]]) -> list[Line]:
 
 
 def _last(text: str) -> str:
-    """The line that says it, in an error output."""
+    """The last line of an error output, which is the message."""
     lines = [line for line in text.splitlines() if line.strip()]
     return lines[-1].removeprefix("gripmon: ") if lines else ""
 
@@ -384,5 +388,5 @@ def _last(text: str) -> str:
 def _texts(path: Path, kept: Mapping[str, object], key: str) -> dict[str, str]:
     found = kept.get(key, {})
     if not isinstance(found, dict) or not all(isinstance(text, str) for pair in found.items() for text in pair):
-        raise InputError(f"{path}: {key}: isn't a table of texts; what gripmon setup writes, or delete the file")
+        raise InputError(f"{path}: {key}: isn't a table of texts; a file of gripmon setup, or delete it")
     return dict(found)

@@ -1,4 +1,4 @@
-"""The hand/eye calibration that a robot already has, as a file that teaching takes."""
+"""A robot's existing hand/eye calibration, as a file for teaching."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _FLANGE = ("flange_T_cam", "flange_T_tcp")
 
 
 def reference_text(path: Path) -> tuple[bytes, str]:
-    """The file's content as ``gripmon teach --reference`` takes it, and what it holds, in words.
+    """The file's content as for ``gripmon teach --reference``, and a summary in words.
 
-    ``cam_T_grip`` is ``inverse(flange_T_cam) flange_T_tcp``; ``position_sigma_m`` and ``rotation_sigma_rad`` may stand
-    beside.  Raises :class:`~gripmon.model.errors.InputError`.
+    ``cam_T_grip`` is ``inverse(flange_T_cam) flange_T_tcp``; ``position_sigma_m`` and ``rotation_sigma_rad`` are
+    optional.  Raises :class:`~gripmon.model.errors.InputError`.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; {_RIGHT}")
@@ -40,7 +40,7 @@ def reference_text(path: Path) -> tuple[bytes, str]:
         made = to_record(invert(flange_T_cam) @ flange_T_tcp)
         values["cam_T_grip"] = {"translation_m": list(made.translation_m), "rotation_xyzw": list(made.rotation_xyzw)}
     elif "cam_T_grip" not in values:
-        raise InputError(f"{path}: holds no hand/eye calibration; {_RIGHT}")
+        raise InputError(f"{path}: contains no hand/eye calibration; {_RIGHT}")
     try:
         settings = to_settings(values, ReferenceSettings, "")
         reference_transform(settings)
@@ -48,14 +48,14 @@ def reference_text(path: Path) -> tuple[bytes, str]:
         raise InputError(f"{path}: {error.fault.key}: {error.fault.wrong}; {error.fault.right}") from None
     x, y, z = (1e3 * v for v in settings.cam_T_grip.translation_m)
     text = f"# {path.name}, by gripmon setup (gripmon {__version__})\n{as_yaml(msgspec.to_builtins(settings))}"
-    return text.encode(), f"TCP at {x:.1f}, {y:.1f}, {z:.1f} mm before the camera"
+    return text.encode(), f"TCP at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"
 
 
 def _transform(path: Path, value: object, key: str) -> Array:
     try:
         found = to_settings(value, TransformSettings, key)
         alone = ReferenceSettings(cam_T_grip=msgspec.structs.replace(found, translation_m=(0.0, 0.0, 0.1)))
-        reference_transform(alone)  # whether its rotation is one; where it is says nothing about the camera
+        reference_transform(alone)  # checks only the rotation: this position isn't the camera's
     except SettingsError as error:
         wrong = error.fault.key.replace("reference.cam_T_grip", key)
         raise InputError(f"{path}: {wrong}: {error.fault.wrong}; {error.fault.right}") from None

@@ -1,4 +1,4 @@
-"""The monitor as a process of its own, and what it sees: ``gripmon run`` on the configuration that was written."""
+"""The monitor in a process of its own, with its images: ``gripmon run`` on the written configuration."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor ha
 
 
 class Seen(msgspec.Struct, frozen=True, kw_only=True):
-    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest answer; ``shown`` counts the pictures; ``lines``
-    of its log, the newest last; ``ended``: how it did, None while it runs or was never started.
+    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply; ``shown`` counts the pictures; ``lines``
+    of its log, the newest last; ``ended``: how it ended, None while it runs or if it was never started.
     """
 
     running: bool
@@ -49,7 +49,7 @@ class Seen(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MonitorProcess:
-    """At most one at a time; it is asked for its newest frame as ``gripmon send snapshot`` does."""
+    """At most one monitor at a time, queried for its newest frame like ``gripmon send snapshot``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -61,11 +61,11 @@ class MonitorProcess:
         self._shown = 0
 
     def start(self) -> None:
-        """Raises :class:`BadRequest` while one runs, and :class:`~gripmon.model.errors.InputError` for a configuration
-        that can't be.
+        """Start the monitor.  Raises :class:`BadRequest` while one runs, and
+        :class:`~gripmon.model.errors.InputError` for an invalid configuration.
         """
         if self.running:
-            raise BadRequest("the monitor runs already")
+            raise BadRequest("the monitor is already running")
         config = load_config(self._folder / "config.yaml")
         self._lines.clear()
         self._record = self._picture = None
@@ -84,7 +84,7 @@ class MonitorProcess:
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
-        """As Ctrl-C does; may be called twice."""
+        """Stop it like Ctrl-C; may be called twice."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -113,9 +113,9 @@ class MonitorProcess:
         )
 
     def picture(self) -> bytes:
-        """JPEG of the newest image with what was measured in it.  Raises :class:`BadRequest`."""
+        """JPEG of the newest image with the measurements in it.  Raises :class:`BadRequest`."""
         if self._picture is None:
-            raise BadRequest("the monitor has shown nothing yet")
+            raise BadRequest("the monitor has sent no image yet")
         return self._picture
 
     def _listen(self, process: subprocess.Popen[str]) -> None:
@@ -137,7 +137,7 @@ class MonitorProcess:
                 try:
                     reply, data = client.snapshot(_ANSWER_S)
                 except (NotCarriedOut, Ambiguous):
-                    reply, data = None, None  # it starts, or ends
+                    reply, data = None, None  # it is starting or ending
                 if reply is not None and reply.snapshot is not None:
                     seen = reply.snapshot
                     self._record = seen.record
@@ -150,7 +150,7 @@ class MonitorProcess:
         self._last_line(config)
 
     def _last_line(self, config: Config) -> None:
-        """A folder may end before anybody has asked: the last frame's line, with the folder's own image."""
+        """A folder may end before the first query: show the last frame's record, with the folder's own image."""
         source = config.settings.source
         with contextlib.suppress(OSError, msgspec.MsgspecError, IndexError):
             lines = (self._folder / "run" / "estimates.jsonl").read_bytes().splitlines()

@@ -1,4 +1,4 @@
-"""The page of ``gripmon setup``: requests to steps, and what the page shows."""
+"""The page of ``gripmon setup``: its requests to the steps, and its state."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _PICTURES = {
 
 
 class Do(Request, frozen=True):
-    """A step to be carried out with what stands in its fields."""
+    """Carry out a step with the values of its fields."""
 
     step: _Name
     values: _Said = msgspec.field(default_factory=dict)
 
 
 class CaptureOrder(Request, frozen=True):
-    """``take`` what is shown, ``next`` of a folder, ``drop`` the image ``name``."""
+    """``take`` the image shown, read the ``next`` one of a folder, ``drop`` the image ``name``."""
 
     step: _Name
     action: Literal["start", "stop", "by_itself", "by_hand", "take", "next", "drop"]
@@ -54,7 +54,7 @@ class FieldState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StepCard(msgspec.Struct, frozen=True, kw_only=True):
-    """What doesn't change of a step, and what does; ``said``: lines of the last time; ``error``: why it failed."""
+    """The constant and the changing part of a step; ``said``: output of the last run; ``error``: why it failed."""
 
     title: str
     about: str
@@ -68,7 +68,7 @@ class StepCard(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SetupState(msgspec.Struct, frozen=True, kw_only=True):
-    """``busy``: the step that is being carried out; ``capture``: of the step whose camera runs, or ran last."""
+    """``busy``: the step being carried out; ``capture``: of the step ``capturing``, whose camera runs or ran last."""
 
     version: str
     folder: str
@@ -80,7 +80,7 @@ class SetupState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SetupSite:
-    """Shows one project; a teaching page is below ``page/`` while one is open."""
+    """Serves one project; an open teaching page is below ``page/``."""
 
     def __init__(self, project: Project) -> None:
         self._project = project
@@ -94,7 +94,7 @@ class SetupSite:
         self._monitor = MonitorProcess(project.folder)
 
     def close(self) -> None:
-        """Let go of the camera, and stop the monitor that was started here."""
+        """Release the camera, and stop the monitor that was started here."""
         self._let_go()
         self._close_page()
         self._monitor.stop()
@@ -133,7 +133,7 @@ class SetupSite:
         return actions.get(path)
 
     def state(self) -> SetupState:
-        """All that the page shows."""
+        """The state for the page."""
         capturing = self._capture
         states = self._project.states()
         return SetupState(
@@ -168,12 +168,12 @@ class SetupSite:
         return (*field.choices, *grippers())
 
     def _do(self, order: Do) -> None:
-        """Begin a step; the state says when it has ended, and how."""
-        # Of the steps that take images only one has something to be said without a camera.
+        """Start a step; the state shows when and how it ends."""
+        # Of the steps that take images only "standing" can be done without a camera.
         self._named(order.step, "form", *(("capture",) if order.step == "standing" else ()))
         with self._lock:
             if self._busy is not None:
-                raise BadRequest(f"the step {self._busy} is still at work")
+                raise BadRequest(f"the step {self._busy} is still running")
             self._keep(order.values)
             self._busy = order.step
         self._errors.pop(order.step, None)
@@ -186,7 +186,7 @@ class SetupSite:
             self._said[step] = tuple(self._project.do(step))
         except (InputError, NoResultError) as error:
             self._errors[step] = str(error)
-        except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
+        except Exception as error:  # noqa: BLE001  the page must report any failure, and continue
             self._errors[step] = in_short(error)
         finally:
             self._busy = None
@@ -223,7 +223,7 @@ class SetupSite:
     def _start_camera(self, step: str) -> None:
         self._let_go()
         if self._monitor.running:
-            raise BadRequest("the monitor has the camera; stop it first")
+            raise BadRequest("the monitor uses the camera; stop it first")
         capture = self._fresh(step)
         try:
             capture.start(self._project.open_camera(step))
@@ -233,7 +233,7 @@ class SetupSite:
         self._capture = step, capture
 
     def _open(self, order: Do) -> dict[str, str]:
-        """A teaching page; where it is."""
+        """Open a teaching page; return its address."""
         self._named(order.step, "page")
         self._keep(order.values)
         self._let_go()
@@ -295,7 +295,7 @@ class SetupSite:
             raise BadRequest(f"there is no step {name} of this kind")
 
     def _let_go(self) -> None:
-        """A camera belongs to one at a time."""
+        """Release the camera, which only one process can open."""
         if self._capture is not None:
             self._capture[1].stop()
 

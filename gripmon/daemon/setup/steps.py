@@ -1,5 +1,5 @@
-"""The way from a camera to a running monitor as one list: what each step asks, needs, writes, and which command does
-the same in the project's folder.
+"""The steps from a camera to a running monitor: each step's fields, inputs and outputs, and the command that does the
+same in the project's folder.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from gripmon.model.targets import CircleGrid, Target, name_of, parse_target
 Values = Mapping[str, str]
 Kind = Literal["form", "capture", "page", "run"]
 DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
-"""Mostly light, so that dark fingers show before it, and small enough for A5."""
+"""Mostly light, so that dark fingers are visible before it, and small enough for A5."""
 INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
 ON_PLATE, BY_CORNERS, BY_IMAGES = "on the plate", "from corners alone", "with the gripper's images"
-_WITHOUT = "when teaching, less exactly"
+_WITHOUT = "when teaching, less accurately"
 
 
 @dataclass(frozen=True)
 class Field:
-    """What a step asks.  ``only``: (another field, its values), where it is asked at all."""
+    """An input field of a step.  ``only``: (another field, its values) for which it is shown; None: always."""
 
     name: str
     label: str
@@ -39,8 +39,8 @@ class Field:
 
 @dataclass(frozen=True)
 class Step:
-    """``needs`` and ``writes`` are paths in the project's folder; ``command`` the words of the command that does the
-    same, None where nothing is to be done with these values.
+    """``needs`` and ``writes`` are paths in the project's folder; ``command`` returns the words of the command that
+    does the same, None if these values need no action.
     """
 
     name: str
@@ -56,18 +56,18 @@ class Step:
 
 
 def target_in(values: Values) -> Target:
-    """The target as it was printed: the bar on it says how large.  Raises :class:`~gripmon.model.errors.InputError`."""
+    """The target as printed, scaled by its bar.  Raises :class:`~gripmon.model.errors.InputError`."""
     target = parse_target(values["target"])
     text, nominal = values["bar_measured"].strip(), values.get("bar_mm", "")
     if values["have"] != PRINT_IT or not text:
         return target
     try:
-        measured = float(text.replace(",", "."))  # some rulers are read with a comma
+        measured = float(text.replace(",", "."))  # decimal comma
     except ValueError:
         measured = 0.0
     bar_mm = float(nominal or "0") or measured
     if not 0.5 * bar_mm < measured < 2.0 * bar_mm:
-        raise InputError(f"the bar measures '{text}' mm; a number near the {bar_mm:g} mm that it should have")
+        raise InputError(f"the bar measures '{text}' mm; a number near the {bar_mm:g} mm that were printed")
     lengths = {
         name: round(value * measured / bar_mm, 9)
         for name, value in msgspec.structs.asdict(target).items()
@@ -83,7 +83,7 @@ def grippers() -> dict[str, Path]:
 
 
 PRINT_IT, HAVE_ONE = "print it", "I have one"
-_PLATE_SOURCE = "empty: the camera of step 1; or a folder with images that were taken before"
+_PLATE_SOURCE = "empty: the camera of step 1; or a folder of existing images"
 
 
 def _step_command(name: str) -> Callable[[Values], list[str]]:
@@ -101,7 +101,7 @@ def _plate(values: Values) -> list[str] | None:
 
 
 def own_camera(path: Path) -> bool:
-    """Whether this is a file of gripmon, which is used as it stands; those of other programs are imported."""
+    """Whether this is a file of gripmon, which is used unchanged; those of other programs are imported."""
     return path.is_file() and b"gripmon.camera_calibration/" in path.read_bytes()[:4096]
 
 
@@ -130,23 +130,23 @@ def _gripper(values: Values) -> list[str] | None:
 def _from_cad(values: Values) -> list[str]:
     files = _words(values, "cad_files")
     if not files:
-        raise InputError("no file is named; a mesh for each finger, or one for both, a URDF or a .cao")
+        raise InputError("no file is given; a mesh for each finger, or one for both, a URDF or a .cao")
     words = [*_given(values, jaw_range="--jaw-range", cad_unit="--unit", cad_view="--view"), *_words(values, "options")]
-    # Only with a view there is something to draw.
+    # A picture needs a view.
     viewed = any(word.startswith(("--view", "--reference")) for word in words)
     words += ["--camera", "camera.yaml", "--picture", "gripper.png"] if viewed else []
     return ["gripmon", "gripper", "from-cad", *files, *words, "--out", "gripper.yaml", "--force"]
 
 
 def _from_images(values: Values) -> list[str]:
-    """From which a reference follows, too."""
+    """Also writes a reference."""
     words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, distance="--distance")]
     words += [*_words(values, "options"), "--picture", "gripper.png", "--reference-out", "hand_eye.yaml"]
     return ["gripmon", "gripper", "from-images", *words, "--out", "gripper.yaml", "--force"]
 
 
 def _given(values: Values, **options: str) -> list[str]:
-    """Options by the fields that hold their values, less those that are empty."""
+    """Options from the fields with their values; empty fields are left out."""
     return [word for field, option in options.items() if values[field] for word in (option, values[field])]
 
 
@@ -203,21 +203,21 @@ STEPS = (
     ),
     Step(
         "target", "Target", "A flat pattern of known size.  Print it at 100 %, glue it onto something flat, and hold a "
-        "ruler against the bar.", "form", "Make it", (), ("setup.yaml", "target.pdf"), _target,
+        "ruler against its bar.", "form", "Make it", (), ("setup.yaml", "target.pdf"), _target,
         (
             Field("have", "target", PRINT_IT, choices=(PRINT_IT, HAVE_ONE)),
             Field("target", "pattern", DEFAULT_TARGET, "circles:COLUMNSxROWS:SPACING:DIAMETER, "
                   "chequerboard:COLUMNSxROWS:SQUARE (inner corners) or charuco:COLUMNSxROWS:SQUARE:MARKER; metres"),
             Field("paper", "paper", "a4", "a5 to a0, letter, legal, tabloid, or WIDTHxHEIGHT in mm", (),
                   ("have", (PRINT_IT,))),
-            Field("bar_measured", "the bar measures (mm)", "", "empty: exactly what stands beside it; else the "
-                  "pattern's size follows the ruler", (), ("have", (PRINT_IT,))),
+            Field("bar_measured", "the bar measures (mm)", "", "empty: as printed beside it; otherwise the pattern is "
+                  "scaled to the measured length", (), ("have", (PRINT_IT,))),
         ),
     ),
     Step(
         "plate", "Images of the target", "Ten to thirty images that fill the view, the target tilted by 20 to 45° to "
-        "all sides.  Images are taken by themselves when the camera stands still and the target is sharp.  Whoever has "
-        "the lens as a file needs none: say so in the next step.", "capture", "Start", ("setup.yaml",), ("plate",),
+        "all sides.  Images are taken automatically when the camera stands still and the target is sharp.  With a lens "
+        "file none are needed: choose it in the next step.", "capture", "Start", ("setup.yaml",), ("plate",),
         _plate,
         (Field("plate_source", "images from", "", _PLATE_SOURCE),),
     ),
@@ -226,7 +226,7 @@ STEPS = (
         "Calibrate", ("plate",), ("camera.yaml",), _intrinsics,
         (
             Field("intrinsics_by", "lens", "from the images", choices=("from the images", FROM_FILE)),
-            Field("model", "model", "brown_conrady", "auto: the one that the images support best",
+            Field("model", "model", "brown_conrady", "auto: the one that fits the images best",
                   ("auto", "brown_conrady", "brown_conrady_5", "fisheye", "paper"),
                   ("intrinsics_by", ("from the images",))),
             Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or mrcal", (),
@@ -240,27 +240,27 @@ STEPS = (
         (
             Field("gripper", "gripper", INFERRED, choices=(INFERRED, FROM_IMAGES, FROM_CAD, FROM_FILE)),
             Field("gripper_file", "file", "", "a gripper file", (), ("gripper", (FROM_FILE,))),
-            Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one a finger or one for both; or a URDF.  "
-                  "Edges drawn sharp count as broken by 0.2 mm, with bounds too wide for valid, until the step Teach",
+            Field("cad_files", "CAD files", "", "STL, OBJ, PLY or .cao, one per finger or one for both; or a URDF.  "
+                  "Sharp edges count as broken by 0.2 mm, with bounds too wide for valid, until the step Teach",
                   (), ("gripper", (FROM_CAD,))),
-            Field("cad_unit", "unit of the meshes", "", "of URDF and .cao it is known", ("", "mm", "m", "cm", "in"),
+            Field("cad_unit", "unit of the meshes", "", "known for URDF and .cao", ("", "mm", "m", "cm", "in"),
                   ("gripper", (FROM_CAD,))),
-            Field("cad_view", "view (m:°)", "", "of fingers that are round, hollow or open: how far the fingertips are "
-                  "from the camera, and its tilt against them, e.g. 0.12:30", (), ("gripper", (FROM_CAD,))),
+            Field("cad_view", "view (m:°)", "", "for round, hollow or open fingers: distance from the camera to the "
+                  "fingertips, and the camera's tilt against them, e.g. 0.12:30", (), ("gripper", (FROM_CAD,))),
             Field("free_images", "images in", "teaching", "a folder with ten to a hundred images, each before another "
                   "background; teaching: take thirty in the step Gripper at work first", (),
                   ("gripper", (FROM_IMAGES,))),
             Field("distance", "distance (m)", "", "of the fingertips from the camera, with its standard deviation, "
-                  "e.g. 0.12:0.003; empty: images at several jaw openings tell it", (), ("gripper", (FROM_IMAGES,))),
+                  "e.g. 0.12:0.003; empty: from images at several jaw openings", (), ("gripper", (FROM_IMAGES,))),
             Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
                   ("gripper", (INFERRED, FROM_CAD))),
-            Field("options", "more options", "", "of the command below, as written there", (),
+            Field("options", "more options", "", "added to the command below, written as there", (),
                   ("gripper", (FROM_CAD, FROM_IMAGES))),
         ), "gripper.png",
     ),
     Step(
-        "standing", "Gripper on the target", "It gives hand and eye: the fingertips stand on the target, as flat as "
-        "they can.  Three to ten images, put down again for each; the jaws stay as they are.  Or choose another "
+        "standing", "Gripper on the target", "For the hand/eye calibration the fingertips stand on the target, as flat "
+        "as they can.  Three to ten images, put down again for each, with the jaws unchanged.  Or choose another "
         "reference.", "capture", "Start", ("camera.yaml",),
         ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
         (
@@ -276,29 +276,29 @@ STEPS = (
         "fine.  Save, then Done.", "page", "Drag them", ("camera.yaml", "standing"), ("standing/rough.yaml",), _corners,
     ),
     Step(
-        "reference", "Hand and eye", "Where the gripper is in the camera's frame, with its uncertainty.", "form",
+        "reference", "Hand and eye", "The gripper's pose in the camera frame, with its uncertainty.", "form",
         "Calibrate", ("camera.yaml", "standing", "standing/rough.yaml"), ("hand_eye.yaml", "gripper.yaml"), _reference,
         (Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the "
-               "gripper's nominal, or as far as the fingertips of an inferred one are apart"),), "hand_eye.png",
+               "gripper's nominal opening, or of an inferred gripper the distance of its fingertips"),), "hand_eye.png",
     ),
     Step(
         "teaching", "Gripper at work", "One to ten images as at work, each before another background, the fingers free "
-        "and lit as in use; thirty where the gripper's model comes from them.", "capture", "Start",
+        "and lit as in use; thirty if the gripper's model is made from them.", "capture", "Start",
         ("camera.yaml", "gripper.yaml"), ("teaching",),
         _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
     ),
     Step(
-        "teach", "Teach", "Drag the corners, see the edges snap and what accuracy to expect.  Save, then Done.  A "
-        "gripper from CAD is hardly ever valid without: its real edges aren't known.", "page", "Teach",
+        "teach", "Teach", "Drag the corners, see the edges snap and the expected accuracy.  Save, then Done.  Without "
+        "this step a gripper from CAD is hardly ever valid: its real edges are unknown.", "page", "Teach",
         ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
     ),
     Step(
-        "check", "Forecast", "What the monitor will be able to do with this view.", "form", "Check", ("config.yaml",),
+        "check", "Forecast", "The monitor's expected performance in this view.", "form", "Check", ("config.yaml",),
         ("check.json",), lambda _values: ["gripmon", "check", "config.yaml"],
     ),
     Step(
         "run", "Start", "The monitor itself.  It ends with this page; without the page start it by the "
-        "command below.  What happened meanwhile: gripmon report run.", "run", "Start the monitor",
+        "command below.  gripmon report run shows what happened.", "run", "Start the monitor",
         ("config.yaml",), ("run",), lambda _values: ["gripmon", "run", "config.yaml", "--out", "run"],
     ),
 )  # fmt: skip
@@ -308,12 +308,12 @@ BY_NAME = {step.name: step for step in STEPS}
 
 
 def defaults() -> dict[str, str]:
-    """Every field's value before a person has said anything."""
+    """Every field's default value."""
     return {field.name: field.default for step in STEPS for field in step.fields}
 
 
 def needed(step: Step, values: Values) -> tuple[str, ...]:
-    """What it needs with these values: some files come only one way, or have another name."""
+    """The files that the step needs with these values; these decide which files exist and how some are named."""
     names = step.needs
     if step.name == "intrinsics" and values["intrinsics_by"] == FROM_FILE:
         names = ()
@@ -333,7 +333,7 @@ def needed(step: Step, values: Values) -> tuple[str, ...]:
 
 
 def written(step: Step, values: Values) -> tuple[str, ...]:
-    """What it writes with these values."""
+    """The files that the step writes with these values."""
     if step.name == "corners" and values["gripper"] != INFERRED:
         return ("standing/corners.yaml",)
     if step.name == "reference" and values["gripper"] != INFERRED:

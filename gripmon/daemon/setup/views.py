@@ -1,7 +1,6 @@
-"""What an image is worth for a calibration: sharp, still, where on the sensor the target is and how it is tilted.
+"""Suitability of an image for a calibration: sharpness, motion, the target's place on the sensor and its tilt.
 
-The limits are those that the calibrations themselves have, or say in their warnings; nothing here decides whether a
-calibration is good.
+The limits are those of the calibrations and of their warnings; nothing here decides whether a calibration is good.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ from gripmon.model.records import Array, Image
 from gripmon.model.targets import Target
 
 CELLS = 12
-"""Across the image, as in the picture of ``gripmon calibrate intrinsics``."""
+"""Number of cells across the image, as in the picture of ``gripmon calibrate intrinsics``."""
 STILL_PX = 0.5
-"""From one frame to the next: an exposure that lasts the whole time between them is blurred by a standard deviation of
-0.5 / sqrt(12) = 0.14 px then, a twentieth of what is refused as blurred."""
+"""Largest motion between two frames (px): even an exposure over the whole time between them is then blurred by a
+standard deviation of only 0.5 / sqrt(12) = 0.14 px, a twentieth of the limit for blurred images."""
 MOVED_PX = 5.0
-"""Since the last image that was taken: ten times what counts as still, so that it is another view."""
+"""Smallest motion since the last image taken (px): ten times STILL_PX, so that it is another view."""
 FEWEST_VIEWS = 10
-"""Images of the plate (docs/howto/calibrate_camera.md)."""
+"""Minimum number of images of the plate (docs/howto/calibrate_camera.md)."""
 TILTED_RAD = math.radians(20.0)
-"""From where on a tilt determines the focal length well (the warning of ``gripmon calibrate intrinsics``)."""
+"""Tilt from which the focal length is well determined (the warning of ``gripmon calibrate intrinsics``)."""
 SIDES = ("right", "down", "left", "up")
 FEWEST_SIDES = 3
-"""Of the four: tilts about one axis alone leave the focal length across it to the other (fx against fy)."""
+"""Minimum number of the four sides: tilts about one axis alone determine only one of fx and fy."""
 _FEATURES = 150
 _QUICK = 0.9
-"""Quantile of the features' motions: what moves before a gripper that stands is a part of the image."""
+"""Quantile of the features' motions: the background may move in a part of the image while the gripper stands still."""
 
 
 class Coverage(msgspec.Struct, frozen=True):
-    """``cells``: rows of 0 and 1, where points were seen; ``tilts``: of each view (x, y), rad, to the side that is
-    farther away; ``wants`` what more would help, in words, empty if nothing.
+    """``cells``: rows of 0 and 1, 1 where points were seen; ``tilts``: of each view (x, y), rad, towards the side that
+    is farther away; ``wants``: missing views, in words, empty if none.
     """
 
     cells: tuple[tuple[int, ...], ...]
@@ -53,7 +52,7 @@ class Coverage(msgspec.Struct, frozen=True):
 @dataclass(frozen=True)
 class View:
     """One image: ``sighting`` of the target or why there is none; ``blur_px`` of its sharpest edges (standard
-    deviation); ``moved_px`` since the image before, None for the first one or where nothing can be followed.
+    deviation); ``moved_px`` since the previous image, None for the first one or if no features can be tracked.
     """
 
     sighting: Sighting | NotFound | None
@@ -62,10 +61,10 @@ class View:
 
     @property
     def fault(self) -> str:
-        """Why the image can't be taken, empty if it can; what moves is no fault of an image that is a file."""
+        """Why the image can't be taken, empty if it can; motion doesn't count, because files can't be repeated."""
         if self.blur_px > BLURRED_PX:
             return (
-                f"blurred: its sharpest edges are {self.blur_px:.1f} px wide, at most {BLURRED_PX:g} px; focus, light"
+                f"blurred: its sharpest edges are {self.blur_px:.1f} px wide; at most {BLURRED_PX:g} px: focus, light"
             )
         return self.sighting.reason if isinstance(self.sighting, NotFound) else ""
 
@@ -78,12 +77,12 @@ class Viewer:
     """Looks at one image after another."""
 
     def __init__(self, target: Target | None) -> None:
-        """``target`` None: none is asked for."""
+        """``target`` None: images need no target."""
         self._target = target
         self._before: Image | None = None
 
     def look(self, image: Image) -> View:
-        """Any image that a camera delivers."""
+        """Examine any image that a camera delivers."""
         grey = to_grey(image)
         shown = to_bytes(grey)
         moved_px = None if self._before is None else moved(self._before, shown)
@@ -93,8 +92,8 @@ class Viewer:
 
 
 def moved(before: Image, now: Image) -> float | None:
-    """By how far (px) all but a tenth of the features of an image (h, w), 8 bits, have moved at most; None where
-    there are none to follow, or they are not found again.
+    """The 90 % quantile of the features' motions (px) between two images (h, w), 8 bits; None if there are no
+    features, or too few are found again.
 
     Lucas and Kanade by pyramids (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000).
     """
@@ -112,7 +111,7 @@ def moved(before: Image, now: Image) -> float | None:
 
 
 def coverage(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Coverage:
-    """What views of a plate come to; ``size_px`` (width, height) of the images."""
+    """The coverage by views of a plate; ``size_px`` (width, height) of the images."""
     rows = max(1, round(CELLS * size_px[1] / size_px[0]))
     seen = np.zeros((rows, CELLS), np.int64)
     for sighting in sightings:
@@ -147,9 +146,9 @@ def _wants(sightings: Sequence[Sighting], tilts: Array, size_px: tuple[int, int]
 def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
     """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down).
 
-    About right, for a person: the camera isn't known yet.  One focal length for all views, from the plate's axes being
-    at right angles and equally long (Zhang, "A flexible new technique for camera calibration", 2000), principal point
-    at the centre, square pixels, no distortion; where the views don't tell it, the image's width.
+    An approximation for people: the camera isn't known yet.  One focal length for all views, from the plate's axes
+    being orthogonal and equally long (Zhang, "A flexible new technique for camera calibration", 2000), principal point
+    at the centre, square pixels, no distortion; if the views don't determine it, the image's width.
     """
     planes = [_homography(sighting, size_px) for sighting in sightings]
     known = [plane for plane in planes if plane is not None]
@@ -163,13 +162,13 @@ def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
         normal = np.cross(axes[:, 0], axes[:, 1])
         normal /= np.linalg.norm(normal) * np.sign(normal[2] or 1.0)  # away from the camera
         across = float(np.linalg.norm(normal[:2]))
-        # Depth grows against the normal's part in the image.
+        # Depth increases against the normal's component in the image.
         out[k] = -normal[:2] / max(across, 1e-9) * math.atan2(across, float(normal[2]))
     return out
 
 
 def _homography(sighting: Sighting, size_px: tuple[int, int]) -> Array | None:
-    """(3, 3) from the plate to the image, px from its centre; None where the points don't span an area."""
+    """(3, 3) from the plate to the image, px from its centre; None if the points don't span an area."""
     if len(sighting) < 4:
         return None
     plate = sighting.plate_m[:, :2] - sighting.plate_m[:, :2].mean(axis=0)
@@ -178,7 +177,7 @@ def _homography(sighting: Sighting, size_px: tuple[int, int]) -> Array | None:
 
 
 def _focal(planes: Sequence[Array]) -> float | None:
-    """Focal length (px); None if these views don't tell."""
+    """Focal length (px); None if these views don't determine it."""
     if len(planes) < 3:
         return None
     terms, rests = [], []

@@ -2,26 +2,25 @@
 
 Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.model.records`):
 
-``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested; a
-               ``get`` brings the last one
+``transform``  every frame; express, real-time priority, dropped on a congested link; a ``get`` returns the last one
 ``state``      once a second and on every change; late joiners get the last one
 ``reference``  on every new revision; late joiners get the last one
 ``alert``      when there is one; an advanced subscriber with history gets the last 32
-``alive``      liveliness token, gone as soon as the process is; ``alive/<id>`` another one, of this start alone
-``spot``       of a second camera in place of ``transform`` and ``reference``: what became of each pulse of the laser
+``alive``      liveliness token, vanishes with the process; ``alive/<id>`` another one, for this start of the process
+``spot``       of a second camera in place of ``transform`` and ``reference``: the result of each laser pulse
 ``pulse``      read, not written: the pulses, from the robot's program
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
-``cmd/<name>`` queryable: what an operator tells the monitor, see :mod:`gripmon.io.publish.commands`
+``cmd/<name>`` queryable: an operator's commands, see :mod:`gripmon.io.publish.commands`
 
-"Late joiners get the last one" holds both ways that people ask: a plain ``get`` on the key (a queryable answers it),
-and an advanced subscriber with history (``zenoh.ext``).
+Late joiners get the last one in two ways: by a plain ``get`` on the key (answered by a queryable), and by an advanced
+subscriber with history (``zenoh.ext``).
 """
 
 from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord
 
 
 class Publisher:
-    """Where a loop puts what it has to say; no method waits for the network.  This one says nothing.
+    """A loop's output; no method waits for the network.  This base class publishes nothing.
 
     A wrist camera's loop has transforms and references, a second camera's has spots.
     """
@@ -33,13 +32,13 @@ class Publisher:
         """The reference that is in force from now on."""
 
     def spot(self, record: SpotRecord) -> None:
-        """What became of a pulse."""
+        """The result of a pulse."""
 
     def state(self, record: StateRecord) -> None:
         """The newest state."""
 
     def alert(self, record: AlertRecord) -> None:
-        """An alert, of a frame or of none."""
+        """An alert, with or without a frame."""
 
     def close(self) -> None:
-        """Let go of what is held.  Calling it twice does nothing more."""
+        """Release all resources.  Calling it twice does nothing more."""

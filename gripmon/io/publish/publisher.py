@@ -1,4 +1,4 @@
-"""What a monitor says on the network, and several publishers in place of one."""
+"""A monitor's messages on the network, and several publishers in place of one."""
 
 from __future__ import annotations
 
@@ -35,12 +35,10 @@ _HEARTBEAT_S = 1.0
 
 
 class _ZenohStates(Publisher):
-    """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
+    """Common part of all publishers on a link: states, alerts, and the records that wait for the link to open."""
 
     def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
-        """``presence``: whose id stands in every message.  Raises ValueError for a name that can't be part of
-        a key.
-        """
+        """``presence`` has the id for every message.  Raises ValueError for a name that can't be part of a key."""
         self.keys = Keys(check_name("robot", robot), check_name("camera", camera))
         self.monitor_id = "" if presence is None else presence.monitor_id
         self.unsent = 0
@@ -64,7 +62,7 @@ class _ZenohStates(Publisher):
         self._link.close()
 
     def _declared(self, wire: _Wire) -> None:
-        """Declare what is the subclass's own."""
+        """Declare the subclass's own keys."""
 
     def _signed(self, record: _T) -> _T:
         """The record with the id of this start."""
@@ -134,7 +132,7 @@ class ZenohSpotPublisher(_ZenohStates):
     """
 
     def spot(self, record: SpotRecord) -> None:
-        """Send what became of a pulse, and keep the last one for late joiners."""
+        """Send the result of a pulse, and keep the last one for late joiners."""
         self._put_each("spot", to_json(self._signed(record)))
 
     def _declared(self, wire: _Wire) -> None:
@@ -144,7 +142,7 @@ class ZenohSpotPublisher(_ZenohStates):
 def _keeping_publisher(
     session: zenoh.Session, key: str, priority: zenoh.Priority, kept: int
 ) -> zenoh.ext.AdvancedPublisher:
-    """A publisher whose last ``kept`` samples an advanced subscriber with history gets when it comes later."""
+    """A publisher that keeps its last ``kept`` samples for advanced subscribers with history that join later."""
     return zenoh.ext.declare_advanced_publisher(
         session,
         key,
@@ -163,7 +161,7 @@ def _too_many_ask(query: zenoh.Query) -> None:
 
 
 class _LastValue:
-    """A key whose last value is there for whoever asks."""
+    """A key whose last value is returned by a ``get``."""
 
     def __init__(
         self,
@@ -194,9 +192,9 @@ class _LastValue:
 
 
 class _TimedStream(_LastValue):
-    """A key whose messages say when they were sent, and which tells the time to whoever asks.
+    """A key whose messages contain their sending time, and which answers queries for the present time.
 
-    With both a reader without a clock of the same time can bound how long a message was on its way.
+    With both a reader without a synchronised clock can bound a message's delay.
     """
 
     _clock = uuid.uuid4().hex  # of this process: after a restart, perhaps on another machine, it is another one
@@ -221,7 +219,7 @@ class _Wire:
 
     def __init__(self, session: zenoh.Session, keys: Keys, monitor_id: str) -> None:
         self._session, self._keys = session, keys
-        # the id first: whoever sees the token without one finds the id, too
+        # the id first: a reader that sees the token without one then also finds the id
         self._tokens = [*([keys[f"alive/{monitor_id}"]] if monitor_id else []), keys["alive"]]
         self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
@@ -230,7 +228,7 @@ class _Wire:
         self._alive: list[zenoh.LivelinessToken] = []
 
     def declare_newest(self, leaf: str) -> None:
-        """A key of a stream, without a cache: a message of it is worth nothing to who didn't ask for the last one."""
+        """A key of a stream, without history: earlier messages are useless to subscribers."""
         publisher = self._session.declare_publisher(
             self._keys[leaf],
             encoding=_JSON,
@@ -241,12 +239,12 @@ class _Wire:
         self.puts[leaf] = _TimedStream(self._session, self._keys[leaf], publisher, self._answers).put
 
     def declare_kept(self, leaf: str, kept: int = 1) -> None:
-        """A key whose last ``kept`` messages are there for who comes late."""
+        """A key whose last ``kept`` messages are kept for late joiners."""
         publisher = _keeping_publisher(self._session, self._keys[leaf], zenoh.Priority.DATA_HIGH, kept)
         self.puts[leaf] = _LastValue(self._session, self._keys[leaf], publisher, self._answers).put
 
     def appear(self) -> None:
-        """Show the liveliness tokens, when all is declared: the one that every monitor has, and that of this start."""
+        """Declare the liveliness tokens, after everything else: the one of every monitor, and that of this start."""
         self._alive = [self._session.liveliness().declare_token(key) for key in self._tokens]
 
     def close(self) -> None:
@@ -256,10 +254,10 @@ class _Wire:
 
 
 class Publishers(Publisher):
-    """Hands each record to the first publisher and then to those of the others that take such records.
+    """Passes each record to the first publisher and then to those of the others that take such records.
 
-    What the first raises is raised, after the others had the record.  What another one raises never reaches the caller:
-    it is logged once, until it changes, and :meth:`fault` says it.
+    An exception of the first is raised, after the others got the record.  An exception of another one never reaches the
+    caller: it is logged once, until it changes, and :meth:`fault` reports it.
     """
 
     def __init__(self, first: Publisher, others: Mapping[str, Publisher]) -> None:

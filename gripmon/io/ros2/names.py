@@ -18,17 +18,17 @@ from gripmon.io.wire import DEFAULT_ENDPOINT, PublishSettings
 from gripmon.io.wire.session import Endpoint
 
 MOST_DOMAIN_ID = 232
-"""As with every other ROS 2 middleware; Zenoh itself would take any number."""
+"""As with every other ROS 2 middleware; Zenoh itself would accept any number."""
 
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv)/([A-Z][A-Za-z0-9]*)")
-_UNTOLD_DEPTH = 42  # what rmw_zenoh takes an unset depth for, and so leaves out
+_UNTOLD_DEPTH = 42  # rmw_zenoh's value for an unset depth, which it omits
 
 EndpointKind = Literal["MP", "MS"]
 
 
 class RosNameError(ValueError):
-    """A name that ROS 2 doesn't allow; the text says which and what would be right."""
+    """An invalid ROS 2 name; the text names it and says what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def check_qualified(role: str, name: str, *, root: bool = False) -> str:
 
 
 def as_token(text: str) -> str:
-    """A name of ours as one token of a ROS name: what isn't allowed there becomes ``_``."""
+    """A gripmon name as one token of a ROS name: characters that aren't allowed become ``_``."""
     token = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return token if _TOKEN.fullmatch(token) else f"_{token}"
 
@@ -99,12 +99,12 @@ def dds_type(type_name: str) -> str:
 
 
 def topic_key(domain_id: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Where messages are put: ``<domain>/<topic>/<type>/<hash>``."""
+    """The key for publishing: ``<domain>/<topic>/<type>/<hash>``."""
     return f"{check_domain(domain_id)}{check_qualified('topic', topic)}/{dds_type(type_name)}/{type_hash}"
 
 
 def subscription_key(domain_id: int, topic: str, type_name: str) -> str:
-    """Where messages of that type come from, whatever hash the publisher's distribution gives to the type.
+    """The key expression for subscribing to that type, with any hash, since distributions differ in it.
 
     ``topic`` is a full name, ``/camera/image_raw``.  Raises :class:`RosNameError`.
     """
@@ -112,7 +112,7 @@ def subscription_key(domain_id: int, topic: str, type_name: str) -> str:
 
 
 def node_token(domain_id: int, zid: str, node_id: int, node: NodeName) -> str:
-    """The liveliness token of a node, of which ``ros2 node list`` knows it."""
+    """The liveliness token of a node, by which ``ros2 node list`` finds it."""
     return _token(domain_id, zid, node_id, node_id, "NN", node)
 
 
@@ -140,7 +140,7 @@ def check_domain(domain_id: int) -> int:
 
 
 def _token(domain_id: int, zid: str, node_id: int, entity_id: int, kind: str, node: NodeName) -> str:
-    enclave = "%"  # none: we don't take part in SROS 2
+    enclave = "%"  # none: SROS 2 is not supported
     where = f"{check_domain(domain_id)}/{zid}/{node_id}/{entity_id}"
     return f"@ros2_lv/{where}/{kind}/{enclave}/{_mangled(node.namespace)}/{node.name}"
 
@@ -225,7 +225,7 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class Ros2Fault(ValueError):
-    """A setting that can't be: ``key`` below ``ros2``, what is ``wrong``, what would be ``right``."""
+    """An invalid setting: ``key`` below ``ros2``, what is ``wrong``, what would be ``right``."""
 
     def __init__(self, key: str, wrong: str, right: str) -> None:
         super().__init__(f"ros2.{key}: {wrong}; {right}")
@@ -246,7 +246,7 @@ class Layout:
 
 
 def layout_of(settings: Ros2Settings, robot: str, camera: str) -> Layout:
-    """What the settings come to for this camera.  Raises :class:`Ros2Fault`."""
+    """The names and frames for this camera.  Raises :class:`Ros2Fault`."""
     inverse = settings.publish == "gripper_from_camera"
     namespace = f"/{as_token(robot)}/{as_token(camera)}" if settings.namespace is None else settings.namespace
     if settings.parent_frame is None and inverse:
@@ -275,7 +275,7 @@ def layout_of(settings: Ros2Settings, robot: str, camera: str) -> Layout:
 
 
 def network_of(publish: PublishSettings, ros2: Ros2Settings) -> PublishSettings:
-    """How to join the network: as client of the ROS 2 router, unless ``publish`` says something else."""
+    """How to join the network: as client of the ROS 2 router, unless ``publish`` has network settings."""
     defaults = PublishSettings()
     said = any(getattr(publish, key) != getattr(defaults, key) for key in ("mode", "listen", "connect", "zenoh_config"))
     if not ros2.enabled or ros2.router is None or said:

@@ -1,13 +1,13 @@
-"""A ROS 2 node on a Zenoh session: its tokens in the graph, its publishers, and the messages that it hears.
+"""A ROS 2 node on a Zenoh session: its tokens in the graph, its publishers, and the messages that it receives.
 
 Message types, their hashes and CDR are ``rosbags``', imported when first needed.  Source: ``docs/design.md`` of
 ``rmw_zenoh`` (sections "Graph Cache" and "Publishers") and its ``rmw_publisher_data.cpp``, ``liveliness_utils.cpp``
 (how a token becomes a gid) and ``attachment_helpers.cpp``.
 
-Whatever is wrong with a message's bytes (CDR) is a :class:`MessageError`.  The payload's size is limited first;
-``rosbags`` then checks each length that the message names against what is left of the payload before it reads on; only
-then are sizes, step and encoding held against the pixels that came.  ``stamp_ns`` is the message's own, Unix
-nanoseconds; 0 where the sender left it empty.
+Any fault in a message's bytes (CDR) is a :class:`MessageError`.  The payload's size is limited first; ``rosbags`` then
+checks each length in the message against the rest of the payload before reading on; then size, step and encoding are
+checked against the pixels received.  ``stamp_ns`` is the message's own, Unix nanoseconds; 0 if the sender left it
+empty.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 class Ros2Missing(ImportError):
-    """The optional dependencies are not there; the text is ``what is wrong; what would be right``."""
+    """The optional dependencies are missing; the text is ``what is wrong; what would be right``."""
 
 
 @functools.cache
@@ -72,7 +72,7 @@ def type_hash(type_name: str) -> str:
 
 
 def prepare(*type_names: str) -> None:
-    """Have the code for these types generated now, tens of milliseconds that no frame should wait for."""
+    """Generate the code for these types now: tens of milliseconds that no frame should wait for."""
     for type_name in type_names:
         typestore().get_msgdef(type_name)
         type_hash(type_name)
@@ -93,7 +93,7 @@ def gid_of(token: str) -> bytes:
 
 
 def attachment(sequence_number: int, stamp_ns: int, gid: bytes) -> bytes:
-    """What ``rmw_zenoh`` wants beside every message (33 bytes); it drops messages without."""
+    """The attachment that ``rmw_zenoh`` expects with every message (33 bytes); it drops messages without."""
     return _ATTACHMENT.pack(sequence_number, stamp_ns, _GID_BYTES, gid)
 
 
@@ -112,8 +112,8 @@ class Node:
     def publisher(
         self, topic: str, type_name: str, qos: Qos = DEFAULT_QOS, *, priority: zenoh.Priority | None = None
     ) -> TopicPublisher:
-        """Publish on a topic (its full name).  A message that a congested link can't take is dropped, not waited for:
-        so does ``rmw_zenoh`` with every history but keep all.  ``priority`` is Zenoh's ``DATA`` by default.
+        """Publish on a topic (its full name).  On a congested link messages are dropped, as by ``rmw_zenoh`` with every
+        history but keep all.  ``priority`` is Zenoh's ``DATA`` by default.
         """
         import zenoh
 
@@ -128,8 +128,8 @@ class Node:
     def declare(self, kind: EndpointKind, topic: str, type_name: str, qos: Qos = DEFAULT_QOS) -> str:
         """Show a publisher (``MP``) or subscription (``MS``) in the graph; returns its token.
 
-        A subscriber works without, but ``ros2 topic info`` doesn't know it, and nodes that publish only while someone
-        listens wait for it.
+        A subscriber works without, but ``ros2 topic info`` doesn't show it, and nodes that publish only to subscribers
+        don't publish.
         """
         ids = (self._id, next(_ids))
         token = endpoint_token(
@@ -139,7 +139,7 @@ class Node:
         return token
 
     def close(self) -> None:
-        """Leave the graph; what was declared first leaves last.  Calling it twice does nothing more."""
+        """Leave the graph, in reverse order of declaration.  Calling it twice does nothing more."""
         while self._tokens:
             self._tokens.pop().undeclare()
 
@@ -155,7 +155,7 @@ class TopicPublisher:
         self._serialize = typestore().serialize_cdr
 
     def put(self, message: object) -> None:
-        """Send a message of ``rosbags``' type.  Raises whatever ``rosbags`` or Zenoh have against it."""
+        """Send a message of ``rosbags``' type.  Raises the exceptions of ``rosbags`` or Zenoh."""
         payload = bytes(self._serialize(message, self._type_name, little_endian=True))
         self._sequence_number += 1
         beside = attachment(self._sequence_number, time.time_ns(), self._gid)
@@ -166,7 +166,7 @@ _SENSOR_DATA = Qos(depth=5, reliable=False)
 
 
 class HeardTopic(NamedTuple):
-    """A topic by its full name, and what is heard there."""
+    """A subscription: a topic by its full name, and its message type."""
 
     domain_id: int
     topic: str
@@ -174,9 +174,9 @@ class HeardTopic(NamedTuple):
 
 
 class Listeners:
-    """Shows a node with subscriptions in the graph of each domain; the subscribers themselves are others' affair.
+    """Shows a node with subscriptions in the graph of each domain; the subscribers themselves are declared elsewhere.
 
-    They would hear without.  But publishers of images look whether there are listeners, and publish nothing without
+    They would work without it, but publishers of images publish nothing without visible subscriptions
     (``image_transport``).
     """
 
@@ -270,14 +270,14 @@ def decode_joint_state(payload: bytes) -> tuple[int, dict[str, float]]:
         raise MessageError(JOINT_STATE, "position", f"{len(positions)} positions of {len(names)} joints")
     if len(set(names)) != len(names):
         raise MessageError(JOINT_STATE, "name", "two joints have the same name")
-    # Velocities and efforts alone are allowed, too.
+    # A message with only velocities or efforts is allowed.
     pairs = zip(names, positions.tolist(), strict=True) if len(positions) else ()
     return _stamp_ns(JOINT_STATE, message.header.stamp), dict(pairs)
 
 
 LONGEST_STEP_S = 0.1
-"""Between reports of an opening farther apart the jaw stood still, and moved only so long before the later one: a robot
-may report only while the jaws move.
+"""Between reports farther apart than this the jaw is assumed to have moved only for this time before the later one: a
+robot may report only while the jaws move.
 """
 
 

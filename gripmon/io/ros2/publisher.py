@@ -93,7 +93,7 @@ class Messages:
     def pose(self, header: Any, transform: Transform, covariance: Iterable[float]) -> Any:
         """``geometry_msgs/PoseWithCovarianceStamped``.
 
-        ROS means by its covariance what ours is: x, y, z, then rotations about x, y, z, all in the axes of the header's
+        ROS defines the covariance as we do: x, y, z, then rotations about x, y, z, all in the axes of the header's
         frame, row by row.
         """
         pose = self._pose(self._point(*transform.translation_m), self._quaternion(*transform.rotation_xyzw))
@@ -117,8 +117,8 @@ class Messages:
 
 
 def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
-    """Stale without frames; else the worst of the verdict, what the state complains of, and the open alerts that no one
-    has acknowledged.
+    """Stale without frames; otherwise the worst of the verdict, the state's message, and the open alerts that are not
+    acknowledged.
     """
     if state.state is State.STALE:
         return STALE
@@ -127,7 +127,7 @@ def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
 
 
 def summary_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> str:
-    """One line for a person."""
+    """One line of text."""
     said = [f"{state.state}, transform {state.verdict}", state.message, *(alert.text for alert in alerts)]
     return "; ".join(part for part in said if part)
 
@@ -169,7 +169,7 @@ def values_of(
 
 
 def _bounds_of(state: StateRecord, protection: Protection | None) -> list[tuple[str, str]]:
-    """How far off the newest transform may be, at which risk, and how far off it is allowed to be."""
+    """The newest transform's protection levels, their risk, and the alert limit."""
     values = []
     if protection is not None:
         values = [
@@ -187,9 +187,8 @@ _TF_QOS = Qos(depth=100)
 """That of ``tf2_ros``' broadcasters: reliable, volatile, keep last 100."""
 
 MOST_WAITED_S = 0.5
-"""What was judged later than this after its frame came is not broadcast: tf takes the newest that comes for what is
-true now.  Twice what the client for controllers lets a transform be old by default, so that a busy machine still says
-something.
+"""Longest time from a frame's arrival to its verdict for a broadcast: tf takes the newest message as the present.  More
+than twice the controller client's default for the age, so that a busy machine still broadcasts (s).
 """
 
 
@@ -202,12 +201,11 @@ class _Topics:
 
 
 class Ros2Publisher(Publisher):
-    """Publishes one monitor's records as a node on a link that someone else closes.
+    """Publishes one monitor's records as a node on a link that it doesn't own.
 
-    Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
-    capture time; one that waited in the monitor does not.  Diagnostics go out with every state record (once a second
-    and on every change) and every alert.  While the link isn't open, nothing is kept: what comes late to tf is old, and
-    diagnostics are sent again.
+    Transforms with an allowed verdict go to tf and to the pose topic, stamped with the frame's capture time, except
+    those delayed in the monitor.  Diagnostics are sent with every state record (once a second and on every change) and
+    every alert.  While the link isn't open, nothing is kept: late transforms are old, and diagnostics are sent again.
     """
 
     def __init__(self, link: Link, settings: Ros2Settings, layout: Layout) -> None:
@@ -290,13 +288,13 @@ class Ros2Publisher(Publisher):
         return record.cam_T_grip, record.covariance
 
     def _ready(self) -> _Topics | None:
-        """What to put on; None while there is no session.  Raises RuntimeError if it could not be declared."""
+        """The topics; None while there is no session.  Raises RuntimeError if they could not be declared."""
         if self._fault:
             raise RuntimeError(self._fault)
         return self._topics
 
     def _adopt(self, session: zenoh.Session) -> None:
-        """Enter the graph.  Others wait for the session, too: what goes wrong here is reported later."""
+        """Enter the graph.  Failures are reported later, because others also wait for the session."""
         import zenoh
 
         layout = self._layout

@@ -1,7 +1,7 @@
-"""Where frames come from: a folder of images, a video file, an episode of recorded messages or of a LeRobot dataset, a
-live camera, one on the network, a simulated one.
+"""Sources of frames: a folder of images, a video file, an episode of recorded messages or of a LeRobot dataset, a live
+camera, one on the network, a simulated one.
 
-All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
+All are a :class:`Source`; :func:`open_source` makes one from its settings, and only then imports heavy packages.
 """
 
 from __future__ import annotations
@@ -65,15 +65,15 @@ def open_source(
     link: Link | None = None,
     keys: Keys | None = None,
 ) -> Source:
-    """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
+    """Start a source; paths in its settings are relative to ``relative_to``, the folder of the configuration file.
 
-    Only the simulator needs a whole ``scene``, and a camera on the network the session, the monitor's keys and the size
-    of the images: (width, height), by default that of the scene's camera.  The simulator's real-time camera starts
-    another Python process by ``multiprocessing``, so a script that opens one must keep its own start behind
+    Only the simulator needs a ``scene``; a camera on the network needs the session, the monitor's keys and the size of
+    the images: (width, height), by default that of the scene's camera.  The simulator's real-time camera starts
+    another Python process by ``multiprocessing``, so a script that opens one needs the guard
     ``if __name__ == "__main__"``.
 
-    Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
-    video, and a device of no known form.  A camera that is only absent at present is no error: the source waits for it.
+    Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that isn't a
+    video, and a device of unknown form.  A camera that is absent at present is not an error: the source waits for it.
     """
     match settings:
         case SimulatedSettings():
@@ -99,8 +99,8 @@ def open_source(
 
 
 def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings | EpisodeSettings:
-    """Settings for a recorded input that a person named: a folder of images, a LeRobot dataset, a rosbag2 folder, an
-    MCAP file, else a video file; ``fps`` (1/s) counts where the input has no time stamps.
+    """Settings for a recorded input given as text: a folder of images, a LeRobot dataset, a rosbag2 folder, an MCAP
+    file, otherwise a video file; ``fps`` (1/s) is used if the input has no time stamps.
     """
     if path.suffix.lower() == ".mcap" or (path.is_dir() and is_rosbag2(str(path))):
         return BagSettings(path=str(path))
@@ -111,8 +111,8 @@ def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | 
 
 
 def settings_for_text(text: str, fps: float | None = None) -> FolderSettings | LiveSettings | VideoSettings:
-    """The same of what may also be a camera: a number, /dev/…, a URL or a GStreamer pipeline.  Raises
-    :class:`SourceError` for what is none of these.
+    """The same for an input that may also be a camera: a number, /dev/…, a URL or a GStreamer pipeline.  Raises
+    :class:`SourceError` for any other text.
     """
     path = Path(text)
     if path.is_dir():

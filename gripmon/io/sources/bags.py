@@ -1,7 +1,7 @@
 """Recorded messages: an MCAP file, or a folder of rosbag2, with images, joint states and camera calibrations.
 
-CDR is decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema that the file itself holds; JSON
-as Foxglove writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
+CDR is decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema in the file; JSON as Foxglove
+writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ class _Message(NamedTuple):
 
 
 class _CutShort(Exception):
-    """The file ends, or is damaged, before its end; ``str()`` says what."""
+    """The file is truncated or damaged; ``str()`` says how."""
 
 
 class _Mcap:
-    """An MCAP file, whole or cut short: without its summary it is read from its beginning as far as it goes."""
+    """An MCAP file, whole or truncated: without its summary it is read from the beginning as far as possible."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -85,7 +85,7 @@ class _Mcap:
                 raise SourceError(f"path: {path} can't be read ({error}); a whole .mcap file") from None
 
     def messages(self, topics: list[str]) -> Iterator[_Message]:
-        """In order of their log times, of a file that is cut short as they stand."""
+        """Messages in order of their log times; of a truncated file in the file's order."""
         for schema, channel, message in self._records(topics):
             data, encoding = message.data, channel.message_encoding
             kind = _kind(schema.name)
@@ -112,7 +112,7 @@ def _kind(type_name: str) -> str:
 
 
 def _decode(data: bytes, encoding: str, schema: Any) -> Any:
-    """A message by its fields, as attributes.  ValueError for an encoding that isn't read."""
+    """A decoded message, its fields as attributes.  ValueError for an unsupported encoding."""
     if encoding == "cdr":
         return _from_cdr(data, schema.name, schema.data.decode(errors="replace"))
     if encoding == "protobuf":
@@ -153,7 +153,7 @@ class _Rosbag2:
             raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole rosbag2") from None
 
     def messages(self, topics: list[str]) -> Iterator[_Message]:
-        """In order of their log times."""
+        """Messages in order of their log times."""
         try:
             with self._reader(self._path) as reader:
                 wanted = [connection for connection in reader.connections if connection.topic in topics]
@@ -174,22 +174,21 @@ def open_messages(path: str) -> _Mcap | _Rosbag2:
 
 
 def is_rosbag2(path: str) -> bool:
-    """Whether a folder is one."""
+    """Whether a folder is a rosbag2."""
     return there(joined(path, "metadata.yaml"))
 
 
 def image_topics(types: dict[str, str]) -> list[str]:
-    """Topics with images, by name."""
+    """Names of the topics with images."""
     return sorted(topic for topic, name in types.items() if _kind(name) in _IMAGES)
 
 
 class BagSource(Stored):
-    """Every image of a topic, in order of log time, with the stamp of its own header (the log's where that is empty),
-    and the opening at that time.  Where the file is cut short the last frame has no image, and says so.
+    """Every image of a topic, in order of log time, with the stamp of its own header (if that is empty, the log's),
+    and the opening at that time.  Of a truncated file the last frame has no image, but a fault.
 
-    ``topic``: that of the images.  ``camera``: the calibration that comes with them, None where there is none.  Raises
-    :class:`SourceError` for what can't be read, and for a topic or joints that aren't there, with the names of those
-    that are.
+    ``topic``: that of the images.  ``camera``: their calibration in the file, None if there is none.  Raises
+    :class:`SourceError` for unreadable files, and for a missing topic or joints, with the names of the existing ones.
     """
 
     def __init__(self, settings: BagSettings, relative_to: str = "") -> None:
@@ -235,7 +234,7 @@ class BagSource(Stored):
                 if opening_m is not None:
                     reports.append((_stamp_ns(found) or message.log_ns, opening_m))
         except _CutShort:
-            pass  # the images end there, too, and say so
+            pass  # the images end there, too, and report it
         except ValueError as error:
             raise SourceError(f"opening: {self._path}: {error}") from None
         if not reports:
@@ -302,7 +301,7 @@ class BagSource(Stored):
 
 
 def _stamp_ns(message: Any) -> int:
-    """Of the message's own header; 0 where it has none or leaves it empty."""
+    """Stamp of the message's own header; 0 if it has none or an empty one."""
     stamp = getattr(getattr(message, "header", message), "stamp", None) or getattr(message, "timestamp", None)
     if stamp is None:
         return 0
@@ -314,8 +313,8 @@ def _stamp_ns(message: Any) -> int:
 def lens_of(message: Any, *, rectified: bool = False) -> LensSettings | None:
     """The camera of a CameraInfo or CameraCalibration; None for one that was never calibrated (its K is 0).
 
-    ``rectified``: of images that ROS has rectified, P's pinhole without distortion.  ValueError for a lens that no
-    monitor can use.
+    ``rectified``: for images that ROS has rectified, P's pinhole without distortion.  ValueError for an unsupported
+    lens.
     """
     k, d, p = (np.array(getattr(message, a, getattr(message, a.upper(), ()))).astype(float) for a in "kdp")
     if k.size != 9 or not k.any():

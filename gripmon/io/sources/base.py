@@ -1,4 +1,4 @@
-"""What every source of frames has in common."""
+"""The common interface of all sources of frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SourceError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """No frame arrived within the time that ``read`` may take; ``reason`` says why, as far as is known."""
+    """No frame arrived within the time that ``read`` may take; ``reason`` says why, if known."""
 
     reason: str
 
@@ -25,18 +25,18 @@ class Waiting:
 class Source(Protocol):
     """Frames, one at a time.
 
-    ``read`` has one caller and three kinds of answers:
+    ``read`` has one caller and returns one of three:
 
-    * a :class:`Frame`; one that could not be made has image None and says why in ``fault``;
-    * :class:`Waiting`: nothing arrived, ask again.  Only live sources say so, after at most ``READ_TIMEOUT_S``, so the
-      caller can stop, and can report that the camera is missing;
-    * None: finished, and so is every later answer.
+    * a :class:`Frame`; a faulty one has image None and the reason in ``fault``;
+    * :class:`Waiting`: nothing arrived, call again.  Only live sources return it, after at most ``READ_TIMEOUT_S``, so
+      that the caller can stop, and can report that the camera is missing;
+    * None: finished, also for all later calls.
 
-    A source with ``live`` true is a camera in real time: ``read`` gives the newest frame, older ones that no one asked
-    for in time are counted in ``dropped`` (their ``seq`` is missing).  Otherwise ``read`` gives every frame in order,
-    at once, ``dropped`` stays 0 and ``connected`` true.  ``connected`` says whether the camera delivers at present.
+    A source with ``live`` true is a camera in real time: ``read`` returns the newest frame; older ones that were not
+    read in time are counted in ``dropped`` (their ``seq`` is missing).  Otherwise ``read`` returns every frame in
+    order, immediately; ``dropped`` stays 0 and ``connected`` true.  ``connected``: the camera delivers at present.
 
-    ``close`` may be called from any thread and more than once; a ``read`` under way then returns None.
+    ``close`` may be called from any thread and more than once; a concurrent ``read`` then returns None.
     """
 
     @property
@@ -50,7 +50,7 @@ class Source(Protocol):
 
 
 class Stored:
-    """What every source of recorded frames is: it waits for nobody, and nobody misses one of its frames."""
+    """Base of the sources of recorded frames: no real time, and no frame is dropped."""
 
     live = False
     connected = True
@@ -61,7 +61,7 @@ READ_TIMEOUT_S = 0.5
 
 
 class OpenedSource:
-    """A source to iterate over: ``for frame in source``, which waits for a live camera, and ends with the frames or by
+    """An iterator over a source: ``for frame in source`` waits for a live camera, and ends with the last frame or with
     ``close``.  As a context manager it closes itself.
     """
 
@@ -99,8 +99,8 @@ class OpenedSource:
 
 
 class FullScale(OpenedSource):
-    """A source of a camera that fills only a part of its 16 bits, in the full scale of the type: so that recordings and
-    previews show what is measured, too.
+    """A source of a camera that uses only a part of its 16 bits, scaled to the full range of the type, so that
+    recordings and previews are visible, too.
     """
 
     def __init__(self, source: Source, bit_depth: int) -> None:

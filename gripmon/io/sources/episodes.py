@@ -1,4 +1,4 @@
-"""The episodes of a dataset: what below a folder or URL is a recording of its own."""
+"""The episodes of a dataset: all recordings below a folder or URL."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from gripmon.model.errors import one_line
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key
 
 ANNOTATION_SUFFIX = ".gripmon.mcap"
-"""Of what ``gripmon dataset --annotate`` writes beside recordings: not an episode."""
+"""Ending of the files that ``gripmon dataset --annotate`` writes beside recordings; these are not episodes."""
 _VIDEOS = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
 
 
 class Episode(msgspec.Struct, frozen=True):
-    """One recording, seen by one camera."""
+    """One recording of one camera."""
 
     name: str
-    """Its path below the dataset; of a LeRobot dataset with the episode's number behind ``#``."""
+    """Its path below the dataset; in a LeRobot dataset with the episode's number after ``#``."""
     source: BagSettings | LeRobotSettings | FolderSettings | VideoSettings
     version: str
-    """Changes with its files: their sizes and what the store says of when they were written."""
+    """Changes with its files: their sizes and the store's modification times."""
 
     @property
     def key(self) -> str:
-        """Of the episode and the camera."""
+        """Digest of the episode and the camera."""
         return f"{self.name}|{getattr(self.source, 'camera', None) or ''}"
 
 
 def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
-    """All below a folder or URL, in the order in which a person counts: LeRobot datasets, MCAP files, rosbag2 folders,
-    folders of images (``timestamps.csv`` beside them), videos; nothing in hidden folders.
+    """All episodes below a folder or URL, in natural order: LeRobot datasets, MCAP files, rosbag2 folders, folders of
+    images (``timestamps.csv`` beside them), videos; nothing in hidden folders.
 
-    ``cameras``: topics or features, one episode for each; none: the only one that there is.  No file is opened but
-    those by which LeRobot describes a dataset.  Raises :class:`SourceError` where nothing can be listed, and for a
-    LeRobot dataset of several cameras of which none is named.
+    ``cameras``: topics or features, one episode for each; none: the only one.  Opens only the files that describe a
+    LeRobot dataset.  Raises :class:`SourceError` if the folder can't be listed, and for a LeRobot dataset with several
+    cameras if none is named.
     """
     system, inside = file_system(root)
     try:
@@ -130,7 +130,7 @@ def _version(files: list[dict[str, Any]]) -> str:
 
 
 def hash_of(value: Any) -> str:
-    """Sixteen hexadecimal digits of plain values."""
+    """Digest of plain values, sixteen hexadecimal digits."""
     import hashlib
 
     return hashlib.sha256(repr(value).encode()).hexdigest()[:16]

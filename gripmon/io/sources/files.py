@@ -33,7 +33,7 @@ COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 class FolderSettings(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="folder"
 ):
-    """Images in a folder; a file ``timestamps.csv`` with ``file,stamp_ns[,jaw_opening_m]`` may lie beside them."""
+    """Images in a folder, optionally with a table ``timestamps.csv``: ``file,stamp_ns[,jaw_opening_m]``."""
 
     path: Annotated[str, msgspec.Meta(min_length=1, description="folder with the images")]
     fps: Annotated[
@@ -47,7 +47,7 @@ class FolderSettings(
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """What a table of time stamps says of an image."""
+    """An image's row in a table of time stamps."""
 
     stamp_ns: int
     jaw_opening_m: float | None
@@ -56,10 +56,9 @@ class TableRow:
 class FolderSource(Stored):
     """Every image of a folder, in order: ``frame10.png`` comes after ``frame9.png``.
 
-    With a table of time stamps it decides which frames there are: a file that it names and that is missing becomes a
-    frame with a fault, an image that it doesn't name is refused at the start.  Grey files stay grey, colour becomes
-    BGR, an alpha channel is left out, 16 bits and float stay what they are.  Truncated or foreign files become frames
-    with a fault.
+    A table of time stamps determines the frames: a file that is missing becomes a frame with a fault, an image that
+    isn't in the table is refused at the start.  Grey files stay grey, colour becomes BGR, an alpha channel is dropped,
+    16 bits and float stay unchanged.  Truncated or foreign files become frames with a fault.
     """
 
     def __init__(self, settings: FolderSettings, relative_to: Path) -> None:
@@ -184,10 +183,10 @@ class VideoSettings(
 
 
 class VideoSource(Stored):
-    """Frames with the container's time stamps, counted from its beginning, as a container knows no Unix time.
+    """Frames with the container's time stamps, counted from its beginning, since a container has no Unix time.
 
-    Containers round (Matroska to 1 ms).  A frame whose stamp doesn't rise becomes a frame with a fault: give ``fps``
-    for files without usable stamps.  Images are BGR, also of grey videos.
+    Containers round (Matroska to 1 ms).  A frame whose stamp doesn't increase becomes a frame with a fault: give
+    ``fps`` for files without usable stamps.  Images are BGR, even for grey videos.
     """
 
     def __init__(self, settings: VideoSettings, relative_to: Path) -> None:
@@ -205,7 +204,7 @@ class VideoSource(Stored):
         self._seq = 0
         self._last_stamp_ns = -1
         self._open = True
-        self._lock = threading.Lock()  # a capture that is released while it reads would crash
+        self._lock = threading.Lock()  # releasing a capture while it reads would crash
 
     def read(self) -> Frame | None:
         with self._lock:

@@ -1,7 +1,7 @@
 """Episodes of LeRobot datasets, of formats 2.0, 2.1 and 3.0: Parquet tables with MP4 videos, or with images inside.
 
-The formats are those of ``lerobot.datasets`` (its ``utils.py`` and ``v30``): format 2 has a video and a table for each
-episode, format 3 several episodes in each, and a table of episodes that says where.
+The formats are those of ``lerobot.datasets`` (its ``utils.py`` and ``v30``): format 2 has one video and one table per
+episode, format 3 several episodes in each, and a table of episodes with their places.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class LeRobotSettings(
 
 @dataclass(frozen=True)
 class LeRobotDataset:
-    """What a dataset says of itself; ``episodes`` by number."""
+    """A dataset's description; ``episodes`` by number."""
 
     path: str
     info: dict[str, Any]
@@ -48,12 +48,12 @@ class LeRobotDataset:
 
     @property
     def cameras(self) -> list[str]:
-        """Features that are images, by name."""
+        """Names of the image features."""
         return sorted(name for name, one in self.info["features"].items() if one["dtype"] in ("video", "image"))
 
     @property
     def joints(self) -> list[str]:
-        """Names of the numbers in the robot's state, in order; where it names none, their places."""
+        """Names of the numbers in the robot's state, in order; if it names none, their indices."""
         state = self.info["features"].get(_STATE)
         if state is None:
             return []
@@ -81,7 +81,7 @@ class LeRobotDataset:
 
 @functools.lru_cache(maxsize=4)
 def open_dataset(path: str) -> LeRobotDataset:
-    """Read what a dataset says of itself.  Raises :class:`SourceError` for what isn't one, or of another format."""
+    """Read a dataset's description.  Raises :class:`SourceError` if it isn't a dataset, or of another format."""
     try:
         with opened(joined(path, INFO)) as file:
             info = json.load(file)
@@ -109,7 +109,7 @@ def _episodes_of_3(path: str) -> list[dict[str, Any]]:
     for name in sorted(system.glob(joined(inside, "meta/episodes/*/*.parquet"))):
         with system.open(name, "rb") as file:
             table = parquet.ParquetFile(file)
-            # Beside these there are hundreds of columns of statistics.
+            # The table has hundreds of further columns of statistics.
             wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c[:5] in _PLACES]
             rows += table.read(columns=wanted).to_pylist()
     return rows
@@ -119,15 +119,15 @@ _PLACES = ("data/", "video")
 
 
 class LeRobotSource(Stored):
-    """Every frame of an episode, its stamp counted from the episode's beginning: the dataset knows no Unix time.  A
-    frame that its video doesn't hold has no image, and says so.
+    """Every frame of an episode, its stamp counted from the episode's beginning: the dataset has no Unix time.  A frame
+    that is missing in its video has no image, but a fault.
 
-    Raises :class:`SourceError` for what can't be read, and for a camera, an episode or joints that aren't there, with
-    the names of those that are.
+    Raises :class:`SourceError` for unreadable files, and for a missing camera, episode or joints, with the names of the
+    existing ones.
     """
 
     camera = None
-    """A LeRobot dataset holds no camera calibration."""
+    """A LeRobot dataset contains no camera calibration."""
 
     def __init__(self, settings: LeRobotSettings, relative_to: str = "") -> None:
         path = settings.path if "://" in settings.path else joined(relative_to, settings.path)
@@ -179,7 +179,7 @@ class LeRobotSource(Stored):
         return time_s, openings_m, None if is_video else table[self._camera].to_pylist()
 
     def _decoded(self) -> Iterator[tuple[Image | None, str | None]]:
-        """An answer for each row."""
+        """A value for each row."""
         if self._files is not None:
             for row in self._files:
                 yield decoded_file(row["bytes"] or b"")
@@ -230,5 +230,5 @@ def _video_frames(path: str, begin_s: float) -> Iterator[tuple[float, Any]]:
 
 
 def is_lerobot(path: str) -> bool:
-    """Whether a folder is one."""
+    """Whether a folder is a LeRobot dataset."""
     return there(joined(path, INFO))

@@ -1,5 +1,5 @@
-"""Newest frame wins: a thread reads, a slot for one frame forgets what came too late.  A camera through
-``cv2.VideoCapture`` that comes back by itself.
+"""Newest frame wins: a thread reads into a slot for one frame, which drops older ones.  A camera through
+``cv2.VideoCapture`` that reconnects automatically.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SILENT = Waiting("the camera is silent")
 
 
 class FrameReader(Protocol):
-    """What the thread reads from; ``read`` may block, and may raise: the consumer gets the exception."""
+    """The thread's input; ``read`` may block, and may raise: the consumer gets the exception."""
 
     @property
     def connected(self) -> bool: ...
@@ -114,14 +114,14 @@ class NewestFrame:
             self._changed.notify_all()
 
 
-_PAUSE_S = 0.25  # longest wait of the reading thread between two looks at the clock
+_PAUSE_S = 0.25  # longest wait of the reading thread between two checks of the clock
 
 Backend = Literal["v4l2", "ffmpeg", "gstreamer", "any"]
 Pixels = Annotated[int, msgspec.Meta(ge=16, le=20000)]
 
 
 class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="live"):
-    """A camera; what it can't do of width, height, fps and format it reports in the log and does its own way."""
+    """A camera; unsupported values of width, height, fps and format are logged, and the camera's own are used."""
 
     device: Annotated[
         int | str,
@@ -157,10 +157,10 @@ class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class LiveCamera(NewestFrame):
-    """The newest frame of a camera; while there is none it tries to connect, for ever, and says :class:`Waiting`.
+    """The newest frame of a camera; while there is none it retries forever, and ``read`` returns :class:`Waiting`.
 
-    ``stamp_ns`` is Unix time when the frame arrived here, before it was decoded.  ``seq`` counts what arrived, so
-    frames that were dropped leave gaps.  Images are BGR as OpenCV delivers them.
+    ``stamp_ns`` is the Unix time of the frame's arrival here, before decoding.  ``seq`` counts arrivals, so dropped
+    frames leave gaps.  Images are BGR as OpenCV delivers them.
     """
 
     def __init__(self, settings: LiveSettings) -> None:
@@ -168,7 +168,7 @@ class LiveCamera(NewestFrame):
 
 
 class Backoff:
-    """Pauses that double from the first to the longest; :meth:`reset` after a success."""
+    """Pauses that double from the first to the longest; call :meth:`reset` after a success."""
 
     def __init__(self, first_s: float, longest_s: float) -> None:
         self._first_s, self._longest_s = first_s, longest_s
@@ -282,15 +282,15 @@ class _CaptureReader:
 
 
 def shown_name(device: int | str) -> str:
-    """The device as people may see it: without the user and password of a URL."""
+    """The device for messages: without the user and password of a URL."""
     if isinstance(device, int):
         return f"camera {device}"
     return re.sub(r"(?<=://)[^/@\s]*@", "", device)
 
 
 def backend_number(settings: LiveSettings) -> int:
-    """OpenCV's number of the backend that opens the device; SourceError for a device of no known form and
-    for a backend that isn't there.
+    """OpenCV's number of the backend that opens the device; SourceError for a device of unknown form and
+    for a missing backend.
     """
     import cv2
 

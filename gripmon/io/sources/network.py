@@ -41,7 +41,7 @@ Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
 class NetworkSettings(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="zenoh"
 ):
-    """A camera whose driver publishes its frames; ``docs/howto/network_camera.md`` says what it has to send."""
+    """A camera whose driver publishes its frames; ``docs/howto/network_camera.md`` describes the protocol."""
 
     key: (
         Annotated[
@@ -71,7 +71,7 @@ class NetworkSettings(
 
 
 class Content(NamedTuple):
-    """What is in a payload; ``stamp_ns`` None where it is not known when it was captured."""
+    """A decoded payload; ``stamp_ns`` None if the capture time is unknown."""
 
     image: Image
     stamp_ns: int | None
@@ -79,7 +79,7 @@ class Content(NamedTuple):
 
 
 class PayloadDecoder:
-    """Payloads of one camera -> images.  A pure function of what it gets: no clock, no state."""
+    """Payloads of one camera -> images.  A pure function of its input: no clock, no state."""
 
     def __init__(self, frame_format: Format, size_px: tuple[int, int]) -> None:
         """``size_px`` is (width, height) of every image.  Raises SourceError where ROS 2 isn't installed."""
@@ -143,15 +143,15 @@ class _Arrival(NamedTuple):
 
 
 class NetworkCamera:
-    """The newest frame that a driver published; what comes before it was asked for is counted as dropped.
+    """The newest frame that a driver published; older ones that were not read are counted as dropped.
 
     Zenoh's thread only puts each sample into a slot for one; it is decoded in :meth:`read`, in the caller's thread, so
-    what is dropped costs nothing.  ``seq`` counts what arrived, without malformed payloads.
+    dropped frames cost nothing.  ``seq`` counts arrivals, without malformed payloads.
 
-    A malformed payload is counted, said once, and passed over as long as good ones come.  Where nothing else comes,
-    ``read`` gives a frame with its fault after ``READ_TIMEOUT_S``, as of a camera that delivers rubbish.
+    A malformed payload is counted, logged once, and ignored as long as good ones come.  If only malformed ones come,
+    ``read`` returns a frame with the fault after ``READ_TIMEOUT_S``.
 
-    ``stamp_ns`` is what the driver says, else Zenoh's time stamp, else when it arrived here.
+    ``stamp_ns`` is the driver's stamp, else Zenoh's time stamp, else the arrival here.
     """
 
     live = True
@@ -167,7 +167,7 @@ class NetworkCamera:
         self._slot: _Arrival | None = None
         self._closed = False
         self._dropped = self._dropped_before = self._handed_over = 0
-        self._newest: tuple[float, int] | None = None  # of the good ones: monotonic time of arrival, stamp
+        self._newest: tuple[float, int] | None = None  # of good payloads: monotonic time of arrival, stamp
         self._last_arrival_s: float | None = None
         self._clock_fault = ""
         self._lateness = Lateness()
@@ -185,11 +185,11 @@ class NetworkCamera:
 
     @property
     def malformed(self) -> int:
-        """Payloads so far that were no frame of this camera."""
+        """Number of payloads so far that were not a frame of this camera."""
         return self._malformed.count
 
     def fault(self) -> str:
-        """What is wrong with payloads or stamps, in a few words for a person; empty if nothing is."""
+        """What is wrong with payloads or stamps, in a few words for people; empty if nothing is."""
         return "; ".join(fault for fault in (self._malformed.fault(), self._clock_fault) if fault)
 
     def read(self) -> Frame | Waiting | None:
@@ -246,7 +246,7 @@ class NetworkCamera:
             self._changed.notify_all()
 
     def _take(self, deadline_s: float) -> _Arrival | None:
-        """What has arrived, or arrives until the deadline."""
+        """The next sample that has arrived, or arrives until the deadline."""
         with self._changed:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0.0:  # payloads without end may all be malformed
@@ -287,7 +287,7 @@ class NetworkCamera:
         return seq
 
     def _stamp_now_ns(self) -> int:
-        """Now, on the camera's clock: a bad payload tells no time, and another clock's would look like a jump."""
+        """Now, on the camera's clock: a bad payload has no time, and another clock's would look like a jump."""
         if self._newest is None:
             return time.time_ns()
         arrival_s, stamp_ns = self._newest
@@ -300,9 +300,9 @@ class NetworkCamera:
 
 
 def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:
-    """By how much a driver's stamp is off, in words that hardly ever change; empty if it may be right.
+    """By how much a driver's stamp is off, in coarse words that rarely change; empty if it may be right.
 
-    Controllers reckon a transform's age from it.
+    Controllers compute a transform's age from it.
     """
     late_s = 1e-9 * (unix_ns - stamp_ns)
     for limit_s, words in (
@@ -337,19 +337,19 @@ def network_key(settings: NetworkSettings, image_key: str) -> str:
 
 
 MOST_LATE_S = 3.0
-"""Stamps further off than this, at best, are of another time or clock: what they say of now is no use."""
+"""Stamps that are always further off than this are of another time or clock, and useless for the age."""
 
 WINDOW_S = 60.0
-"""The fastest frame of the last one to two windows is what others are held against.  Long enough to have one that did
-not wait; a driver's clock that was set is lived with after two of them."""
+"""Delays are relative to the fastest frame of the last one to two windows: long enough to contain one without delay;
+after a driver's clock was set, wrong for at most two of them."""
 
 _FAR_NS = 2**63
 
 
 class Lateness:
-    """Holds each frame's (arrival - stamp) against the smallest of late.
+    """Compares each frame's (arrival - stamp) with the smallest recent one.
 
-    What it is over that, the frame has waited for certain.  It may be more: the fastest one may have waited, too.
+    The difference is a lower bound on the frame's delay: the fastest one may have been delayed, too.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A camera driver's payload -> an image, checked before anything of it is decoded."""
+"""A camera driver's payload -> an image, checked before decoding."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
 MOST_SCANS = 100
-"""A progressive JPEG has some ten; each one costs as much as the whole image, whatever few bytes it takes."""
+"""A progressive JPEG has some ten; each one costs as much as the whole image, however few bytes it has."""
 
 
 class PayloadError(ValueError):
@@ -30,7 +30,7 @@ class WrongSizeError(PayloadError):
 
 
 def read_note(attachment: bytes | None) -> FrameNote:
-    """The attachment; an empty one where there is none.  Raises :class:`PayloadError`."""
+    """The attachment; an empty one if there is none.  Raises :class:`PayloadError`."""
     if not attachment:
         return FrameNote()
     try:
@@ -72,8 +72,8 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
 def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
     """A JPEG -> H x W, its brightness; a PNG -> H x W, or H x W x 3 (BGR); uint8, or uint16 for grey PNGs of 16 bits.
 
-    Its header is held against ``expected_px``, (width, height), before memory is taken or a pixel is decoded.  Pillow
-    does both: OpenCV has no way to the header alone, and writes what it thinks of a damaged file to stderr.  Raises
+    Its header is compared with ``expected_px``, (width, height), before memory is allocated or a pixel decoded.  This
+    uses Pillow, because OpenCV can't read only the header, and writes warnings about damaged files to stderr.  Raises
     :class:`PayloadError`.
     """
     try:
@@ -95,7 +95,7 @@ def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
 
 
 def _open_file(payload: bytes) -> ImageFile:
-    """Reads the header.  These two classes alone: Pillow's general ``open`` would try all formats."""
+    """Reads the header.  Only these two classes: Pillow's general ``open`` would try all formats."""
     jpeg, png = _pillow()
     return png(io.BytesIO(payload)) if payload.startswith(PNG) else jpeg(io.BytesIO(payload))
 
@@ -105,7 +105,7 @@ def _pillow() -> tuple[type[ImageFile], type[ImageFile]]:
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
 
-    # Damaged metadata, which is not read here, would be a line on stderr for every frame.
+    # Damaged metadata, which is not read here, would give a line on stderr for every frame.
     warnings.filterwarnings("ignore", module=r"PIL\.")
     return JpegImageFile, PngImageFile
 
@@ -119,7 +119,7 @@ def _check_png(payload: bytes) -> None:
 
 
 def _array_of(file: ImageFile) -> Image:
-    # Brightness alone is measured, and a JPEG holds it by itself: a fifth of the time of its colours.
+    # Only brightness is measured, and a JPEG stores it separately: a fifth of the time for its colours.
     file.draft("L", file.size)
     if file.mode in ("L", "I;16"):
         return np.asarray(file, dtype=np.uint8 if file.mode == "L" else np.uint16)

@@ -27,7 +27,7 @@ _SLOTS = 12  # a frame stays readable for at least 12 - MOST_PROCESSES frame per
 MOST_PROCESSES = 4
 _WRITING = -1
 _END_WITHIN_S = 0.5
-_SLEEP_S = 0.05  # longest sleep of a renderer without a look whether it should end
+_SLEEP_S = 0.05  # longest sleep of a renderer without checking whether it should end
 _START_WITHIN_S = 60.0
 
 
@@ -40,10 +40,10 @@ class FrameMaker(Protocol):
 class SimulatedCamera:
     """A live camera whose frame i is due at ``start + i / fps``.
 
-    The content of a frame depends on ``seq`` alone, ``stamp_ns`` is the Unix time when it was due.  Where rendering
-    can't keep up, frames are left out, as a camera would not wait either.  Several processes take turns, so one of them
-    may take as many frame periods for a frame as there are processes.  Images come through shared memory: in this
-    process a frame costs one copy and no thread, so the caller keeps the interpreter lock for itself.
+    A frame's content depends only on ``seq``; ``stamp_ns`` is the Unix time when it was due.  If rendering can't keep
+    up, frames are skipped, since a camera would not wait either.  Several processes take turns, so each may take as
+    many frame periods for a frame as there are processes.  Images come through shared memory: in this process a frame
+    costs one copy and no thread, so the caller keeps the interpreter lock for itself.
 
     Construction waits until the renderers are ready, and raises :class:`SourceError` when they can't be.
     """
@@ -124,7 +124,7 @@ class SimulatedCamera:
                 renderer.announcements.close()
 
     def _newest(self) -> _Announcement | None:
-        """The newest of all announcements that have arrived; RuntimeError if a renderer ended before its time."""
+        """The newest announcement that has arrived; RuntimeError if a renderer ended early."""
         newest: _Announcement | None = None
         for renderer in tuple(self._running):
             try:
@@ -171,7 +171,7 @@ class _Schedule(NamedTuple):
     end: int | None
 
     def following(self, index: int, elapsed_s: float) -> int:
-        """The next own frame, without those whose time is over."""
+        """The next own frame, without those that are overdue."""
         late = int(elapsed_s * self.fps) - index - self.step
         return index + self.step * (1 + max(-(-late // self.step), 0))
 
@@ -251,7 +251,7 @@ class _Ring:
 
 
 def _start_deaf_to_signals(process: Any) -> None:
-    """Ctrl-C reaches the whole process group, but a renderer has to end when its parent says so, not before."""
+    """Ctrl-C reaches the whole process group, but only the parent may end a renderer."""
     resource_tracker.ensure_running()  # starting it later would undo the mask
     former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
@@ -291,7 +291,7 @@ def _deliver(
     while schedule.end is None or index < schedule.end:
         if _sleep_until(start_s + index / schedule.fps, commands):
             return
-        # A full pipe: it was not read for long.  This frame counts as dropped, like the older ones that it overwrote.
+        # A full pipe: it is not being read.  This frame counts as dropped, like the older ones that it overwrote.
         with contextlib.suppress(BlockingIOError):
             announce.send(_Announcement(index, start_ns + round(index * NS_PER_S / schedule.fps), opening_m))
         index = schedule.following(index, time.monotonic() - start_s)

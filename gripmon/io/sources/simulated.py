@@ -1,4 +1,4 @@
-"""A simulated wrist camera: in real time from a process of its own, or as a sequence as fast as it is asked for."""
+"""A simulated wrist camera: in real time from its own process, or as a sequence as fast as it is read."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SimulatedSettings(
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """What the simulator needs beside its settings: ``cam_T_grip`` (4, 4) is the calibration before any disturbance."""
+    """The simulator's input besides its settings: ``cam_T_grip`` (4, 4) is the calibration before any disturbance."""
 
     camera: Camera
     gripper: Gripper
@@ -60,7 +60,7 @@ class SimulatedScene:
 
 
 def make_simulator(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Simulator:
-    """The simulator of these settings, which also knows the truth; SourceError if they don't fit the scene."""
+    """The simulator for these settings, which also has the truth; SourceError if they don't fit the scene."""
     from gripmon.simulate import Simulator
 
     scenario = _load_scenario(settings, relative_to)
@@ -90,7 +90,7 @@ def _load_scenario(settings: SimulatedSettings, relative_to: Path) -> Scenario:
 
 
 class SimulatedSequence(Stored):
-    """Every frame of a scenario in order, rendered when it is asked for; stamps are the scenario's."""
+    """Every frame of a scenario in order, rendered when it is read; stamps are the scenario's."""
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
@@ -112,7 +112,7 @@ class SimulatedSequence(Stored):
 
 
 def open_simulated(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Source:
-    """The simulated camera, live or as a sequence, as the settings say."""
+    """The simulated camera, live or as a sequence, depending on the settings."""
     simulator = make_simulator(settings, scene, relative_to)
     if not settings.realtime:
         return SimulatedSequence(simulator)

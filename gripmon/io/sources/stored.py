@@ -1,4 +1,4 @@
-"""Files of recorded episodes, on this machine or in an object store: what the sources and the search for them share."""
+"""Files of recorded episodes, on this machine or in an object store: shared by the sources and the search for them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXTRA = "pip install -e '.[datasets]' in gripmon's checkout"
 
 
 def file_system(path: str) -> tuple[AbstractFileSystem, str]:
-    """What reads a path or URL (``s3://bucket/…``), and the path as that takes it.  Credentials are those that the
+    """The file system for a path or URL (``s3://bucket/…``), and the path in it.  Credentials are those that the
     store's own library finds.  Raises :class:`SourceError` without the libraries.
     """
     try:
@@ -53,7 +53,7 @@ def opened(path: str) -> IO[bytes]:
 
 
 def there(path: str) -> bool:
-    """Whether a file or folder is; False for what can't be asked, too."""
+    """Whether a file or folder exists; False also if that can't be determined."""
     if "://" not in path:
         return Path(path).exists()
     try:
@@ -77,8 +77,8 @@ def needed(package: str) -> Any:
 
 
 def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int) -> float:
-    """The opening (m) at a time, of reports (n,) in order of time: :func:`opening_between` two; beyond the first
-    and last one nothing is made up: as they say.
+    """The opening (m) at a time, from reports (n,) in order of time: :func:`opening_between` two; before the first
+    and after the last report their value holds.
     """
     after = int(np.searchsorted(stamps_ns, wanted_ns))
     if after in (0, len(stamps_ns)):
@@ -88,7 +88,7 @@ def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int)
 
 
 def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
-    """The image in a JPEG's or PNG's bytes, its brightness alone (that is all that is measured); or why there is
+    """The image in a JPEG's or PNG's bytes, only its brightness (nothing else is measured); or why there is
     none.
     """
     import cv2
@@ -101,7 +101,7 @@ def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
 
 
 class VideoDecoder:
-    """Pictures out of packets of an elementary stream, in grey levels; one thread, so that nothing else waits."""
+    """Pictures from packets of an elementary stream, in grey levels; in one thread, so that nothing else waits."""
 
     CODECS: ClassVar = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "av1"}
 

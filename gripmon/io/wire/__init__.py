@@ -1,5 +1,5 @@
-"""The one Zenoh session of a process, its settings, and the names of the keys: what everyone who talks to the network
-shares.
+"""The one Zenoh session of a process, its settings, and the names of the keys: shared by everything on the
+network.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A small private certificate authority, for mutual TLS between the programs of one site.
 
-An example that is sound by itself, not a replacement for the authority that a company may already have: any one whose
-certificates carry the common names of the access rules does.
+A sound example, not a replacement for a company's existing authority: any authority works whose certificates have the
+common names of the access rules.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 _CA_DAYS = 3650
 _DAYS = 825
-_EARLIER = datetime.timedelta(hours=1)  # a clock that is behind
+_EARLIER = datetime.timedelta(hours=1)  # for clocks that are behind
 
 
 class Authority:
-    """The authority whose key and certificate lie in a folder; made there if there is none."""
+    """The authority whose key and certificate are in a folder; created there if there is none."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises OSError for a folder that can't be written to, ValueError for files that are no authority."""
+        """Raises OSError for a folder that can't be written to, ValueError for files that aren't an authority's."""
         self._folder = folder
         key_path, path = folder / "ca-key.pem", folder / "ca.pem"
         self.is_new = _is_missing(path, key_path)
@@ -49,10 +49,10 @@ class Authority:
             self._key = key
 
     def issue(self, name: str, hosts: Sequence[str] = ()) -> bool:
-        """``<name>.pem`` and ``<name>-key.pem`` (mode 0600) with the common name ``name``; False if they are there.
-        Raises ValueError if one of them is.
+        """Make ``<name>.pem`` and ``<name>-key.pem`` (mode 0600) with the common name ``name``; False if they exist.
+        Raises ValueError if only one of them exists.
 
-        With ``hosts``, names or addresses by which it is reached, it may also be used by a server.
+        With ``hosts``, names or addresses at which it is reached, it may also be used by a server.
         """
         key_path, path = self._folder / f"{name}-key.pem", self._folder / f"{name}.pem"
         if not _is_missing(path, key_path):
@@ -67,7 +67,7 @@ class Authority:
 
 @dataclass(frozen=True)
 class Issued:
-    """What a certificate says of its holder: common name, whether a server may show it, and under which hosts."""
+    """A certificate's content: common name, whether a server may use it, and for which hosts."""
 
     name: str
     serves: bool
@@ -75,7 +75,7 @@ class Issued:
 
 
 def read(path: Path) -> Issued:
-    """What is in a certificate.  Raises ValueError for a file that is none, OSError for one that can't be read."""
+    """Read a certificate.  Raises ValueError for a file that isn't one, OSError for one that can't be read."""
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
         names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
@@ -93,7 +93,7 @@ def read(path: Path) -> Issued:
 
 
 def _is_missing(certificate: Path, key: Path) -> bool:
-    """Whether neither is there.  Raises ValueError if only one of them is."""
+    """Whether neither exists.  Raises ValueError if only one of them does."""
     there = [path for path in (certificate, key) if path.exists()]
     if len(there) == 1:
         missing = key if there[0] == certificate else certificate
@@ -118,7 +118,7 @@ def _builder(
     )
     if ca:
         return builder
-    # A name for everyone, since some implementations refuse a certificate without; that it may serve is said apart.
+    # Every certificate has a name, since some implementations require one; another extension allows serving.
     alternatives = [_alternative(host) for host in hosts] or [x509.DNSName(f"{name}.invalid")]
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     return builder.add_extension(x509.SubjectAlternativeName(alternatives), critical=False).add_extension(
@@ -164,7 +164,7 @@ def _private_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, *, secret: bool = False) -> None:
-    """A new file; never over one that is there, and a secret is never readable by others, not even for a moment."""
+    """Write a new file; never replaces one, and a secret is never readable by others, not even for a moment."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if secret else 0o644)
     with os.fdopen(descriptor, "wb") as file:
         file.write(data)

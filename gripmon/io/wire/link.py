@@ -1,4 +1,4 @@
-"""A session that may open later, with those who wait for it; a router in this process; messages that were malformed."""
+"""A session that may open later, with its waiting users; a router in this process; malformed messages."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _LOOK_EVERY_S = 1.0
 class Link:
     """The process's session.
 
-    It is open when the constructor returns, except for a client: its router may come later, so it is opened in a thread
-    that tries again with growing pauses.
+    It is open when the constructor returns, except for a client: its router may start later, so it is opened in a
+    thread that retries with growing pauses.
     """
 
     def __init__(self, settings: PublishSettings, relative_to: Path = Path()) -> None:
-        """``relative_to`` is the folder of the configuration file, from which a path in the settings counts.
+        """``relative_to`` is the folder of the configuration file, to which a path in the settings is relative.
 
         Raises :class:`PublishError` for a configuration that can't work or an address that is already taken.
         """
@@ -68,13 +68,13 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """Is there a session?  False only for a client that has not found its router yet."""
+        """Whether there is a session; False only for a client that has not found its router yet."""
         return self._session is not None
 
     def fault(self) -> str:
-        """Whom there is no connection to, in a few words for a person; empty if all is well.
+        """Which connections are missing, in a few words for people; empty if none.
 
-        It may be asked all the time: once a second it looks.  A client needs one connection, a peer one to each
+        It may be called at any rate: it checks once a second.  A client needs one connection, a peer one to each
         endpoint that it is to connect to.
         """
         session, now_s = self._session, time.monotonic()
@@ -84,14 +84,14 @@ class Link:
         return self._fault
 
     def unconnected(self) -> str:
-        """The same as of this moment: for a start, which waits for it."""
+        """The same, checked now: for the start, which waits for it."""
         self._next_look_s = 0.0
         return self.fault()
 
     def attach(self, declare: Callable[[zenoh.Session], None], leave: Callable[[], None] | None = None) -> None:
         """Call ``declare`` with the session: now, or in another thread when it opens; ``leave`` before it is closed.
 
-        What is attached first is declared first and leaves last.
+        The first one attached is declared first and leaves last.
         """
         with self._lock:
             self._leave += [] if leave is None else [leave]
@@ -101,7 +101,7 @@ class Link:
                 declare(self._session)
 
     def close(self) -> None:
-        """Tell everyone attached, close the session and free its port.  Calling it twice does nothing more."""
+        """Call all ``leave``, close the session and free its port.  Calling it twice does nothing more."""
         import zenoh
 
         self._closing.set()
@@ -117,7 +117,7 @@ class Link:
         if session is not None:
             try:
                 session.close()
-            except zenoh.ZError as error:  # someone who was stopped holds up what is being sent
+            except zenoh.ZError as error:  # a stopped process blocks what is being sent
                 _log.warning("the Zenoh session could not be closed in order: %s", in_short(error))
 
     def _look(self, session: zenoh.Session) -> None:
@@ -128,7 +128,7 @@ class Link:
             _log.log(logging.WARNING if fault else logging.INFO, "Zenoh: %s", fault or "connected")
 
     def _adopt(self, session: zenoh.Session) -> bool:
-        """Let everyone declare what they have; False if it came too late."""
+        """Let all attached users declare; False if it came too late."""
         with self._lock:
             if self._closing.is_set():
                 return False
@@ -164,7 +164,7 @@ class Link:
 
 
 def in_zenohs_thread(take: Callable[[_T], None]) -> zenoh.handlers.Callback[_T]:
-    """A callback in Zenoh's own threads: one of Python's would keep a process that forgot ``close()`` from ending."""
+    """A callback in Zenoh's own threads: a Python thread would keep a process without ``close()`` from ending."""
     import zenoh
 
     return zenoh.handlers.Callback(take, indirect=False)
@@ -176,9 +176,9 @@ _NUMERIC = re.compile(r"[\d.]+|\[[0-9a-fA-F:.%]+\]")
 
 
 def missing(session: zenoh.Session, endpoints: Iterable[str], *, one_is_enough: bool) -> str:
-    """Whom of these the session has no link to, in words; empty if that is as it should be.
+    """The endpoints to which the session has no link, in words; empty if none is missing.
 
-    Takes some microseconds: the session only looks at what it knows.
+    Takes some microseconds, without any network traffic.
     """
     far_ends = [link.dst for link in session.info.links()]
     if one_is_enough:
@@ -187,7 +187,7 @@ def missing(session: zenoh.Session, endpoints: Iterable[str], *, one_is_enough: 
 
 
 def is_at(locator: str, endpoint: str) -> bool:
-    """Can a link's far end be what this endpoint names?  A host's name isn't looked up: its port is enough."""
+    """Whether a link's far end may be this endpoint.  A host's name isn't resolved: its port is enough."""
     far, named = _LOCATOR.match(locator), _LOCATOR.match(endpoint)
     if far is None or named is None or far["protocol"] != named["protocol"]:
         return False
@@ -203,7 +203,7 @@ class Router:
     """Routes from construction to :meth:`close`."""
 
     def __init__(self, path: Path) -> None:
-        """``path``: a json5 or yaml file of Zenoh's.  Raises :class:`ZenohFileError`."""
+        """``path``: a Zenoh configuration, json5 or yaml.  Raises :class:`ZenohFileError`."""
         import zenoh
 
         config = load_file(path, default_mode="router")
@@ -231,7 +231,7 @@ class Router:
         self.close()
 
     def fault(self) -> str:
-        """Whom it should be connected to and isn't, in a few words for a person; empty if all is well."""
+        """Which connections are missing, in a few words for people; empty if none."""
         places = missing(self._session, self._connects_to, one_is_enough=False)
         return f"no connection to {places}, trying again" if places else ""
 
@@ -247,13 +247,13 @@ def _endpoints(listed: object) -> tuple[str, ...]:
 
 
 REMEMBERED_S = 60.0
-"""So long after the last one it is still said; one that comes later is a new occasion."""
+"""Time after the last malformed payload during which it is reported; a later one is a new occasion (s)."""
 
 CALM_S = 3.0
-"""Good ones for so long, and nothing else: it is no longer said."""
+"""Time with only good payloads after which malformed ones are no longer reported (s)."""
 
 _LONGEST_REASON = 200
-_MOST_KINDS = 8  # of reasons; a stranger may make up any number
+_MOST_KINDS = 8  # of reasons; a sender may cause any number
 _OTHERS = "any other"
 FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 
@@ -261,31 +261,30 @@ FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 class Malformed:
     """Counts the payloads on a key that could not be used.
 
-    An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is silent sooner, when good ones have
-    come for :data:`CALM_S`, and what comes after such a calm counts from one.  The log gets one line an occasion for
-    each of the first few kinds of reasons, and the words of :meth:`fault`, with the most frequent reason, change only
-    when the count passes a power of ten, so that no one can fill a log, or keep the network busy, by sending rubbish.
-    Any thread may call.
+    An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is empty sooner, when only good ones
+    have come for :data:`CALM_S`, and the count then starts again.  The log gets one line per occasion for each of the
+    first few kinds of reasons, and the text of :meth:`fault`, with the most frequent reason, changes only when the
+    count passes a power of ten, so that malformed payloads can't fill a log or load the network.  Thread-safe.
     """
 
     def __init__(self, what: str, key: str) -> None:
-        """``what`` has been sent, in the singular: ``frame``."""
+        """``what``: name of the payload, in the singular: ``frame``."""
         self._what, self._key = what, key
         self._lock = threading.Lock()
         self._count = self._here = 0
         self._reason = ""
-        self._kinds: Counter[str] = Counter()  # since the last calm: of reasons without their figures
+        self._kinds: Counter[str] = Counter()  # reasons without figures, since the last calm
         self._examples: dict[str, str] = {}
-        self._logged: set[str] = set()  # kinds, of this occasion
+        self._logged: set[str] = set()  # kinds logged on this occasion
         self._last_s = self._good_s = 0.0
 
     @property
     def count(self) -> int:
-        """All of them."""
+        """Number of malformed payloads so far."""
         return self._count
 
     def add(self, reason: str) -> None:
-        """One more; ``reason`` may hold what a stranger sent."""
+        """Count a malformed payload; ``reason`` may contain data from the sender."""
         now_s = time.monotonic()
         with self._lock:
             if now_s - self._last_s > REMEMBERED_S:
@@ -308,7 +307,7 @@ class Malformed:
             _log.warning("%s (said once)", said)
 
     def _kind(self, reason: str) -> str:
-        """What is counted together: the reason without figures; the rest, where there are too many."""
+        """The kind of a reason: its text without figures, or "any other" if there are too many kinds."""
         text = _for_people(reason)
         kind = FIGURES.sub("", text)
         if kind not in self._examples and len(self._examples) >= _MOST_KINDS:
@@ -320,11 +319,11 @@ class Malformed:
         return now_s - self._last_s > REMEMBERED_S or self._good_s - self._last_s > CALM_S
 
     def good(self) -> None:
-        """One came that could be used."""
+        """Note a good payload."""
         self._good_s = time.monotonic()
 
     def fault(self) -> str:
-        """How many since the last calm, roughly, and the most frequent reason, for a person; empty if it is over."""
+        """The rough number since the last calm, and the most frequent reason, for people; empty if it is over."""
         with self._lock:
             if self._here == 0 or self._is_over(time.monotonic()):
                 return ""
@@ -339,6 +338,6 @@ def _roughly(count: int) -> str:
 
 
 def _for_people(reason: str) -> str:
-    """One line of a bounded length that can't play tricks on a terminal."""
+    """One line of bounded length, without control characters for a terminal."""
     line = " ".join(reason[: 2 * _LONGEST_REASON].split())
     return "".join(c if c.isprintable() else "?" for c in line[:_LONGEST_REASON])

@@ -1,4 +1,4 @@
-"""Rules of a router's file for one more robot: its own certificates speak for it, and for no other one."""
+"""Access rules in a router's file for another robot, whose certificates are valid for it alone."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def names_of(robot: str) -> tuple[str, str]:
 
 
 def wanted_names(names: Sequence[str], robots: Sequence[str], hosts: Sequence[str]) -> dict[str, list[str]]:
-    """The common names for which there shall be certificates, each with the hosts at which it is reached: ``names`` or
-    else those of the shipped rules, and two of each robot.  ValueError as :func:`names_of`.
+    """The common names that need certificates, each with the hosts at which it is reached: ``names`` or else those of
+    the shipped rules, and two for each robot.  ValueError as :func:`names_of`.
     """
     of_robots = [name for robot in robots for name in names_of(robot)]
     if names:
@@ -36,7 +36,7 @@ def wanted_names(names: Sequence[str], robots: Sequence[str], hosts: Sequence[st
 
 
 def add_robots(path: Path, robots: Sequence[str]) -> bool:
-    """Put the robots' rules into a router's file; False if it has them already.  ValueError as :func:`with_robot`,
+    """Add the robots' rules to a router's file; False if it has them already.  ValueError as :func:`with_robot`,
     OSError for a file that can't be read or written.
     """
     before = text = path.read_text(encoding="utf-8")
@@ -48,9 +48,9 @@ def add_robots(path: Path, robots: Sequence[str]) -> bool:
 
 
 def with_robot(text: str, robot: str) -> str:
-    """A router's file, json5, with the rules for this robot, too; the same text if it has them.
+    """The text of a router's file, json5, with the rules for this robot added; the same text if it has them.
 
-    They are put before the lines ``// robots: rules``, ``subjects`` and ``policies`` of the shipped files.  Raises
+    They are inserted before the lines ``// robots: rules``, ``subjects`` and ``policies`` of the shipped files.  Raises
     ValueError for a file without these.
     """
     monitor, driver = names_of(robot)

@@ -1,5 +1,5 @@
-"""From settings to an open Zenoh session, with errors that name the key; the keys' names, and a clock that readers may
-compare with.
+"""From settings to an open Zenoh session, with errors that name the key; the names of the keys, and a clock for
+bounding a message's age.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     import zenoh
 
 _SEND_BUFFER_BYTES = 8192
-"""Linux takes twice this, with its own overhead: three or four transforms of 2.7 kB.  Half of it would be less than
-two, so that each waits for the far end's word that it has the one before.
+"""Linux allocates twice this, including its overhead: three or four transforms of 2.7 kB.  With half of it, fewer than
+two, each transform would wait for the acknowledgement of the previous one.
 """
 
 
 def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh.Config:
-    """Zenoh's own configuration for these settings; a path in them counts from ``relative_to``.
+    """Zenoh's own configuration for these settings; a path in them is relative to ``relative_to``.
 
     Raises :class:`PublishError`.
     """
@@ -57,22 +57,22 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         "listen/endpoints": listen,
         "listen/exit_on_failure": True,
         "connect/endpoints": settings.connect,
-        # Also when a router restarts: Zenoh's own pauses, up to 4 s, would be several seconds without a transform.
+        # Also when a router restarts: Zenoh's default pauses, up to 4 s, would mean seconds without a transform.
         "connect/retry": {
             "period_init_ms": math.ceil(1e3 * settings.retry_first_s),
             "period_max_ms": math.ceil(1e3 * settings.retry_longest_s),
             "period_increase_factor": 2,
         },
         "scouting/multicast/enabled": settings.multicast_scouting,
-        # Someone's endless message must not fill the memory; an image of 20 megapixels passes.
+        # An endless message must not fill the memory; an image of 20 megapixels passes.
         "transport/link/rx/max_message_size": 64 << 20,
         # Images gain by shared memory; transforms, 3 KiB, don't, and each sender costs its reader a pool of 16 MiB.
         "transport/shared_memory/transport_optimization/message_size_threshold": 64 << 10,
-        # Where a link can't carry the rate, what waits here makes every transform old: a few messages and not
-        # megabytes, the rest is dropped.  On loopback it costs no latency; a snapshot of 10 MB still takes 0.1 s.
+        # On a link that can't carry the rate, queued data makes every transform old: keep a few messages, not
+        # megabytes, and drop the rest.  On loopback it costs no latency; a snapshot of 10 MB still takes 0.1 s.
         "transport/link/tcp/so_sndbuf": _SEND_BUFFER_BYTES,
         "transport/link/tls/so_sndbuf": _SEND_BUFFER_BYTES,
-        # An endpoint that takes the connection and says nothing: closing waits for the attempt under way.
+        # For an endpoint that accepts the connection and stays silent: closing waits for the pending attempt.
         "transport/unicast/open_timeout": 3000,
     }
     for key, value in entries.items():
@@ -86,7 +86,7 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
 
 
 class Joining(msgspec.Struct, frozen=True):
-    """How a session would join the network: its mode, its endpoints, and the file of Zenoh's that says so, if any."""
+    """How a session would join the network: its mode, its endpoints, and the Zenoh file that defines them, if any."""
 
     mode: str
     listen: tuple[str, ...]
@@ -95,14 +95,14 @@ class Joining(msgspec.Struct, frozen=True):
 
 
 def joining(settings: PublishSettings, relative_to: Path = Path()) -> Joining:
-    """What :func:`zenoh_config` comes to, without a session.  Raises :class:`PublishError`."""
+    """The result of :func:`zenoh_config`, without a session.  Raises :class:`PublishError`."""
     config = zenoh_config(settings, relative_to)
     file = None if settings.zenoh_config is None else str(relative_to / settings.zenoh_config)
     return Joining(str(said(config, "mode")), endpoints(config, "listen"), endpoints(config, "connect"), file)
 
 
 def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:
-    """Raises :class:`PublishError` that names the key."""
+    """Open a session.  Raises :class:`PublishError` that names the key."""
     import zenoh
 
     try:
@@ -206,25 +206,25 @@ def check_name(role: str, name: str) -> str:
 
 
 def check_key(key: str) -> str:
-    """The key; raises ValueError unless it is one that can be put on: a pattern might be many monitors' keys."""
+    """The key; raises ValueError if it is invalid or a pattern, which might match several monitors' keys."""
     if not re.match(KEY_PATTERN, key):
         raise ValueError(f"key {key!r} is none; names with / between them, none empty, without * $ # ? or blanks")
     return key
 
 
 MOST_DRIFT = 1e-3
-"""Two such clocks differ by at most this share of the time that passes: 500 ppm each.  An oscillator that is further
-off is beyond what NTP can correct (``MAXFREQ`` of Linux), so that machine could not keep any time.  Quartz has some 50.
+"""Largest relative drift of two such clocks: 500 ppm each.  NTP can't correct more (``MAXFREQ`` of Linux), so such a
+machine could not keep time.  Quartz has some 50 ppm.
 """
 
 CLOCK_PARAMETER = "clock"
-"""A query for ``…/transform?clock`` asks what such a clock of the monitor shows."""
+"""A query for ``…/transform?clock`` returns a reading of the monitor's steady clock."""
 
-_CLOCK = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)  # NTP and PTP let the other one gain or lose
+_CLOCK = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)  # NTP and PTP slew the other one
 
 
 def steady_ns() -> int:
-    """Nanoseconds since some moment, the same one for all processes of a machine until it is started again."""
+    """Nanoseconds since an arbitrary time, the same for all processes of a machine until it restarts."""
     return time.clock_gettime_ns(_CLOCK)
 
 
@@ -246,8 +246,8 @@ class ZenohFileError(InputError):
 def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
     """The configuration in a json5 or yaml file.
 
-    The files that it names for TLS count from its folder.  Where it is silent, Zenoh would listen on all interfaces and
-    look for others by multicast; with gripmon it doesn't.  Raises :class:`ZenohFileError`.
+    Its TLS files are relative to its folder.  By default Zenoh would listen on all interfaces and scout by multicast;
+    with gripmon it does neither.  Raises :class:`ZenohFileError`.
     """
     import zenoh
 
@@ -276,7 +276,7 @@ def said(config: zenoh.Config, key: str) -> object:
 
 
 def _is_gripmons(path: Path) -> bool:
-    """Is it a configuration of ours, given in place of one of Zenoh's?  Only asked when Zenoh can't read it."""
+    """Whether this is a gripmon configuration given in place of Zenoh's; called only if Zenoh can't read it."""
     text = path.read_text(encoding="utf-8", errors="replace")
     return len(set(re.findall(r"^(robot|camera|gripper|reference|monitor)\s*:", text, re.MULTILINE))) > 1
 
@@ -296,7 +296,7 @@ def _find_tls_files(config: zenoh.Config, path: Path) -> None:
 
 
 def _remedy(name: str, file: Path) -> str:
-    """Where a missing certificate or key is to come from: a second authority would not help."""
+    """How to get a missing certificate or key: a second authority would not help."""
     if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
         host = " --host ADDRESS" if name.startswith("listen") else ""
         return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
@@ -339,7 +339,7 @@ def in_short(error: zenoh.ZError) -> str:
 
 
 def _unreached(ends: str) -> str:
-    """Whom there is no connection to, and what may be the reason: Zenoh says the same of all of them."""
+    """Which connections are missing, and the possible reason: Zenoh reports the same for all of them."""
     endpoints = re.findall(r"Single\((.*?)\)(?=, |$)", ends) or [ends]
     reason = "no program listens there"
     if any(endpoint.startswith(_ENCRYPTED) for endpoint in endpoints):
@@ -360,14 +360,14 @@ def endpoints(config: zenoh.Config, which: str) -> tuple[str, ...]:
     listed = said(config, f"{which}/endpoints")
     if isinstance(listed, dict):  # a list for each mode
         listed = listed.get(said(config, "mode") or "peer")
-    # Zenoh allows an object in place of a text: {"endpoints": [...], "policy": ...}; what it means, only Zenoh knows.
+    # Zenoh also allows an object here: {"endpoints": [...], "policy": ...}; only Zenoh interprets it.
     return tuple(each for each in listed if isinstance(each, str)) if isinstance(listed, list) else ()
 
 
 def endpoint_fault(endpoint: str, *, listens: bool = False) -> str:
     """What is wrong with an endpoint by itself, ``what is wrong; what would be right``; empty if nothing is.
 
-    A host's name isn't looked up, and other protocols than those of IP aren't judged.
+    A host's name isn't resolved, and only IP protocols are checked.
     """
     parts = _ADDRESS.match(endpoint)
     if parts is None or parts["protocol"] not in _WITH_PORT:

@@ -29,9 +29,9 @@ class LaserPulse(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", 
     """A pulse of the laser on the end-effector, reported by the robot's program."""
 
     stamp_ns: Annotated[
-        Stamp, Meta(description="from then on the laser was on and the hand stood still, Unix ns, the images' clock")
+        Stamp, Meta(description="from then on the laser was on and the hand stood still, Unix ns, by the images' clock")
     ]
-    until_ns: Annotated[Stamp, Meta(description="until then, likewise; it may lie in the future")]
+    until_ns: Annotated[Stamp, Meta(description="end of that time; it may be in the future")]
     base_T_ee: ArmPose
 
 
@@ -55,9 +55,11 @@ class SpotGap(msgspec.Struct, frozen=True):
     """Two of the three ways to compute a spot, and how far apart they put it."""
 
     ways: Annotated[tuple[str, str], Meta(description="which two: beam and plane, ray and plane, beam and ray")]
-    gap_m: Annotated[Vector, Meta(description="from one to the other, base frame, m")]
+    gap_m: Annotated[Vector, Meta(description="from the first result to the second, base frame, m")]
     sigma_m: Annotated[float, Meta(description="standard deviation of the distance, along the gap, m")]
-    square: Annotated[float, Meta(description="of the gap over its covariance: about freedom while nothing has moved")]
+    square: Annotated[
+        float, Meta(description="normalised square of the gap (chi-square): about freedom while nothing has moved")
+    ]
     freedom: Annotated[int, Meta(description="degrees of freedom of square")]
 
 
@@ -71,50 +73,53 @@ class CameraShift(msgspec.Struct, frozen=True):
         Meta(
             min_length=36,
             max_length=36,
-            description="6 x 6, row by row: translation (m), then rotation (rad); wide along what isn't seen",
+            description="6 x 6, row by row: translation (m), then rotation (rad); wide along unobserved directions",
         ),
     ]
-    complete: Annotated[bool, Meta(description="the pulses tell all six; else the rest is what goes with them")]
+    complete: Annotated[
+        bool, Meta(description="the pulses determine all six numbers; else the rest follow by correlation")
+    ]
     text: Annotated[str, Meta(description="the same in words")]
 
 
 class SpotRecord(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.spot/1"):
     """The result of one laser pulse."""
 
-    pulse: Annotated[int, Meta(description="counts the pulses that were told")]
-    seq: Annotated[int, Meta(description="of its last frame that was used, else of the newest; -1: none yet")]
+    pulse: Annotated[int, Meta(description="number of the reported pulse")]
+    seq: Annotated[int, Meta(description="of its last frame used, else of the newest frame; -1: none yet")]
     stamp_ns: Annotated[int, Meta(description="the pulse's, Unix ns")]
     until_ns: Annotated[int, Meta(description="the pulse's, Unix ns")]
     verdict: Annotated[Verdict, Meta(description="may the calibration of the camera be used?")]
     state: State
-    used: Annotated[bool, Meta(description="the spot was believed")]
-    fault: Annotated[PulseFault | None, Meta(description="why it was not; null if it was")]
+    used: Annotated[bool, Meta(description="the spot was accepted")]
+    fault: Annotated[PulseFault | None, Meta(description="why it was not accepted; null if it was")]
     reason: Annotated[str | None, Meta(description="the same in one line for a person")]
     base_T_ee: ArmPose
-    frames: Annotated[int, Meta(description="with the laser on, averaged")]
+    frames: Annotated[int, Meta(description="number of frames with the laser on that were averaged")]
     background: Annotated[bool, Meta(description="a frame from before the pulse was subtracted")]
-    candidates: Annotated[int, Meta(description="bright spots that were found")]
+    candidates: Annotated[int, Meta(description="number of bright spots found")]
     uv_px: Annotated[
         Pair | None, Meta(description="the spot: column and row, px; the first pixel's centre is 0; null if none")
     ]
     foreseen_px: Annotated[
-        Pair | None, Meta(description="where the calibration has it, px; null where that is not in view")
+        Pair | None, Meta(description="predicted by the calibration, px; null if that is not in view")
     ]
-    off_px: Annotated[Pair | None, Meta(description="seen less foreseen, px; null likewise")]
+    off_px: Annotated[Pair | None, Meta(description="innovation: measured less predicted, px; null if either is")]
     off_covariance_px2: Annotated[
         tuple[float, float, float, float] | None,
-        Meta(description="2 x 2, row by row, of calibration, spot and arm, px²; null with off_px"),
+        Meta(description="of off_px, 2 x 2, row by row, by calibration, spot and arm, px²; null with off_px"),
     ]
     square: Annotated[
-        float | None, Meta(description="of off_px over its covariance: about 2 while nothing has moved; null with it")
+        float | None,
+        Meta(description="normalised innovation squared (chi-square): about 2 while nothing has moved; null with it"),
     ]
     gaps: Annotated[tuple[SpotGap, ...], Meta(description="how far the three ways to the spot disagree")]
     probability_moved: Annotated[float, Meta(description="that camera, plane or laser pointer has moved, 0 to 1")]
-    shift: Annotated[CameraShift | None, Meta(description="of the camera; null where nothing is known of one")]
-    reference_id: Annotated[str, Meta(description="the laser calibration that it is judged against")]
+    shift: Annotated[CameraShift | None, Meta(description="motion of the camera; null if none is likely")]
+    reference_id: Annotated[str, Meta(description="the laser calibration that is monitored")]
     revision: Annotated[int, Meta(description="of that; 0")]
-    alerts: Annotated[tuple[Alert, ...], Meta(description="what this pulse raised, updated or cleared")]
-    latency_ns: Annotated[int, Meta(description="from when its frames were complete to when it was judged, ns")] = 0
+    alerts: Annotated[tuple[Alert, ...], Meta(description="raised, updated or cleared by this pulse")]
+    latency_ns: Annotated[int, Meta(description="processing time once its frames are complete, ns")] = 0
     monitor_id: Annotated[
         str, Meta(description="of this start of the monitor; empty in a replay, and from a monitor before ids")
     ] = ""

@@ -17,7 +17,7 @@ class LookVersion(msgspec.Struct, frozen=True):
     origin: Annotated[str, Meta(description="start, or what made it a new one")]
     reference_id: Annotated[str, Meta(description="the reference in force when it began")]
     revision: Annotated[int, Meta(description="of that reference")]
-    first_stamp_ns: Annotated[int, Meta(description="of the first frame that it was learnt from, Unix ns")]
+    first_stamp_ns: Annotated[int, Meta(description="of the first frame that it was learned from, Unix ns")]
     last_stamp_ns: Annotated[int, Meta(description="of the newest one, Unix ns")]
 
 
@@ -25,10 +25,10 @@ class LookNote(msgspec.Struct, frozen=True):
     """The look that an alert is about: a picture of it, without the image."""
 
     version: LookVersion
-    views: Annotated[int, Meta(description="frames with another background that it was learnt from")]
+    views: Annotated[int, Meta(description="frames with another background that it was learned from")]
     block_px: Annotated[int, Meta(description="side of a block of pixels, px")]
     places_px: Annotated[tuple[tuple[int, int], ...], Meta(description="middle of each block in the frame's image")]
-    different: Annotated[tuple[int, ...], Meta(description="which of them, from 0, look otherwise than at first")]
+    different: Annotated[tuple[int, ...], Meta(description="which of them, from 0, look different than at first")]
 
 
 class LookPixels(msgspec.Struct, frozen=True):
@@ -36,13 +36,13 @@ class LookPixels(msgspec.Struct, frozen=True):
 
     cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when the blocks were chosen")]
     jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
-    views: Annotated[int, Meta(ge=1, description="frames with another background that they were learnt from")]
+    views: Annotated[int, Meta(ge=1, description="frames with another background that they were learned from")]
     blocks: Annotated[bytes, Meta(description="uint16 (p, 3): column and row of the first pixel, number of the finger")]
     mean: Annotated[bytes, Meta(description="float32 (p, 64): mean of each pixel, steps of 8 bits")]
-    variance: Annotated[bytes, Meta(description="float32 (p, 64): about it")]
+    variance: Annotated[bytes, Meta(description="float32 (p, 64): of each pixel about its mean")]
     first: Annotated[bytes, Meta(description="float32 (p, 64): mean when the version began; NaN: not known yet")]
     count: Annotated[bytes, Meta(description="float32 (p,): frames behind each block, of those kept")]
-    unlike: Annotated[bytes, Meta(description="uint16 (p,): frames in a row in which it looked otherwise")]
+    unlike: Annotated[bytes, Meta(description="uint16 (p,): frames in a row in which it looked different")]
 
 
 class LookBias(msgspec.Struct, frozen=True):
@@ -61,7 +61,7 @@ class LookBias(msgspec.Struct, frozen=True):
 class FinerLookRecord(msgspec.Struct, frozen=True):
     """The look as a measurement."""
 
-    edges: Annotated[str, Meta(description="digest of the taught edges that its bias was learnt against; empty: none")]
+    edges: Annotated[str, Meta(description="digest of the taught edges that its bias was learned against; empty: none")]
     version: LookVersion
     pixels: LookPixels
     bias: LookBias | None
@@ -85,12 +85,12 @@ class StripsRecord(msgspec.Struct, frozen=True):
 class LookRecord(msgspec.Struct, frozen=True):
     """Learned texture of the fingers; bytes are little-endian and base64 in JSON."""
 
-    camera: Annotated[str, Meta(description="digest of the camera model that it was learnt with")]
+    camera: Annotated[str, Meta(description="digest of the camera model that it was learned with")]
     gripper: Annotated[str, Meta(description="digest of the gripper file")]
     reference_id: Annotated[str, Meta(description="the reference that was in force")]
     cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when its pixels were chosen")]
     jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
-    views: Annotated[int, Meta(description="frames with a new background that it was learnt from")]
+    views: Annotated[int, Meta(description="frames with a new background that it was learned from")]
     mean: Annotated[bytes, Meta(description="float16 (n, 16): mean texture of each patch")]
     weight: Annotated[bytes, Meta(description="float32 (n,): frames behind each mean, old ones forgotten")]
     hit: Annotated[bytes, Meta(description="float16 (n,): share of frames in which a patch agreed where it was")]
