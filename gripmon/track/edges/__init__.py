@@ -6,6 +6,7 @@ from gripmon.track.edges.ends import (
     edges_at_ends,
     has_lone_end,
     inner_edges,
+    sides,
 )
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers, edge_residuals_px
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
@@ -41,6 +42,7 @@ __all__ = [
     "has_lone_end",
     "inner_edges",
     "prior_information",
+    "sides",
     "trace_of",
     "warm_up",
 ]

@@ -168,8 +168,8 @@ def has_lone_end(gripper: Gripper) -> bool:
 
 @lru_cache(maxsize=8)
 def inner_edges(gripper: Gripper) -> NDArray[np.bool_]:
-    """(e,) which edges along the fingers face the other fingers, a lone one's the TCP, so that what is grasped touches
-    them: those that are nearer to the inmost one of their finger than to its middle.
+    """(e,) which edges face the other fingers, a lone one's the TCP, so that what is grasped touches them: those along
+    the fingers that are nearer to the inmost one of their finger than to its middle, and the end between them.
     """
     axis, along = along_fingers(gripper)
     middle_m = gripper.points_grip_m()[gripper.edge_points].mean(axis=1)
@@ -183,7 +183,25 @@ def inner_edges(gripper: Gripper) -> NDArray[np.bool_]:
         way_m = (middle_m - centre) @ inwards / max(float(np.linalg.norm(inwards)), DISTINCT_M)
         inmost_m = way_m[edges].max()
         inner |= edges & (way_m > 0.5 * inmost_m) & (inmost_m > DISTINCT_M)
-    return inner
+    return inner | np.isin(gripper.edge_points, gripper.edge_points[inner]).all(axis=1)
+
+
+@lru_cache(maxsize=8)
+def sides(gripper: Gripper) -> tuple[NDArray[np.bool_], ...]:
+    """Two of (e,): which edges lie on the one side of their fingers, and which on the other, along the line from the
+    first finger to the last: the fingers' shadows fall beside those together.  None of a lone finger.
+    """
+    fingers = np.unique(gripper.point_finger)
+    if len(fingers) < 2:
+        return ()
+    points_m, axis = gripper.points_grip_m(), along_fingers(gripper)[0]
+    centre_m = np.array([points_m[gripper.point_finger == finger].mean(axis=0) for finger in fingers])
+    across = centre_m[-1] - centre_m[0]
+    across = across - (across @ axis) * axis
+    beside_m = (points_m - centre_m[np.searchsorted(fingers, gripper.point_finger)]) @ across
+    least_m = DISTINCT_M * float(np.linalg.norm(across))
+    both_m = beside_m[gripper.edge_points]
+    return tuple((way * both_m > least_m).all(axis=1) for way in (-1.0, 1.0))
 
 
 class FingerEnds:

@@ -26,7 +26,7 @@ class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
     the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
-    end of a finger is what it seems, ``grasp`` of the one that something grasped shifts the inner edges; -1: none is.
+    end of a finger is what it seems, ``grasp`` those of something grasped that shifts the inner edges.
     """
 
     name: tuple[str, ...]
@@ -35,7 +35,7 @@ class Hypotheses:
     opening: NDArray[np.bool_]
     sudden: NDArray[np.bool_]
     ends: int
-    grasp: int = -1
+    grasp: tuple[int, ...] = ()
 
     def without_ends(self) -> tuple[Hypotheses, NDArray[np.bool_]]:
         """The same where no end of a finger is what it seems besides; (h,) which doubt more than that then."""
@@ -52,6 +52,7 @@ def hypotheses_of(
     along: NDArray[np.bool_],
     inner: NDArray[np.bool_],
     has_opening: bool,
+    sides: tuple[NDArray[np.bool_], ...] = (),
 ) -> Hypotheses:
     """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end,
     ``inner`` (v,) for those that what is grasped touches.
@@ -74,11 +75,16 @@ def hypotheses_of(
             rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
             rows.append((f"finger {name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
-    grasp = -1
-    if inner.sum() > 1 and not inner.all():
-        grasp = len(rows)
-        # In one image another distance and opening make up for it; where the gripper was before doesn't fit then.
-        rows.append(("the fingers' inner edges belong to what is grasped", WRONG_EDGE, ~inner, False, True))
+    grasp: tuple[int, ...] = ()
+    for part, what in ((inner & along, "inner edges"), (inner, "inner edges with their ends")):
+        if part.sum() > 1 and not part.all() and (not grasp or (part & ~along).any()):
+            grasp = (*grasp, len(rows))
+            # In one image another distance and opening make up for it; where the gripper was before doesn't fit then.
+            rows.append((f"the fingers' {what} belong to what is grasped", WRONG_EDGE, ~part, False, True))
+    for side in sides:
+        if side.sum() > 1 and not side.all():
+            what = "the edges on one side of all fingers belong to something else"
+            rows.append((what, WRONG_EDGE, ~side, False, True))
     if has_opening:
         rows.append(("the jaw opening is wrong", WRONG_GRIPPER, whole, True, False))
     ends = len(rows)

@@ -5,10 +5,11 @@ from gripmon.track.look.alignment import LookAlignment, LookMotion, warm_up
 from gripmon.track.look.blocks import BLOCK_PX
 from gripmon.track.look.core import GripperLook, another_background
 from gripmon.track.look.fusion import Fused, LookFusion
-from gripmon.track.look.strips import FingerStrips, StripsSeen
+from gripmon.track.look.strips import ONE_EDGE_PX, FingerStrips, StripsSeen
 
 __all__ = [
     "BLOCK_PX",
+    "ONE_EDGE_PX",
     "FingerStrips",
     "Fused",
     "GripperLook",

@@ -47,8 +47,10 @@ NODE_PX = 16
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
-SMALLEST_SLIDE_PX = 2
-"""Slides up to this are none: edges of an image that are nearer to each other are one, and fitted ten times better."""
+ONE_EDGE_PX = 2
+"""Edges of an image that are nearer to each other are one, and fitted ten times better: no mark on a finger is taken
+for its end then, and slides up to this are none.
+"""
 
 EXPLAINED_CORRELATION = 0.87
 """Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
@@ -81,6 +83,9 @@ class StripsSeen(NamedTuple):
 
     here: bool = False
     """Whether it is seen to stand there."""
+
+    undecided: bool = False
+    """Whether it may as well stand elsewhere: fingers that look alike all along themselves."""
 
 
 class FingerStrips:
@@ -154,22 +159,27 @@ class FingerStrips:
         independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
-        if beyond_chance * _unexplained(EXPLAINED_CORRELATION) >= _unexplained(alike_here):
+        alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - self._alike_beside**2
+        most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
+        if alone and beyond_chance * (1.0 - most_alike**2) >= _unexplained(alike_here, most_alike):
             # Usually: no slide could be so much better.
-            alone = beyond_chance * _unexplained(EXPLAINED_CORRELATION) <= _unexplained(self._alike_beside)
-            return StripsSeen(here=bool(alone) and alike_here >= EXPLAINED_CORRELATION)
+            return StripsSeen(here=alike_here >= most_alike)
         strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
         alike = product / np.sqrt(np.maximum(energy, least) * own + 1e-12)
-        unexplained = _unexplained(alike)
+        unexplained = _unexplained(alike, most_alike)
         here = float(unexplained[REACH_PX])
-        unexplained[REACH_PX - SMALLEST_SLIDE_PX : REACH_PX + SMALLEST_SLIDE_PX + 1] = 1.0
+        unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = int(np.argmin(unexplained))
-        if here <= beyond_chance * float(unexplained[best]):
+        if here > beyond_chance * float(unexplained[best]):
+            return StripsSeen((best - REACH_PX) * layout.step_m.mean(axis=0))
+        if alone:
             return StripsSeen()
-        return StripsSeen((best - REACH_PX) * layout.step_m.mean(axis=0))
+        # Odds of ten to one for this slide: what hides a part of them leaves less.
+        undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= float(unexplained[best])
+        return StripsSeen(here=beyond_chance * here <= float(unexplained[best]), undecided=undecided)
 
     def _prepare(self, layout: _Layout) -> None:
         """What a comparison needs of the mean."""
@@ -275,7 +285,7 @@ class FingerStrips:
 
 
 def _alike_beside(strips: NDArray[np.float32], within: NDArray[np.float32]) -> float:
-    """The largest correlation of strips with themselves, slid by :data:`SMALLEST_SLIDE_PX` and more: a broad line looks
+    """The largest correlation of strips with themselves, slid by :data:`ONE_EDGE_PX` and more: a broad line looks
     alike beside its place, and ribs do one farther on.
     """
     reach = LENGTH_PX - SHORTEST_PX
@@ -285,13 +295,13 @@ def _alike_beside(strips: NDArray[np.float32], within: NDArray[np.float32]) -> f
     theirs = cv2.matchTemplate(np.square(slid), within, cv2.TM_CCORR).ravel()
     own = cv2.matchTemplate(shown, np.square(strips), cv2.TM_CCORR).ravel()
     alike = product / np.sqrt(np.maximum(theirs * own, 0.0) + 1e-12)
-    alike[reach - SMALLEST_SLIDE_PX + 1 : reach + SMALLEST_SLIDE_PX] = 0.0
+    alike[reach - ONE_EDGE_PX + 1 : reach + ONE_EDGE_PX] = 0.0
     return float(alike.max())
 
 
-def _unexplained(alike: Any) -> Any:
-    """Part of the variance that correlations leave."""
-    return 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED_CORRELATION))
+def _unexplained(alike: Any, most_alike: float) -> Any:
+    """Part of the variance that correlations leave, none being better than ``most_alike``."""
+    return 1.0 - np.square(np.clip(alike, 0.0, most_alike))
 
 
 @lru_cache(maxsize=4)
