@@ -16,7 +16,7 @@ from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.edges.ends import along_fingers
+from gripmon.track.edges.roles import along_fingers
 
 PLAIN = plain_scenario()
 CUBE = Path(__file__).parent.parent / "configs" / "grippers" / "visp_cube.yaml"

@@ -17,9 +17,9 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import prediction_kernel
-from gripmon.track.edges.ends import along_fingers
 from gripmon.track.edges.prediction import ROWS, SHORTEST_PX, independent_part, lay_out
 from gripmon.track.edges.profiles import find_candidates, profile_offsets_px, read_profiles
+from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
 from gripmon.track.look import FingerStrips
 from gripmon.track.look.strips import FIRST_FRAMES

@@ -15,7 +15,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.records import Image, StripsRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
-from gripmon.track.edges.ends import along_fingers
+from gripmon.track.edges.roles import along_fingers
 from gripmon.track.look import FingerStrips, LookRefused, StripsSeen
 from gripmon.track.look.strips import FIRST_FRAMES, RELEARN_S
 

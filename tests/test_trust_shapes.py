@@ -24,7 +24,7 @@ from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, BentFinger, Bump
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
-from gripmon.track.edges.ends import along_fingers
+from gripmon.track.edges.roles import along_fingers
 
 FPS, KNOCK = 20.0, 16
 """Frame with which the mount is knocked."""

@@ -19,7 +19,7 @@ from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, leaves_smo
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
-from gripmon.track.edges.ends import PARALLEL_COSINE
+from gripmon.track.edges.roles import PARALLEL_COSINE
 
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0

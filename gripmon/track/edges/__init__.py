@@ -1,17 +1,11 @@
 """Fingertip corners from images: predicted edges, sub-pixel edgel hypotheses, one joint fit, intersections."""
 
-from gripmon.track.edges.ends import (
-    FingerEnds,
-    FingerEndsSeen,
-    edges_at_ends,
-    has_lone_end,
-    inner_edges,
-    sides,
-)
+from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers, edge_residuals_px
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
 from gripmon.track.edges.readout import edge_sums, trace_of
 from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, NormalEquations, prior_information
+from gripmon.track.edges.roles import has_lone_end, inner_edges, sides
 from gripmon.track.edges.settings import MeasurementSettings, SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel

@@ -9,7 +9,6 @@ Where little shows of a rounding it is like a corner, at which neither of its tw
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +18,13 @@ from gripmon.model.records import Array, Image
 from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import find_candidates, read_profiles
+from gripmon.track.edges.roles import PARALLEL_COSINE, along_fingers
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settings import EdgeSettings
 from gripmon.track.edges.settling import Measurement
 
 END_CORNERS = 2
 """Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
-
-PARALLEL_COSINE = 0.87
-"""Edges within 30 degrees of the fingers' direction run along them."""
-
-MAJORITY = 0.5
-"""Part of the edges' length that has to run one way for the fingers to have a direction at all."""
-
-DISTINCT_M = 1e-4
-"""A finger's edges that are nearer to each other than a gripper file's points may be have no inner and outer one, m."""
 
 BEYOND_PX = (3.0, 16.5)
 """Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and as long as the stretch of an edge
@@ -57,23 +48,6 @@ CONTINUATION_PX = 1.0
 
 CONTINUATION_STEP_RATIO = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
-
-
-def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
-    """The way (3,) that most of the edges' length has, gripper frame, and (e,) which edges run along it.
-
-    Where no way has most of it: zero, and all True, so that nothing is an end.
-    """
-    points_m = gripper.points_grip_m()
-    way = points_m[gripper.edge_points[:, 1]] - points_m[gripper.edge_points[:, 0]]
-    length = np.linalg.norm(way, axis=1)
-    direction = way / length[:, None]
-    near = np.abs(direction @ direction.T) > PARALLEL_COSINE
-    together = near @ length
-    best = int(np.argmax(together))
-    if together[best] < MAJORITY * length.sum():
-        return np.zeros(3), np.ones(len(length), dtype=bool)
-    return direction[best], np.asarray(near[best])
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,49 +133,6 @@ def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:
     """(e,) which edges meet a place at which a finger may end, and don't run along it: not those of its root."""
     ends = FingerEnds(gripper, EdgeSettings())
     return ~ends.along & np.isin(gripper.edge_points, ends.points).any(axis=1)
-
-
-def has_lone_end(gripper: Gripper) -> bool:
-    """Whether the end of a single finger alone tells where it is along itself."""
-    return len(gripper.finger_ids) == 1 and not along_fingers(gripper)[1].all()
-
-
-@lru_cache(maxsize=8)
-def inner_edges(gripper: Gripper) -> NDArray[np.bool_]:
-    """(e,) which edges face the other fingers, a lone one's the TCP, so that what is grasped touches them: those along
-    the fingers that are nearer to the inmost one of their finger than to its middle, and the end between them.
-    """
-    axis, along = along_fingers(gripper)
-    middle_m = gripper.points_grip_m()[gripper.edge_points].mean(axis=1)
-    own = [along & (gripper.edge_finger == finger) for finger in np.unique(gripper.edge_finger[along])]
-    centre_m = np.array([middle_m[edges].mean(axis=0) for edges in own])
-    between_m = centre_m.mean(axis=0) if len(own) > 1 else np.zeros(3)
-    inner = np.zeros(len(along), dtype=bool)
-    for edges, centre in zip(own, centre_m, strict=True):
-        inwards = between_m - centre
-        inwards -= (inwards @ axis) * axis
-        way_m = (middle_m - centre) @ inwards / max(float(np.linalg.norm(inwards)), DISTINCT_M)
-        inmost_m = way_m[edges].max()
-        inner |= edges & (way_m > 0.5 * inmost_m) & (inmost_m > DISTINCT_M)
-    return inner | np.isin(gripper.edge_points, gripper.edge_points[inner]).all(axis=1)
-
-
-@lru_cache(maxsize=8)
-def sides(gripper: Gripper) -> tuple[NDArray[np.bool_], ...]:
-    """Two of (e,): which edges lie on the one side of their fingers, and which on the other, along the line from the
-    first finger to the last: the fingers' shadows fall beside those together.  None of a lone finger.
-    """
-    fingers = np.unique(gripper.point_finger)
-    if len(fingers) < 2:
-        return ()
-    points_m, axis = gripper.points_grip_m(), along_fingers(gripper)[0]
-    centre_m = np.array([points_m[gripper.point_finger == finger].mean(axis=0) for finger in fingers])
-    across = centre_m[-1] - centre_m[0]
-    across = across - (across @ axis) * axis
-    beside_m = (points_m - centre_m[np.searchsorted(fingers, gripper.point_finger)]) @ across
-    least_m = DISTINCT_M * float(np.linalg.norm(across))
-    both_m = beside_m[gripper.edge_points]
-    return tuple((way * both_m > least_m).all(axis=1) for way in (-1.0, 1.0))
 
 
 class FingerEnds:

@@ -164,12 +164,7 @@ class FingerStrips:
         if alone and beyond_chance * (1.0 - most_alike**2) >= _unexplained(alike_here, most_alike):
             # Usually: no slide could be so much better.
             return StripsSeen(here=alike_here >= most_alike)
-        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -most, most)
-        energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
-        product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
-        least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
-        alike = product / np.sqrt(np.maximum(energy, least) * own + 1e-12)
-        unexplained = _unexplained(alike, most_alike)
+        unexplained = _unexplained(self._alike(layout, image, cam_T_grip, jaw_opening_m), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = int(np.argmin(unexplained))
@@ -180,6 +175,14 @@ class FingerStrips:
         # Odds of ten to one for this slide: what hides a part of them leaves less.
         undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= float(unexplained[best])
         return StripsSeen(here=beyond_chance * here <= float(unexplained[best]), undecided=undecided)
+
+    def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
+        """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
+        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -self._most, self._most)
+        energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
+        product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
+        least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
+        return np.asarray(product / np.sqrt(np.maximum(energy, least) * self._own + 1e-12))
 
     def _prepare(self, layout: _Layout) -> None:
         """What a comparison needs of the mean."""
