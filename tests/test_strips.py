@@ -173,7 +173,8 @@ def test_they_go_on_after_a_restart():
     again = new_strips()
     again.restore(msgspec.json.decode(msgspec.json.encode(state), type=StripsRecord))
     kept = again.state()
-    assert kept is not None and kept.mean == state.mean and kept.frames == FIRST_FRAMES and not again.awaited
+    assert kept is not None and (kept.mean, kept.usual, kept.frames) == (state.mean, state.usual, FIRST_FRAMES)
+    assert not again.awaited
     truth = simulation.truth(LAST)
     for way_m in (0.0, *SLIDES_M):
         where = image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK

@@ -96,6 +96,7 @@ class Weigher:
         self.swing: Array = np.zeros(6)
         """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         self.anchor: Anchor | None = None
+        self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
     def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
@@ -181,7 +182,8 @@ class Weigher:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
-        if displaced and not ambiguous and measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE:
+        opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
+        if displaced and not ambiguous and opened:
             # A knock leaves the jaw alone: fingers that flex and shadows beside them look like both at once.
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
@@ -224,6 +226,7 @@ class Weigher:
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
         else:
+            self._in_place = True
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:

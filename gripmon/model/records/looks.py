@@ -80,6 +80,7 @@ class StripsRecord(msgspec.Struct, frozen=True):
     mean: Annotated[
         bytes, Meta(description="float32 (n, 64): grey levels from the finger's end on, slow changes left out")
     ]
+    usual: Annotated[bytes, Meta(description="float32 (193,): correlation with them at each px along, from -96 to 96")]
 
 
 class LookRecord(msgspec.Struct, frozen=True):

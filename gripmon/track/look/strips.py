@@ -99,6 +99,7 @@ class FingerStrips:
         self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
         self._layout: _Layout | None = None
         self._own = 0.0  # sum of squares of what was learnt: none of a finger of one shade
+        self._usual = np.zeros(2 * REACH_PX + 1)  # correlations at each slide while the gripper stands in its place
 
     @property
     def ready(self) -> bool:
@@ -123,13 +124,17 @@ class FingerStrips:
         self._learnt_s = now_s
         self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
         self._prepare(self._layout)
+        usual = self._alike(self._layout, image, cam_T_grip, jaw_opening_m)
+        self._usual += (usual - self._usual) / min(self.frames, MOST_FRAMES)
+        self._farther = _farther_on(self._usual)
 
     def state(self) -> StripsRecord | None:
         """What survives a restart, some 10 kB; None before a frame was learned."""
         if self._laid_out is None or not self.frames:
             return None
         cam_T_grip, jaw_opening_m = self._laid_out
-        return StripsRecord(to_record(cam_T_grip), jaw_opening_m, self.frames, self._mean.astype("<f4").tobytes())
+        mean, usual = (part.astype("<f4").tobytes() for part in (self._mean, self._usual))
+        return StripsRecord(to_record(cam_T_grip), jaw_opening_m, self.frames, mean, usual)
 
     def restore(self, record: StripsRecord) -> None:
         """Go on with kept strips of the same gripper and camera.  Raises :class:`LookRefused`, and begins again, if
@@ -137,11 +142,14 @@ class FingerStrips:
         """
         self._lay_out(from_record(record.cam_T_grip), record.jaw_opening_m)
         layout = self._layout
-        fits = layout is not None and len(record.mean) == 4 * layout.within.size
-        if layout is None or not fits or not np.isfinite(np.frombuffer(record.mean, "<f4")).all():
+        sizes = (0 if layout is None else layout.within.size), len(self._usual)
+        fits = all(len(data) == 4 * size for data, size in zip((record.mean, record.usual), sizes, strict=True))
+        if layout is None or not fits or not np.isfinite(np.frombuffer(record.mean + record.usual, "<f4")).all():
             self._laid_out = self._layout = None
             raise LookRefused("the kept look along the fingers isn't this gripper's; it is learnt again")
         self._mean = np.frombuffer(record.mean, "<f4").reshape(layout.within.shape).astype(np.float32)
+        self._usual = np.frombuffer(record.usual, "<f4").astype(float)
+        self._farther = _farther_on(self._usual)
         self.frames = record.frames
         self._prepare(layout)
 
@@ -159,7 +167,8 @@ class FingerStrips:
         independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
-        alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - self._alike_beside**2
+        farther = self._farther
+        alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - float(farther.max()) ** 2
         most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
         if alone and beyond_chance * (1.0 - most_alike**2) >= _unexplained(alike_here, most_alike):
             # Usually: no slide could be so much better.
@@ -167,14 +176,17 @@ class FingerStrips:
         unexplained = _unexplained(self._alike(layout, image, cam_T_grip, jaw_opening_m), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
-        best = int(np.argmin(unexplained))
-        if here > beyond_chance * float(unexplained[best]):
-            return StripsSeen((best - REACH_PX) * layout.step_m.mean(axis=0))
+        best = float(unexplained.min())
+        # What looks alike farther on is always seen there, and alone where the place itself is hidden.
+        unexplained[beyond_chance * unexplained >= _unexplained(farther, most_alike)] = 1.0
+        slide_px = int(np.argmin(unexplained)) - REACH_PX
+        if here > beyond_chance * float(unexplained.min()):
+            return StripsSeen(slide_px * layout.step_m.mean(axis=0))
         if alone:
             return StripsSeen()
         # Odds of ten to one for this slide: what hides a part of them leaves less.
-        undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= float(unexplained[best])
-        return StripsSeen(here=beyond_chance * here <= float(unexplained[best]), undecided=undecided)
+        undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= best
+        return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
 
     def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
         """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
@@ -189,7 +201,6 @@ class FingerStrips:
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
         self._learnt = np.clip(self._mean, -self._most, self._most)
         self._own = float(np.square(self._learnt).sum())
-        self._alike_beside = _alike_beside(self._learnt, layout.within)
 
     def _read(
         self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
@@ -287,19 +298,15 @@ class FingerStrips:
         return out
 
 
-def _alike_beside(strips: NDArray[np.float32], within: NDArray[np.float32]) -> float:
-    """The largest correlation of strips with themselves, slid by :data:`ONE_EDGE_PX` and more: a broad line looks
-    alike beside its place, and ribs do one farther on.
+def _farther_on(alike: Array) -> Array:
+    """Correlations at each slide, zero from the place itself to where they first fall below a half: what is left is of
+    something else that looks alike.
     """
-    reach = LENGTH_PX - SHORTEST_PX
-    wide = (0, 0), (reach, reach)
-    slid, shown = np.pad(strips, wide), np.pad(within, wide)
-    product = cv2.matchTemplate(slid, strips, cv2.TM_CCORR).ravel()
-    theirs = cv2.matchTemplate(np.square(slid), within, cv2.TM_CCORR).ravel()
-    own = cv2.matchTemplate(shown, np.square(strips), cv2.TM_CCORR).ravel()
-    alike = product / np.sqrt(np.maximum(theirs * own, 0.0) + 1e-12)
-    alike[reach - ONE_EDGE_PX + 1 : reach + ONE_EDGE_PX] = 0.0
-    return float(alike.max())
+    low = np.flatnonzero(alike < 0.5)
+    before, after = low[low < REACH_PX], low[low > REACH_PX]
+    out = np.maximum(alike, 0.0)
+    out[before[-1] if len(before) else 0 : after[0] if len(after) else len(out)] = 0.0
+    return out
 
 
 def _unexplained(alike: Any, most_alike: float) -> Any:
