@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 def test_a_row_says_what_was_valid_how_far_it_was_off_and_what_was_missed():
     from benchmarks import shapes
 
-    lines = list(shapes.report(4, 1, ["rounded by 2 mm"]))[2:]
+    lines = list(shapes.report(12, 1, ["rounded by 2 mm"]))[2:]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [row[:2] for row in cells] == [
         [name, motion] for name in ("sharp box", "rounded by 2 mm") for motion in shapes.MOTIONS
