@@ -16,9 +16,11 @@ from support.simulated import STRONG_LENS
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.config.yaml_file import as_yaml
+from gripmon.daemon.sweeping import make_grid
 from gripmon.model.camera import make_camera
+from gripmon.model.errors import InputError
 from gripmon.model.provenance import provenance_of
 
 DEMO = builtin_config("demo.yaml")
@@ -203,6 +205,21 @@ def test_bad_input_is_said_in_one_line(options: list[str], said: str, capsys: py
     captured = capsys.readouterr()
     assert said in captured.err and captured.err.count("\n") == 1
     assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("ranges", "said"),
+    [
+        ({"distance": (0.1, 80.0)}, "distance: 80 m is out of bounds; 0.005 to 5 m, at most 100"),
+        ({"tilt": (float("nan"),)}, "tilt: nan degrees is out of bounds"),
+        ({"roll": tuple(range(101))}, "roll: has 101 values"),
+        ({"yaw": (1.0,)}, "ranges: yaw: no axis of a sweep; distance, tilt, side, roll, focal, fov"),
+    ],
+)
+def test_ranges_that_nobody_typed_are_checked_too(ranges: dict[str, tuple[float, ...]], said: str):
+    with pytest.raises(InputError) as refused:
+        make_grid(load_config(DEMO), ranges)
+    assert str(refused.value).startswith(said)
 
 
 def test_a_focal_length_and_a_field_of_view_exclude_each_other(capsys: pytest.CaptureFixture[str]):

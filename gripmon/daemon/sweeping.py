@@ -62,10 +62,12 @@ def make_grid(
     cameras.  Missing ranges keep the present value, except distance and tilt, which have default ranges.  ``at_px``:
     position of the TCP in the present camera's image (None: as now), which is also returned.
 
-    Raises :class:`InputError` for values out of bounds, impossible lenses, a position outside the image, and too many
-    mounts.
+    Raises :class:`InputError` for other ranges, values out of bounds, impossible lenses, a position outside the image,
+    and too many mounts.
     """
     for name, values in ranges.items():
+        if name not in _BOUNDS:
+            raise InputError(f"{name}: no axis of a sweep; {', '.join(_BOUNDS)}", "ranges")
         if wrong := _wrong_with(name, values):
             raise InputError(f"{wrong}; {_in_words(name)}", name)
     present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
