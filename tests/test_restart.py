@@ -20,13 +20,11 @@ import pytest
 import zenoh
 from support.kept_states import configuration, keep, make_pictures
 from support.loopback import ask, free_endpoint, plain_session, wait_until
-from support.meters import box_gripper
-from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.watched import frames_of, new_monitor, pose_of, reference_of
+from support.simulated import nominal_cam_T_grip
+from support.watched import frames_of, new_monitor, pose_of, reference_of, restarted
 
 from gripmon.daemon.config import load_config
 from gripmon.judge.references import ReferenceBook
-from gripmon.model.camera import make_camera
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -38,19 +36,12 @@ from gripmon.model.records import (
     Severity,
     Verdict,
 )
-from gripmon.monitor import Monitor, MonitorSettings
 
 HERE = Path(__file__).resolve().parent
 ROBOT = "gripmon/demo/wrist"
 
 
 # --- the core ---
-
-
-def restarted(state: MonitorState) -> Monitor:
-    back = msgspec.json.decode(msgspec.json.encode(state), type=MonitorState)
-    reference = reference_of(nominal_cam_T_grip())
-    return Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, state=back)
 
 
 def with_reference(shift_m: tuple[float, float, float]) -> MonitorState:

@@ -15,14 +15,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.watched import Watched, new_monitor, reference_of, watch
+from support.watched import Watched, new_monitor, reference_of, restarted, watch
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import make_transform, perturb
-from gripmon.model.records import AlertKind, Frame, MonitorState, Protection, State, Verdict, to_json
-from gripmon.monitor import Monitor, MonitorSettings, Tracker
+from gripmon.model.records import AlertKind, Frame, Protection, State, Verdict, to_json
+from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import MISREAD_PROBABILITY
@@ -244,13 +244,18 @@ def test_a_knock_across_lined_fingers_before_a_background_like_them_misleads_in_
     assert_nothing_misleads(watched(Scenario(name="lines", fps=15.0, duration_s=24 / 15.0, **sections)))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("from_tip_m", [1.2e-3, 1.8e-3, 5e-3])
-def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_misleads_in_no_frame(from_tip_m: float):
-    """The border comes to lie where the tips were: but for what the fingers show, nothing has moved."""
+def knocked_to_a_border(frames: int, from_tip_m: float) -> Scenario:
+    """The fingers' rear is darker than their tips; the mount is knocked so that it begins where the tips ended."""
     border = FingerMark(from_tip_m=(from_tip_m, from_tip_m + 0.02), across=(-2.0, 2.0), gain=0.4)
     plain = Background(kind="plain", contrast=0.0, level_dn=180.0, boxes=0, cables=0, motion="still")
     knock = along_fingers(from_tip_m, BEGINS_S)
-    seen = watched(scene(28, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,))))
+    return scene(frames, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,)))
+
+
+@pytest.mark.parametrize("from_tip_m", [1.2e-3, 1.8e-3, 5e-3])
+def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_misleads_in_no_frame(from_tip_m: float):
+    """The border comes to lie where the tips were: but for what the fingers show, nothing has moved."""
+    seen = watched(knocked_to_a_border(28, from_tip_m))
     assert_nothing_misleads(seen)
     assert valid(seen)[2 : BEGINS + 1].all() and valid(seen)[-4:].all() and errors_m(seen)[-4:].max() < 2e-4
 
@@ -260,17 +265,11 @@ def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_while_nothing_runs_
     from_tip_m: float,
 ):
     """The border stands where the tips were: without the kept strips the picture fits the reference."""
-    border = FingerMark(from_tip_m=(from_tip_m, from_tip_m + 0.02), across=(-2.0, 2.0), gain=0.4)
-    plain = Background(kind="plain", contrast=0.0, level_dn=180.0, boxes=0, cables=0, motion="still")
-    knock = along_fingers(from_tip_m, BEGINS_S)
-    frames, truths = frames_of(scene(40, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,))))
+    frames, truths = frames_of(knocked_to_a_border(40, from_tip_m))
     before = new_monitor()
     for frame in frames[:BEGINS]:
         before.process(frame)
-    state = msgspec.json.decode(msgspec.json.encode(before.state()), type=MonitorState)
-    reference = reference_of(nominal_cam_T_grip())
-    after = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, state=state)
-    seen = watch(frames[BEGINS + 1 :], truths[BEGINS + 1 :], after)
+    seen = watch(frames[BEGINS + 1 :], truths[BEGINS + 1 :], restarted(before.state()))
     assert_nothing_misleads(seen)
     assert not valid(seen).any() and errors_m(seen)[-1] < 1e-4
     [alert] = [alert for record in seen.records for alert in record.alerts if alert.kind is AlertKind.RESTARTED]

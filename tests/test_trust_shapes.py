@@ -16,7 +16,7 @@ from support.watched import Watched, pose_of, reference_of, watch
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import gripper_from_dict
+from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import AlertKind, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.refits import SIGMA_INFLATION
@@ -36,6 +36,14 @@ def box_fingers(bevel_m: float) -> dict[str, Any]:
     for name, edge in model["edges"].items():
         edge["bevel_m"] = bevel_m if name.endswith("along") else 0.0
     return model
+
+
+def lone_finger() -> Gripper:
+    model = box_fingers(bevel_m=0.0)
+    for part in ("points", "edges", "fingers"):
+        model[part] = {name: value for name, value in model[part].items() if name.lower().startswith("l")}
+    model["faces"] = [face for face in model["faces"] if face["finger"] == "left"]
+    return gripper_from_dict(model)
 
 
 # --- fingers that tell where they are along themselves ---
@@ -113,8 +121,8 @@ def test_what_is_grasped_touches_the_inner_edges_of_both_fingers():
     gripper = gripper_from_dict(box_fingers(bevel_m=0.0))
     along = along_fingers(gripper)[1]
     inner = {gripper.edge_ids[k] for k in np.flatnonzero(inner_edges(gripper))}
-    sides = {name for name, runs in zip(gripper.edge_ids, along, strict=True) if runs and "_in_" in name}
-    assert inner == {*sides, "L_tip_in", "R_tip_in"} and len(sides) == 4
+    run_along = {name for name, runs in zip(gripper.edge_ids, along, strict=True) if runs and "_in_" in name}
+    assert inner == {*run_along, "L_tip_in", "R_tip_in"} and len(run_along) == 4
 
 
 def test_edges_on_the_same_side_of_all_fingers_are_told_apart():
@@ -125,11 +133,7 @@ def test_edges_on_the_same_side_of_all_fingers_are_told_apart():
 
 
 def test_what_a_lone_finger_holds_touches_it_towards_the_tcp():
-    model = box_fingers(bevel_m=0.0)
-    for part in ("points", "edges", "fingers"):
-        model[part] = {name: value for name, value in model[part].items() if name.lower().startswith("l")}
-    model["faces"] = [face for face in model["faces"] if face["finger"] == "left"]
-    gripper = gripper_from_dict(model)
+    gripper = lone_finger()
     inner = {gripper.edge_ids[k] for k in np.flatnonzero(inner_edges(gripper))}
     assert inner == {"L_in_near_along", "L_in_far_along", "L_tip_in"}
 
@@ -313,12 +317,7 @@ def test_fingers_that_flex_alike_are_no_knock(flex_m: float, way: float):
 @pytest.mark.parametrize("away_m", [0.0, 1e-3])
 def test_of_a_lone_finger_that_may_have_slid_along_itself_no_look_is_learnt(away_m: float):
     """Found a millimetre along from its reference: that may be a mark's place, and only a person can say."""
-    model = box_fingers(bevel_m=0.0)
-    model["fingers"] = {"left": model["fingers"]["left"]}
-    model["points"] = {name: point for name, point in model["points"].items() if point["finger"] == "left"}
-    model["edges"] = {name: edge for name, edge in model["edges"].items() if edge["from"] in model["points"]}
-    model["faces"] = [face for face in model["faces"] if face["finger"] == "left"]
-    gripper, camera, pose = gripper_from_dict(model), make_camera(PAPER_LENS), nominal_cam_T_grip()
+    gripper, camera, pose = lone_finger(), make_camera(PAPER_LENS), nominal_cam_T_grip()
     simulator = Simulator(camera, gripper, pose, Scenario(name="lone", fps=FPS, duration_s=1.0), 1)
     reference_T = pose.copy()
     reference_T[:3, 3] += away_m * pose[:3, 2]

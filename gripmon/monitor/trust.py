@@ -170,7 +170,7 @@ class Integrity:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
             self._ends_seen = trust.proven
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
-        measurement, cam_T_grip, _, along, trust = here
+        measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:

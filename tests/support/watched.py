@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
-from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
+from gripmon.model.records import (
+    AlertKind,
+    Frame,
+    FrameRecord,
+    MonitorState,
+    Origin,
+    ReferenceRecord,
+    Transform,
+    Verdict,
+)
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, Cover, Creep
@@ -56,6 +65,13 @@ def reference_of(cam_T_grip: np.ndarray) -> ReferenceRecord:
 def new_monitor(settings: MonitorSettings | None = None, cam_T_grip: np.ndarray | None = None) -> Monitor:
     pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
     return Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), settings or MonitorSettings(), reference_of(pose))
+
+
+def restarted(state: MonitorState) -> Monitor:
+    """A new monitor that goes on from a state, as it comes back from its file."""
+    back = msgspec.json.decode(msgspec.json.encode(state), type=MonitorState)
+    reference = reference_of(nominal_cam_T_grip())
+    return Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, state=back)
 
 
 @lru_cache(maxsize=16)

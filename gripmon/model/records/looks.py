@@ -76,7 +76,7 @@ class StripsRecord(msgspec.Struct, frozen=True):
 
     cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when the strips were chosen")]
     jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
-    frames: Annotated[int, Meta(ge=1, description="that they were learnt from")]
+    frames: Annotated[int, Meta(ge=1, description="that they were learned from")]
     mean: Annotated[
         bytes, Meta(description="float32 (n, 64): grey levels from the finger's end on, slow changes left out")
     ]

@@ -66,13 +66,15 @@ RELEARN_S = 1.0
 
 class _Layout(NamedTuple):
     """Where n strips lie, gripper frame: their points nearest to the finger's end (n, 3), the steps (n, 3) from each
-    point to the next, which points are on the finger (n, LENGTH_PX), and the finger of each (n,).
+    point to the next, which points are on the finger (n, LENGTH_PX), and the finger of each (n,); ``fingers_m`` (f, 3):
+    where the fingers' first points were.
     """
 
     start_m: Array
     step_m: Array
     within: NDArray[np.float32]
     finger: NDArray[np.intp]
+    fingers_m: Array
 
 
 class StripsSeen(NamedTuple):
@@ -98,13 +100,9 @@ class FingerStrips:
         self._learnt_s = -math.inf
         self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
         self._layout: _Layout | None = None
-        self._own = 0.0  # sum of squares of what was learnt: none of a finger of one shade
+        self.ready = False
+        """Whether it may judge: not by fingers of one shade."""
         self._usual = np.zeros(2 * REACH_PX + 1)  # correlations at each slide while the gripper stands in its place
-
-    @property
-    def ready(self) -> bool:
-        """Whether it may judge."""
-        return self._own > 0.0
 
     @property
     def awaited(self) -> bool:
@@ -158,7 +156,7 @@ class FingerStrips:
         for each slide that is tried.
         """
         layout = self._layout
-        if layout is None or self._own == 0.0:
+        if layout is None or not self.ready:
             return StripsSeen()
         most, learnt, own = self._most, self._learnt, self._own
         # Gain and brightness are free: light changes.
@@ -201,6 +199,7 @@ class FingerStrips:
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
         self._learnt = np.clip(self._mean, -self._most, self._most)
         self._own = float(np.square(self._learnt).sum())
+        self.ready = self._own > 0.0
 
     def _read(
         self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
@@ -210,7 +209,7 @@ class FingerStrips:
         node, share = _nodes(width)
         along = (node - FILTERED_PX - beyond)[:, None] * layout.step_m[:, None]
         now = self._gripper.points_grip_m(jaw_opening_m)
-        moved = (now[self._first] - self._laid_out_m)[layout.finger]
+        moved = (now[self._first] - layout.fingers_m)[layout.finger]
         points = (layout.start_m[:, None] + moved[:, None] + along).reshape(-1, 3)
         uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         # A point outside the lens is NaN; OpenCV needs a number for it.
@@ -241,9 +240,9 @@ class FingerStrips:
         if not long_enough.any():
             return
         within = (np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]).astype(np.float32)
-        self._layout = _Layout(start[long_enough], pitch_m * way[long_enough], within, finger[long_enough])
+        fingers_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
+        self._layout = _Layout(start[long_enough], pitch_m * way[long_enough], within, finger[long_enough], fingers_m)
         self._mean = np.zeros_like(within)
-        self._laid_out_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
 
     def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
         """Strips behind the end edges on faces that look at the camera: where they start (n, 3) and the way (n, 3)
