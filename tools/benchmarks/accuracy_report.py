@@ -45,7 +45,7 @@ def as_markdown(results: dict[str, Any], pictures: list[Path]) -> str:
     rows = results["rows"]
     parts = [
         "# Accuracy",
-        "Written by `tools/bench accuracy --out docs/results`; its `accuracy.json` with all figures isn't in the repository.",
+        "Written by `tools/bench accuracy --out docs/results`; its `accuracy.json` isn't in the repository.",
         "\n".join(f"- {line}" for line in about(results)),
         _METHOD,
         "## Results",
