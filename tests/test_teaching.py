@@ -235,7 +235,7 @@ def test_an_opening_that_the_image_contradicts_is_refused():
 def test_images_between_which_the_camera_moved_are_refused():
     shifted = image_of(0.0, None, moved(POSE, np.array([2e-4, 0.0, 0.0, 0.0, 0.0, 0.0])))
     with pytest.raises(
-        TeachingRefused, match=r"\d\.png: the gripper shows 0\.\d px from where it is in the other images"
+        TeachingRefused, match=r"\d\.png: the gripper appears 0\.\d px from where it is in the other images"
     ):
         taught_from(image_of(0.0), shifted, using=reference(None, 1e-3, 1e-2))
 
@@ -248,8 +248,8 @@ def test_an_image_that_contradicts_most_others_is_left_out():
     using = reference(None, 1e-3, 1e-2)
     taught = taught_from(image_of(0.0), shifted, darker, empty, brighter, using=using)
     assert set(taught.left_out) == {1, 3} and taught.used("abcde") == ["a", "c", "e"]
-    assert re.match(r"1\.png: the gripper shows \d\.\d px from where it is in the other images", taught.left_out[1])
-    assert "3.png: measured with what was taught the gripper isn't found" in taught.left_out[3]
+    assert re.match(r"1\.png: the gripper appears \d\.\d px from where it is in the other images", taught.left_out[1])
+    assert "3.png: measured with the taught edges the gripper isn't found" in taught.left_out[3]
     alone = taught_from(image_of(0.0), darker, brighter, using=using)
     assert taught.edges == alone.edges and not alone.left_out
 
