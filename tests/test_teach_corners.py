@@ -129,7 +129,7 @@ def test_a_corner_put_by_hand_beyond_the_lens_gives_no_pose():
     shown = dict(zip(gripper.corner_ids, camera.project(points_m), strict=True))
     found = Setup(camera, gripper, MonitorSettings(), None).evaluate(image, shown, (), OPENING_M)
     assert found.reference is not None
-    with pytest.raises(PoseRefused, match="L_in_near was put where the lens shows nothing"):
+    with pytest.raises(PoseRefused, match="L_in_near was placed outside the lens's view"):
         pose_from_corners(camera, gripper, found.snapped, {"L_in_near": np.array([1.0, 1.0])})
 
 
