@@ -108,7 +108,7 @@ def test_a_fixed_opening_is_the_configurations(sequence: Path, tmp_path: Path):
     config = gripmon.load_config(tmp_path / "config.yaml")
     said: list[str] = []
     records = list(gripmon.replay(sequence, config, warn=said.append))
-    assert said == ["the frames bring jaw openings, but jaw.source is fixed: they are not used"]
+    assert said == ["the frames have jaw openings, but jaw.source is fixed: they are not used"]
     monitor = gripmon.Monitor(config)
     frames = list(gripmon.open_source(config))
     assert {monitor.with_opening(frame).jaw_opening_m for frame in frames} == {0.02}

@@ -153,7 +153,7 @@ def test_a_gripper_that_isnt_known_and_a_configuration_that_needs_no_editing(
     # With a rough calibration no corners need be given; it may well be some pixels off.
     capsys.readouterr()
     assert plane("p1.png", "--config", "arm.yaml", "--target", TARGET, "--out", "he2.yaml") == 0
-    assert "jaw opening taken as 0.034 m" in capsys.readouterr().out
+    assert "jaw opening assumed to be 0.034 m" in capsys.readouterr().out
     check_truth(hand_eye(here / "he2.yaml"))
     assert plane("p1.png", "--config", "arm.yaml", "--target", TWICE, "--out", "he3.yaml") == 2
     assert f"the camera was calibrated with {TARGET}" in capsys.readouterr().err
@@ -258,7 +258,7 @@ def one(name: str) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("arguments", "code", "line"),
     [
-        (["p0.png", *KNOWN], 2, "nothing says where the gripper is in the image; --corners FILE.yaml, or --config"),
+        (["p0.png", *KNOWN], 2, "the gripper's place in the image is unknown; --corners FILE.yaml, or --config"),
         (["p0.png", *KNOWN, "--corners", "none.yaml"], 2, "none.yaml: there is no such file"),
         (["p0.png", *KNOWN, "--corners", "camera.yaml"], 2, "camera.yaml: is a file of gripmon calibrate intrinsics; "),
         (["p0.png", *KNOWN, "--corners", "outline.yaml"], 2, "corners.left_inner_near: two_box_fingers has no"),
@@ -275,7 +275,7 @@ def one(name: str) -> dict[str, object]:
         (["p0.png", *INFER[:-2], "--corners", "outline.yaml"], 2, "--gripper-out FILE.yaml"),
         (["p0.png", *INFER[:-1], "he.yaml", "--corners", "outline.yaml"], 2, "--out and --gripper-out: both are"),
         (["p0.png", *INFER, "--corners", "rough.yaml"], 2, "corners.L_in_near: is not a name of a fingertip's"),
-        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0.04:0.06"], 3, "jaws stand 0.0340 m open"),
+        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0.04:0.06"], 3, "jaws are 0.0340 m open"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "60"], 2, "'60' isn't a range; MIN:MAX"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0:60"], 2, "millimetres?"),
         (["p0.png", *KNOWN, "--jaw-range", "0:0.06", "--corners", "rough.yaml"], 2, "--jaw-range: has no effect"),

@@ -27,7 +27,7 @@ def test_many_are_said_after_ten_seconds_with_what_to_change():
     said = after(Drops(0.2), 20, 10, 50)
     assert not any(said[: int(OVER_S)]) and all(said[int(OVER_S) :])
     assert said[-1] == (
-        "83 % of the frames were dropped in 10 s: 60 a second came, the monitor had time for 10; lower the camera's "
+        "83 % of the frames were dropped in 10 s: 60 a second arrived, the monitor had time for 10; lower the camera's "
         "rate (source.fps, or its driver's) to that, give smaller images, or free the processor of other work"
     )
 

@@ -164,9 +164,9 @@ def test_what_the_monitor_refuses_is_said_in_its_words(cell: Cell):
     ("changed", "said"),
     [
         ({"robot": "other"}, "isn't there any more"),
-        ({"monitor_id": "earlier-1-2"}, "isn't there any more; it may have started again"),
+        ({"monitor_id": "earlier-1-2"}, "isn't there any more; it may have restarted"),
         ({"monitor_id": ""}, "isn't there any more"),
-        ({"argument": ""}, "accept names nothing"),
+        ({"argument": ""}, "accept has no argument"),
         ({"argument": "x" * 1000}, "argument"),
     ],
 )
@@ -406,7 +406,7 @@ def test_an_operators_way(
         assert "old" in visitor.find(card()).get_attribute("class")
 
         running.process.send_signal(signal.SIGINT)
-        wait_for("gripmon doesn't answer: it has ended; what is shown is of ", lambda: "#status")
+        wait_for("gripmon doesn't answer: it has ended; shown: state of ", lambda: "#status")
         assert visitor.script(enabled, "article button") == 0
         assert running.ended()[0] == 130
     capsys.readouterr()

@@ -70,7 +70,7 @@ def fits(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Fit], dict
             "none fits; wider: .*; thicker: valid in . of .. frames; parallel_.*: valid in 0",
         ),
         # All that is in view is shifted by a millimetre: no image tells that from another place of the camera.
-        (["true", "longer"], "two_box_fingers and longer fit alike; a file less"),
+        (["true", "longer"], "two_box_fingers and longer fit alike; one file fewer"),
     ],
 )
 def test_true_gripper_or_none(fits, names: list[str], expected: str):

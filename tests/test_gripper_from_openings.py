@@ -159,7 +159,7 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart_by_motion() -> N
     assert alone.gripper.finger_ids == ("finger",)
     found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     assert found.gripper.finger_ids == ("left", "right")
-    assert any("joins the fingers" in note for note in found.notes)
+    assert any("join the fingers" in note for note in found.notes)
     assert abs(found.gripper.jaw_max_m - 0.034) < 2e-4 and abs(found.gripper.jaw_min_m - 0.024) < 2e-4
     apart = perturbation_between(POSE, found.cam_T_grip)
     assert np.abs(apart[:3]).max() < 4e-4 and np.abs(apart[3:]).max() < np.radians(0.3)

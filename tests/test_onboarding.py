@@ -238,7 +238,7 @@ def test_outlines_that_are_none(points: dict[str, tuple[float, float]], reason: 
     ("name", "to", "reason"),
     [
         ("left_inner_near", (-5.0, 100.0), "corners.left_inner_near: .* lies outside of the image"),
-        ("left_inner_near", (380.0, 60.0), "its edge shows along"),
+        ("left_inner_near", (380.0, 60.0), "its edge is visible along"),
         ("left_inner_near", (250.0, 350.0), "px apart; at least"),
     ],
 )

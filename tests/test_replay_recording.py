@@ -264,7 +264,7 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     assert replayed(both, tmp_path / "again.jsonl") == lines_now
     capsys.readouterr()
     replayed(then, tmp_path / "now.jsonl", "--recording", str(then), code=2)
-    assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is what is replayed; another file"]
+    assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is the replayed file; another file"]
 
 
 @pytest.mark.slow("4 s; other limits on the same recording are in the default run")

@@ -225,7 +225,7 @@ def test_a_robot_that_forgets_its_laser_is_an_alert_until_it_remembers():
     bench.run([*items, *bench.pulse(0)], no_spot_alert_after_s=0.25)
     assert (AlertKind.STREAM, AlertEvent.RAISED) in bench.alerts
     said = bench.network.alerts[0].text
-    assert said.startswith("no spot that could be judged for ") and said.endswith(" s: no pulse yet")
+    assert said.startswith("no usable spot for ") and said.endswith(" s: no pulse yet")
 
 
 def test_recorded_frames_with_a_table_need_no_feed():

@@ -116,7 +116,7 @@ def test_the_same_with_rounded_tips_from_images(walked: Walked, driver: Any, tmp
     assert {step: each["ugly"] for step, each in seen.items() if each["ugly"]} == {}
     assert "the reference comes with it" in seen["gripper"]["said"]
     assert seen["gripper"]["command"].startswith("gripmon gripper from-images")
-    assert "of 0 corners" not in seen["teach"]["status"] and "of the edges agree" in seen["teach"]["status"]
+    assert "of 0 corners" not in seen["teach"]["status"] and "of the edges are inliers" in seen["teach"]["status"]
     assert "FAIL" not in seen["check"]["said"] and "TCP now" in seen["run"]["log"]
     before, after = held_against(truth, folder)
     assert before > 0.5 and after > 0.0

@@ -213,7 +213,7 @@ def test_bad_input_is_said_in_one_line(options: list[str], said: str, capsys: py
         ({"distance": (0.1, 80.0)}, "distance: 80 m is out of bounds; 0.005 to 5 m, at most 100"),
         ({"tilt": (float("nan"),)}, "tilt: nan degrees is out of bounds"),
         ({"roll": tuple(range(101))}, "roll: has 101 values"),
-        ({"yaw": (1.0,)}, "ranges: yaw: no axis of a sweep; distance, tilt, side, roll, focal, fov"),
+        ({"yaw": (1.0,)}, "ranges: yaw: isn't an axis of a sweep; distance, tilt, side, roll, focal, fov"),
     ],
 )
 def test_ranges_that_nobody_typed_are_checked_too(ranges: dict[str, tuple[float, ...]], said: str):

@@ -103,7 +103,7 @@ def test_an_opening_that_nobody_reports_may_be_far_from_the_nominal_one(rig: Rig
 def test_refusals_say_what_to_do(rig: Rig, setup: Setup):
     good = rig.rough(*INNER)
     few = setup.evaluate(rig.image, put({"L_in_near": good["L_in_near"]}), (), OPENING_M)
-    assert few.snapped.refused == "put 3 more corners on the fingertips" and few.reference is None
+    assert few.snapped.refused == "place 3 more corners on the fingertips" and few.reference is None
     swapped = {**good, "L_in_near": good["R_in_near"], "R_in_near": good["L_in_near"]}
     assert "where the others put it" in str(setup.evaluate(rig.image, put(swapped), (), OPENING_M).snapped.refused)
     other = {name: good[f"{'R' if name[0] == 'L' else 'L'}{name[1:]}"] for name in good}
@@ -129,7 +129,7 @@ def test_a_corner_put_by_hand_beyond_the_lens_gives_no_pose():
     shown = dict(zip(gripper.corner_ids, camera.project(points_m), strict=True))
     found = Setup(camera, gripper, MonitorSettings(), None).evaluate(image, shown, (), OPENING_M)
     assert found.reference is not None
-    with pytest.raises(PoseRefused, match="L_in_near was put where the lens shows nothing"):
+    with pytest.raises(PoseRefused, match="L_in_near was placed outside the lens's view"):
         pose_from_corners(camera, gripper, found.snapped, {"L_in_near": np.array([1.0, 1.0])})
 
 
@@ -229,8 +229,8 @@ def test_without_a_page_a_file_of_corners_does_the_same(rig: Rig, tmp_path: Path
     command: list[object] = ["teach", rig.image_path, "--corners", rough, *rig.options, "--out", tmp_path / "mine"]
     code, out, err = run(command, capsys)
     assert (code, err) == (0, "")
-    assert "L_out_far   not measured: hidden by its own finger" in out and "smallest drift seen" in out
-    assert "less exact than with a plate" in out
+    assert "L_out_far   not measured: hidden by its own finger" in out and "smallest drift  " in out
+    assert "less accurate than with a plate" in out
     config = load_config(tmp_path / "mine" / "config.yaml")
     assert config.taught is not None and config.settings.jaw.source == "frames"
     # What is not said holds as everywhere.

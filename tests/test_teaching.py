@@ -227,7 +227,7 @@ def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
 
 def test_an_opening_that_the_image_contradicts_is_refused():
     with pytest.raises(
-        TeachingRefused, match=r"shows an opening of 0\.03(39|40)\d\d m, 0\.034900 m is reported, at most"
+        TeachingRefused, match=r"shows a jaw opening of 0\.03(39|40)\d\d m, 0\.034900 m is reported; at most"
     ):
         taught_from(image_of(0.0), using=reference(None, 2e-5, 2e-4), opening_m=0.0349)
 
@@ -235,7 +235,7 @@ def test_an_opening_that_the_image_contradicts_is_refused():
 def test_images_between_which_the_camera_moved_are_refused():
     shifted = image_of(0.0, None, moved(POSE, np.array([2e-4, 0.0, 0.0, 0.0, 0.0, 0.0])))
     with pytest.raises(
-        TeachingRefused, match=r"\d\.png: the gripper shows 0\.\d px from where it is in the other images"
+        TeachingRefused, match=r"\d\.png: the gripper appears 0\.\d px from where it is in the other images"
     ):
         taught_from(image_of(0.0), shifted, using=reference(None, 1e-3, 1e-2))
 
@@ -248,8 +248,8 @@ def test_an_image_that_contradicts_most_others_is_left_out():
     using = reference(None, 1e-3, 1e-2)
     taught = taught_from(image_of(0.0), shifted, darker, empty, brighter, using=using)
     assert set(taught.left_out) == {1, 3} and taught.used("abcde") == ["a", "c", "e"]
-    assert re.match(r"1\.png: the gripper shows \d\.\d px from where it is in the other images", taught.left_out[1])
-    assert "3.png: measured with what was taught the gripper isn't found" in taught.left_out[3]
+    assert re.match(r"1\.png: the gripper appears \d\.\d px from where it is in the other images", taught.left_out[1])
+    assert "3.png: measured with the taught edges the gripper isn't found" in taught.left_out[3]
     alone = taught_from(image_of(0.0), darker, brighter, using=using)
     assert taught.edges == alone.edges and not alone.left_out
 
@@ -257,7 +257,7 @@ def test_an_image_that_contradicts_most_others_is_left_out():
 def test_images_of_which_half_contradict_the_others_are_refused():
     away = [moved(POSE, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])) for x in (2e-4, 4e-4)]
     images = [image_of(0.0), image_of(0.0, scene(150.0)), *(image_of(0.0, None, pose) for pose in away)]
-    with pytest.raises(TeachingRefused, match=r"^\d\.png: the gripper shows .* left out before: \d\.png: the gripper"):
+    with pytest.raises(TeachingRefused, match=r"^\d\.png: the gripper appears .* left out before: \d\.png: the"):
         taught_from(*images, using=reference(None, 1e-3, 1e-2))
 
 
@@ -290,7 +290,7 @@ def test_a_crease_that_something_hides_is_not_taught_and_why_is_said():
         image[round(v) : round(v) + 3, round(u) - 5 : round(u) + 6] = 60
     taught = taught_from(image)
     assert set(taught.untaught) == {"L_in_near_along"} and "L_in_near_along" not in taught.edges
-    assert re.search("no line|shows along", taught.untaught["L_in_near_along"])
+    assert re.search("no line|visible along", taught.untaught["L_in_near_along"])
     found = measured(image_of(0.0), arrays(taught), POSE)
     assert box_gripper().edge_ids.index("L_in_near_along") not in found.prediction.layout.edges
 

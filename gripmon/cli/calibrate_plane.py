@@ -120,7 +120,7 @@ def _check_options(arguments: Arguments) -> None:
     elif arguments.camera is None and config is None:
         wrong = "the camera isn't given; --camera FILE.yaml (of gripmon calibrate intrinsics), or --config CONFIG"
     elif not corners and config is None:
-        wrong = "nothing says where the gripper is in the image; --corners FILE.yaml, or --config CONFIG"
+        wrong = "the gripper's place in the image is unknown; --corners FILE.yaml, or --config CONFIG"
     if wrong:
         raise InputError(f"calibrate plane: {wrong}")
     arguments.check_outputs("out", "gripper_out", "picture")

@@ -244,7 +244,7 @@ def plane_inputs(
     notes: tuple[str, ...] = ()
     if jaw_opening_m is None and known is not None and loaded is not None and known.has_jaw:
         jaw_opening_m = loaded.jaw_opening_m
-        notes = (f"jaw opening taken as {jaw_opening_m:g} m; --jaw-opening M if it was another",)
+        notes = (f"jaw opening assumed to be {jaw_opening_m:g} m; --jaw-opening M if it was another",)
     given = None if camera is None else read_given_camera(camera)
     if given is None:
         assert loaded is not None, "the caller asks for a camera"

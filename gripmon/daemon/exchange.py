@@ -31,7 +31,7 @@ def import_camera(
         camera=read_foreign_camera(data, str(path), kind, which, size_px, fisheye),
         parameters=(),
         covariance=(),
-        warnings=(f"imported from {kind}: how certain it is isn't known",),
+        warnings=(f"imported from {kind}: its uncertainty is unknown",),
         provenance=provenance_of(command, [path]),
     )
 

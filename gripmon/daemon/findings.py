@@ -225,7 +225,7 @@ def _view(in_view: InView, gripper: GripperValues) -> Finding:
         limit = f"{1e3 * limit_m:g} mm (monitor.policy.limit_m)"
         return Finding("WARN", "view", f"{text}: less than the shift that leads to a recalibration, {limit}")
     if not gripper.faces:
-        unknown = "the gripper file has no faces, so what a finger itself hides isn't known"
+        unknown = "the gripper file has no faces, so self-occlusion isn't known"
         return Finding("WARN", "view", f"{text}; {unknown}")
     return Finding("OK", "view", text)
 
@@ -265,7 +265,7 @@ def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | N
     texts += [f"every transform is suspect {past}"] if past is not None else []
     if texts:
         return Finding("WARN", "jaw travel", f"of {span}: {'; '.join(texts)}")
-    return Finding("OK", "jaw travel", f"{span}, within the alert limit all the way")
+    return Finding("OK", "jaw travel", f"{span}, within the alert limit throughout")
 
 
 def past_limit(certainty: OpeningCertainty) -> str | None:

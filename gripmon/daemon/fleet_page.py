@@ -143,7 +143,7 @@ class FleetSite:
         """Send the command.  Raises :class:`BadRequest` if the result is unknown or the monitor isn't there."""
         name = self._known(MonitorName(order.robot, order.camera), order.monitor_id).name
         if order.name != "undo" and not order.argument:
-            raise BadRequest(f"{order.name} names nothing; what the page showed")
+            raise BadRequest(f"{order.name} has no argument; the one that the page showed")
         if order.name == "undo":
             # Undo without an argument goes back by one: only from the revision shown, unless someone else was faster.
             now = self._ask(name, CommandName.STATE, "", order.monitor_id)[0]
@@ -193,7 +193,7 @@ class FleetSite:
                 if each.gone_since_ns is not None:
                     raise BadRequest(f"{name} is gone")
                 return each
-        raise BadRequest(f"{_short(str(name))} {_short(monitor_id)} isn't there any more; it may have started again")
+        raise BadRequest(f"{_short(str(name))} {_short(monitor_id)} isn't there any more; it may have restarted")
 
     def _ask(
         self, name: MonitorName, command: CommandName, argument: str, monitor_id: str

@@ -84,7 +84,7 @@ def _open_link(config: Config | SecondConfig) -> Link | None:
 def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
     """The presence of this start of the monitor.  Raises :class:`NameTakenError` if another monitor keeps the name."""
     presence = Presence(link, Keys(robot, camera))
-    _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
+    _log.info("this monitor of %s/%s has the id %s", robot, camera, presence.monitor_id)
     others = () if take_over else presence.wait_alone()
     if others:
         remedy = "stop it, give this one another name, or start it with --take-over and stop the other one then"

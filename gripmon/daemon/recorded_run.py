@@ -81,7 +81,7 @@ class RecordedRun:
         """
         config, reference = self.config, self.config.reference
         if path.resolve() in {source.resolve() for source in self.source.paths}:
-            raise InputError(f"{path}: is what is replayed; another file", "recording")
+            raise InputError(f"{path}: is the replayed file; another file", "recording")
         if self.state is not None:
             reference = self.state.references[-1]
         part = path.with_name(f".{path.name}.part")
@@ -120,7 +120,7 @@ class RecordedRun:
         ours = recorded is not None and recorded.state_owner.calibration == config.state_owner.calibration
         if first is None or recorded is None or not ours:
             if recorded is not None:
-                self.notes.append("the configuration has another calibration: it begins with that one's reference")
+                self.notes.append("the configuration has another calibration: the replay starts with its reference")
             return config, None
         began_with = recorded.reference if state is None else state.references[-1]
         if state is None and first.origin == began_with.origin:
@@ -128,8 +128,8 @@ class RecordedRun:
         if state is not None and (first.reference_id, first.revision) == (began_with.reference_id, began_with.revision):
             return dataclasses.replace(config, reference=state.references[0]), state
         self.notes.append(
-            f"the run's beginning isn't in {self.name}: it begins with the reference that was in force in the "
-            f"first file, {first.reference_id}; the result comes close only"
+            f"the run's beginning isn't in {self.name}: the replay begins with the reference that was in force in the "
+            f"first file, {first.reference_id}; the result is approximate"
         )
         return dataclasses.replace(config, reference=first), None
 
@@ -139,7 +139,7 @@ class RecordedRun:
         if source.frames_without_image:
             self.notes.append(
                 f"{self.name} holds images of {len(source) - source.stand_ins} frames; "
-                f"{source.frames_without_image} more were recorded without: the result comes close only"
+                f"{source.frames_without_image} more were recorded without: the result is approximate"
             )
         if source.stand_ins:
             self.notes.append(

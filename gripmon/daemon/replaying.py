@@ -94,7 +94,7 @@ def replay(
             recorder.command(_repeated(monitor, waiting.popleft()))
         if not ignored and monitor.ignores_opening(frame):
             ignored = True
-            warn("the frames bring jaw openings, but jaw.source is fixed: they are not used")
+            warn("the frames have jaw openings, but jaw.source is fixed: they are not used")
         frame = monitor.with_opening(frame)
         start_ns = time.perf_counter_ns()
         try:
@@ -363,8 +363,8 @@ def lens_fault(lens: LensSettings, config: Config) -> str | None:
     try:
         off = compare_cameras(GivenCamera(config.settings.camera, (), None), GivenCamera(lens, (), None))
     except CalibrationError as error:
-        return f"the frames bring a camera calibration of another kind ({error}); the configuration's is used"
+        return f"the frames have a camera calibration of another kind ({error}); the configuration's is used"
     if off.largest_px <= NEGLIGIBLE_PX:
         return None
     far = f"up to {off.largest_px:.3g} px from the configuration's"
-    return f"the frames bring a camera calibration that is {far}, which is used"
+    return f"the frames have a camera calibration that is {far}, which is used"

@@ -197,7 +197,7 @@ class SecondCamera(Loop):
         if silence_s < self._no_spot_s:
             self._alert_all(self._alerts.absent(_NO_SPOT, "spots are seen again", now_s), self._pulsed.state)
             return
-        text = f"no spot that could be judged for {silence_s:.0f} s: {self._unused or 'no pulse was reported'}"
+        text = f"no usable spot for {silence_s:.0f} s: {self._unused or 'no pulse was reported'}"
         alert = Alert(AlertKind.STREAM, Cause.UNKNOWN, Severity.WARNING, text)
         self._alert_all(self._alerts.present(_NO_SPOT, alert, now_s, time.time_ns()), self._pulsed.state)
 

@@ -67,7 +67,7 @@ def make_grid(
     """
     for name, values in ranges.items():
         if name not in _BOUNDS:
-            raise InputError(f"{name}: no axis of a sweep; {', '.join(_BOUNDS)}", "ranges")
+            raise InputError(f"{name}: isn't an axis of a sweep; {', '.join(_BOUNDS)}", "ranges")
         if wrong := _wrong_with(name, values):
             raise InputError(f"{wrong}; {_in_words(name)}", name)
     present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
@@ -159,7 +159,7 @@ def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tu
 def _place(config: Config, at_px: tuple[float, float] | None) -> tuple[float, float]:
     """The position of the TCP in the image: as now, or as given."""
     camera = config.camera
-    where = "lies at" if at_px is not None else "the TCP shows now at"
+    where = "lies at" if at_px is not None else "the TCP is now at"
     u, v = at_px if at_px is not None else camera.project(config.cam_T_grip[None, :3, 3])[0].tolist()
     if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
         right = f"two numbers inside {camera.width_px} x {camera.height_px} px"

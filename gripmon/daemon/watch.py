@@ -168,9 +168,9 @@ class Watch:
             silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
             alerts = self._fails(_OUTPUT, silent, now_s, stamp_ns)
         else:
-            alerts = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
+            alerts = list(self._alerts.absent(_OUTPUT, "all outputs accept messages again", now_s))
         if not failure:
-            return [*alerts, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
+            return [*alerts, *self._alerts.absent(_FAILURE, "frames are processed again", now_s)]
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
         return [*alerts, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
@@ -178,7 +178,7 @@ class Watch:
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or drops data, as ``failure`` says; the monitor continues."""
         if failure is None:
-            return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
+            return list(self._alerts.absent(_RECORDING, "recording continues", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
         return self._fails(_RECORDING, stopped, now_s, stamp_ns)
 
@@ -299,6 +299,6 @@ class Drops:
 def _in_words(handled_per_s: float, came_per_s: float, share: float) -> str:
     remedy = "lower the camera's rate (source.fps, or its driver's) to that, give smaller images, or free the processor"
     return (
-        f"{100.0 * share:.0f} % of the frames were dropped in {OVER_S:g} s: {came_per_s:.3g} a second came, the "
+        f"{100.0 * share:.0f} % of the frames were dropped in {OVER_S:g} s: {came_per_s:.3g} a second arrived, the "
         f"monitor had time for {handled_per_s:.3g}; {remedy} of other work"
     )

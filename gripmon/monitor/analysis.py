@@ -1,7 +1,7 @@
-"""What a frame says of the calibration: whether the gripper has moved against the reference, whether anything looks
-wrong, and what explains it.
+"""A frame's evidence about the calibration: whether the gripper has moved against the reference, whether anything looks
+wrong, and the probable cause.
 
-What explains it is asked as long as something looks wrong, and at first, for what is normal.
+Causes are analysed as long as something looks wrong, and at first to learn what is normal.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import Effort, Measurement, agreeing_fingers, edge_residuals_px
 
 LULL_FRAMES = 3
-"""Frames in a row in which nothing looks wrong up to which an explanation holds."""
+"""Successive frames without anything wrong after which an explanation no longer holds."""
 
 GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
-"""Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn,
-and after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
+"""Of the frames that look wrong, counted from 1: those whose evidence is gathered, those after which a conclusion is
+drawn, and the period of later ones for both.  Gathering takes as long as measuring, a conclusion as several frames.
 """
 
 DOUBTED_FRAMES = 5
-"""Frames in a row in which the gripper contradicts its model, from which on the drift test takes them all the same."""
+"""Successive frames in which the gripper contradicts its model, from which on the drift test uses them nevertheless."""
 
 CONFIRMED_AFTER_S = 1.0
-"""From a further conclusion's frame to the one that it counts in, where a cause is known, so that it isn't urgent; and
-where frames come one right after the other, as in a replay, a second of them takes longer than the 20 to 40 ms of this.
+"""From the frame of a periodic conclusion to the one in which it counts, if a cause is known already.  Even in a fast
+replay a second of frames takes longer than the 20 to 40 ms of the analysis.
 """
 
 
 class _Finding(NamedTuple):
-    """What a task has led to: in the ``episode`` that it belongs to, an explanation or none; and whether the judge
-    still learns from frames in which all is well.
+    """Result of a task: an explanation or none, for the ``episode`` it belongs to; and whether the judge still learns
+    from frames without anything wrong.
     """
 
     episode: int
@@ -57,7 +57,7 @@ class _Finding(NamedTuple):
 
 
 class CauseAnalysis:
-    """Asks the judge of causes about the frames that are worth it.  The judge works in the backlog alone."""
+    """Chooses the frames for the cause analysis.  The judge is used only in the backlog."""
 
     def __init__(self, judge: CauseJudge):
         self._judge = judge
@@ -68,7 +68,7 @@ class CauseAnalysis:
         self._wants_baseline = judge.wants_baseline
 
     def run_pending(self) -> None:
-        """Work through what is waiting; in any thread."""
+        """Run the waiting tasks; in any thread."""
         self._backlog.run()
 
     @property
@@ -81,18 +81,18 @@ class CauseAnalysis:
         self._forget(lambda judge: judge.rebase(reference_sigma))
 
     def moved_again(self) -> None:
-        """The evidence so far is of another place."""
+        """Forget the evidence so far: it is from another pose."""
         calm = self._calm
         self._forget()
         self._calm = calm
 
     def knocked(self) -> None:
-        """The camera is elsewhere from the next frame on: what is normal isn't learnt of two places."""
+        """The camera's pose differs from the next frame on: what is normal isn't learnt from two poses."""
         if self._wants_baseline:
             self._do(CauseJudge.knocked)
 
     def interrupted(self) -> None:
-        """No frames came for long: someone may have exchanged the camera meanwhile, until all has been calm again."""
+        """After a long gap in the stream the camera may have been exchanged, until all has been calm again."""
         self._do(lambda judge: judge.interrupted())
         self._calm = min(self._calm, LULL_FRAMES + 1)
 
@@ -105,11 +105,11 @@ class CauseAnalysis:
         ref_cam_T_grip: Array,
         now_s: float,
     ) -> Explanation:
-        """What the frames before have shown; and one more in which something looks ``wrong``, or which may show what is
-        ``usual``, or neither, that of ``now_s``, up to which :meth:`catch_up` has taken over what was due.
+        """Add the frame of ``now_s``, in which something looks ``wrong``, or which may show what is ``usual``, or
+        neither; return the explanation from earlier frames.  :meth:`catch_up` comes before.
 
-        ``gather`` its evidence only if it is needed, from an image of its own: the caller may read the next one into
-        the same memory.
+        ``gather`` is called only if the frame's evidence is needed, with a copy of the image: the caller may read the
+        next one into the same memory.
         """
         if not wrong:
             self._calm += 1
@@ -139,13 +139,13 @@ class CauseAnalysis:
 
     @property
     def known(self) -> Explanation:
-        """What the frames so far have shown; for a frame that says nothing new.  Nothing before the first conclusion is
-        due: a change of light spoils one or two frames.
+        """The explanation from the frames so far; none before the first conclusion is due, since a change of light
+        spoils one or two frames.
         """
         return self._explanation if self._asked >= CONCLUDED_AT[0] and self._calm <= LULL_FRAMES else Explanation()
 
     def catch_up(self, now_s: float) -> None:
-        """Take over what is due.  What has failed costs an explanation, not a frame."""
+        """Use the results that are due.  A failed task costs an explanation, not a frame."""
         for found in self._backlog.results(now_s):
             if isinstance(found, Exception):
                 self._explanation = Explanation(text=f"cause analysis failed: {in_short(found)}")
@@ -169,7 +169,7 @@ class CauseAnalysis:
 
 
 class FrameAnalysis:
-    """Gathers, frame by frame, what the decision rests on."""
+    """Gathers, frame by frame, the evidence for the decision."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class FrameAnalysis:
         configured: ReferenceRecord,
         error: Array | None,
     ):
-        """``configured``: the reference of the configuration, and its ``error`` (6,) as far as that is known."""
+        """``configured``: the reference of the configuration; ``error`` (6,): its error, if known."""
         self._gripper, self._tracker = gripper, tracker
         self._reach_px = settings.corners.sampling.reach_px
         self.stream = StreamWatch(settings.stream)
@@ -188,12 +188,12 @@ class FrameAnalysis:
         jaw = settings.jaw_sigma_m, settings.jaw_offset_sigma_m
         self.causes = CauseAnalysis(CauseJudge(camera, gripper, settings.causes, np.zeros(6), *jaw))
         self.of_configured = Baseline(_sigma(configured), settings.policy.settle_frames, error)
-        """What the configured reference was off by at the start."""
+        """The configured reference's error at the start."""
         self._watches = Watches(len(gripper.finger_ids))
         self._astray = 0
 
     def rebase(self, reference: ReferenceRecord, configured: bool) -> None:
-        """Drift is reckoned from ``reference``, which is the ``configured`` one or a newer one."""
+        """Measure drift from ``reference``, which is the ``configured`` one or a newer one."""
         self._ref_cam_T_grip = from_record(reference.cam_T_grip)
         if configured:
             self.baseline, covariance = self.of_configured, np.zeros((6, 6))
@@ -208,7 +208,7 @@ class FrameAnalysis:
             self._watches = Watches(len(self._gripper.finger_ids))
 
     def begin_frame(self, frame: Frame, now_s: float) -> tuple[StreamFault, ...]:
-        """What is wrong with the stream; its rate goes to the drift test, and what is due of the causes counts."""
+        """Return the stream's faults; pass its rate to the drift test, and use the cause analyses that are due."""
         self.causes.catch_up(now_s)
         faults = self.stream.add(frame)
         for fault in faults:
@@ -229,10 +229,10 @@ class FrameAnalysis:
         doubtful: bool,
         now_s: float,
     ) -> Evidence:
-        """What a measured frame says for and against the reference.
+        """A measured frame's evidence for and against the reference.
 
         ``before_T`` (4, 4): where the gripper was expected; ``swing`` (6,): variance of the mount's vibration;
-        ``doubtful``: the stream is.
+        ``doubtful``: the stream has a fault.
         """
         measurement, cam_T_grip, covariance = standing.measurement, standing.cam_T_grip, standing.covariance
         # Motion that the search lines can follow from frame to frame is not a jump.
@@ -242,7 +242,7 @@ class FrameAnalysis:
         shares = agreeing_fingers(measurement, self._gripper)
         astray = gripper_astray(measurement, shares)
         self._astray = self._astray + 1 if astray else 0
-        # Few doubtful frames tell nothing; many are how it is now.
+        # A few doubtful frames say nothing; many are a lasting change.
         if 0 < self._astray < DOUBTED_FRAMES or not standing.believed:
             motion = self.watch.skip()
         else:
@@ -283,14 +283,14 @@ class FrameAnalysis:
         if since_start is not None and not self._baseline_weighed:
             self._baseline_weighed = True
             if self.baseline.error is not None and self.baseline.error.any():
-                # It was measured before one background: what such a frame claims, it is uncertain by.
+                # It was measured in front of one background: it is as uncertain as one such frame.
                 self.watch.set_reference_covariance(covariance)
         return since_start
 
     def explain(self, frame: Frame, measurement: Measurement, wrong: bool, usual: bool, now_s: float) -> Explanation:
-        """What explains what the frames show, of which this is one more: see :meth:`CauseAnalysis.ask`."""
+        """Add this frame and return the explanation so far: see :meth:`CauseAnalysis.ask`."""
         if self.stream.repeats:
-            return self.causes.known  # the image is an old one, what the robot reports is not
+            return self.causes.known  # the image is an old one, the robot's reports are not
         tracker, here = self._tracker, self._ref_cam_T_grip
 
         def gather(kept: Frame) -> EdgeEvidence:

@@ -1,4 +1,4 @@
-"""From what was decided to the record that says so, and to the notes on what it was decided by."""
+"""From a decision to its record, and to the notes with the limits behind it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from gripmon.track.edges import Measurement
 from gripmon.track.jaw import UNREPORTED_MOTION_SIGMAS
 
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
-"""Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
+"""Inlier ratios of a finger's search lines: above the first it is where it should be, below the second it is not."""
 
 
 def flat(covariance: Array) -> tuple[float, ...]:
@@ -46,13 +46,13 @@ def flat(covariance: Array) -> tuple[float, ...]:
 
 
 def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
-    """Equation (14) for the motion from a reference to now, and the TCP's way in the camera frame."""
+    """Equation (14) for the motion from a reference to now, and the TCP's shift in the camera frame."""
     x, y, z = (cam_T_grip[:3, 3] - ref_cam_T_grip[:3, 3]).tolist()
     return Drift(*motion_between(ref_cam_T_grip, cam_T_grip), (x, y, z))
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:
-    """The average with its covariance and ``more`` (6, 6) on top; None before the first measurement."""
+    """The average, its covariance increased by ``more`` (6, 6); None before the first measurement."""
     if average.cam_T_grip is None:
         return None
     transform = to_record(average.cam_T_grip)
@@ -87,7 +87,7 @@ def measured_record(
     alerts: tuple[Alert, ...],
     has_jaw: bool,
 ) -> FrameRecord:
-    """The record of a frame whose pose stands."""
+    """The record of a frame with a measured pose."""
     measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
     return FrameRecord(
         seq=frame.seq,
@@ -117,8 +117,8 @@ def unmeasured_corners(names: tuple[str, ...], fault: CornerFault) -> tuple[Corn
 
 
 def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float) -> Alert:
-    """The alert whether the picture fits the reference that the monitor went on from, within ``worth_m``, what is worth
-    a warning, m.
+    """The alert whether the picture fits the reference after a restart: without a drift, and with a shift of at most
+    ``worth_m``, which is worth a warning (m), plus five standard deviations.
     """
     off_m = float(np.linalg.norm(evidence.shift[:3]))
     fits = not evidence.motion.present and off_m <= worth_m + 5.0 * float(np.linalg.norm(evidence.sigma[:3]))
@@ -130,7 +130,7 @@ def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float
 
 
 def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
-    """The refusal of an image that repeats an earlier one, with the reason; None where none does."""
+    """The refusal of an image that repeats an earlier one, with the reason; None if it doesn't."""
     for fault in faults:
         if fault.kind == "frozen":
             return Refusal.FROZEN, fault.text
@@ -138,7 +138,7 @@ def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
 
 
 def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
-    """What the stream explains of refused images: another camera, or repeated images."""
+    """The stream's explanation of refused images: another camera, or repeated images."""
     for fault in faults:
         if fault.kind in ("replaced", "frozen"):
             known = CauseWeight(fault.cause, 1.0)
@@ -148,8 +148,8 @@ def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
 
 def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
     """Whether the gripper contradicts its model: one finger is where the transform has it and another, though sampled,
-    is not (hidden or bent), or the seen jaw opening is not the reported one.  ``shares``: of each finger's search lines
-    that agree.
+    is not (hidden or bent), or the measured jaw opening is not the reported one.  ``shares``: inlier ratio of each
+    finger's search lines.
     """
     if abs(measurement.jaw_innovation) > UNREPORTED_MOTION_SIGMAS:
         return True
@@ -157,7 +157,7 @@ def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
 
 
 class NoteTaker:
-    """Gathers notes; the limits, which change slowly, only when the test has reckoned them again."""
+    """Gathers notes; the limits, which change slowly, only when the drift test or the reference's error has changed."""
 
     def __init__(self, settings: MonitorSettings):
         self._policy, self._tolerated = settings.policy, _six(settings.drift.tolerated)
@@ -165,7 +165,7 @@ class NoteTaker:
         self._of: tuple[int, Array | None] = (-1, None)
 
     def take(self, watch: MotionWatch, baseline: Baseline, average: PoseAverage, measured: bool) -> MonitorNotes:
-        """``measured``: the newest frame was, so that it may have been tested."""
+        """``measured``: the newest frame was measured, so that it may have been tested."""
         refreshes, offset = watch.test.refreshes, baseline.error
         if self._limits is None or self._of[0] != refreshes or self._of[1] is not offset:
             self._of = refreshes, offset

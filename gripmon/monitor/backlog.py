@@ -1,7 +1,7 @@
-"""Work that takes the time of many frames, beside them: what moved, and where a lost gripper is.
+"""Work that takes longer than a frame, done in the background: cause analysis, and the search for a lost gripper.
 
-No frame waits for it, and yet a replay decides as the daemon did: the result of what begins with one frame counts from
-a fixed moment of the frames' own clock on, whoever has done the work until then.
+No frame waits for it, and yet a replay decides as the daemon did: a result counts from a fixed moment of the frames'
+own clock on, in whichever thread it was computed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 RESULT_AFTER_S = 0.1
-"""From the frame that work begins with to the one that its result counts in: a search and an analysis take 20 to 50 ms
+"""From the frame that starts a task to the one in which its result counts: a search and an analysis take 20 to 50 ms
 (tools/bench latency); a controller notices tenths of a second.
 """
 
@@ -47,8 +47,8 @@ class Backlog(Generic[_T]):
         return len(self._undone) > 0
 
     def add(self, work: Callable[[], _T], now_s: float = -math.inf, after_s: float = RESULT_AFTER_S) -> None:
-        """Begin something in the frame of ``now_s``, to count ``after_s`` later; without a time its result counts as
-        soon as those before do.  What came before counts no later than it.
+        """Add a task that starts in the frame of ``now_s``; its result counts ``after_s`` later, or without a time as
+        soon as the earlier ones do.  Earlier tasks count no later than this one.
         """
         task = _Task(work, now_s + after_s)
         for earlier in self._tasks if task.due_s > -math.inf else ():
@@ -57,7 +57,7 @@ class Backlog(Generic[_T]):
         self._undone.append(task)
 
     def results(self, now_s: float) -> Iterator[_T | Exception]:
-        """What is due, in the order in which it was begun; done now where that hasn't been.  What has failed is its
+        """The results that are due, in the order of their tasks, computed now if need be; of a failed task its
         exception.
         """
         while self._tasks and self._tasks[0].due_s <= now_s:
@@ -68,12 +68,12 @@ class Backlog(Generic[_T]):
             yield task.result
 
     def run(self) -> None:
-        """Do what is waiting, one task after the other."""
+        """Run all waiting tasks, one after the other."""
         while self._undone:
             self._do_next()
 
     def _do_next(self, wanted: _Task[_T] | None = None) -> None:
-        """The next task; nothing if what is ``wanted`` was done meanwhile: a frame doesn't pay for what isn't due."""
+        """Run the next task, unless ``wanted`` was done meanwhile: a frame doesn't wait for tasks that aren't due."""
         with self._one_at_a_time:
             if not self._undone or (wanted is not None and wanted.done):
                 return

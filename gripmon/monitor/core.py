@@ -78,14 +78,14 @@ class Monitor:
         state: MonitorState | None = None,
         keep: Keep = lambda _: "",
     ):
-        """``state``, where given, is what :meth:`state` gave before a restart: its newest reference counts then.
-        ``keep`` is called before any other comes into force: a reference that can't be kept is only proposed, or
+        """``state``: of :meth:`state` before a restart; its newest reference counts then.
+        ``keep`` is called before any other reference comes into force: one that can't be kept is only proposed, or
         refused.
 
-        Raises ValueError for a state that doesn't hold together.
+        Raises ValueError for an inconsistent state.
         """
         self._camera, self._gripper, self._settings = camera, gripper, settings
-        # What was taught belongs to the gripper's edges: a new reference doesn't change it.
+        # Taught offsets belong to the gripper's edges: a new reference doesn't change them.
         self._tracker = Tracker(camera, gripper, settings, taught)
         self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
         self._average = PoseAverage(settings.smoothing)
@@ -130,12 +130,12 @@ class Monitor:
 
     @property
     def recalibration(self) -> Proposal | Refused | None:
-        """What came of the newest attempt at a new reference; None before the first one."""
+        """Outcome of the newest attempt at a new reference; None before the first one."""
         return self._renewal.outcome
 
     @property
     def state_revision(self) -> int:
-        """Grows with each change of what :meth:`state` gives, the last transform aside."""
+        """Grows with each change of :meth:`state`, except of the last transform and the look."""
         known = self._analysis.of_configured.error is not None
         return self._renewal.book.changes + self._policy.alerts.changes + int(known)
 
@@ -153,8 +153,8 @@ class Monitor:
         )
 
     def process(self, frame: Frame) -> FrameRecord:
-        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason.  The image is
-        not looked at after that.
+        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason.  The image
+        isn't used afterwards.
         """
         self.learn()
         self._due += self._trust.take_alerts()
@@ -213,7 +213,7 @@ class Monitor:
         return replace(judgement, alerts=(compared, *judgement.alerts))
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
-        """The gripper is where it was measured: averages and what is learnt follow."""
+        """The measured pose is believed: update the averages and what is learnt."""
         self._tracker.learn(standing.measurement, opening=not standing.grasped)
         jumped, self._jumped = self._jumped, False
         if jumped:
@@ -225,9 +225,7 @@ class Monitor:
             self._average.step(motion.step_frames)
 
     def learn(self) -> None:
-        """Learn from the newest frame what no decision waits for, in some 2 ms.  :meth:`process` does it first where
-        the caller hasn't.
-        """
+        """Learn from the newest frame, in some 2 ms.  :meth:`process` begins with it if the caller hasn't done it."""
         self._trust.learn()
         self._analysis.watch.learn()
 
@@ -237,8 +235,8 @@ class Monitor:
         return self._tracker.searching.pending or self._analysis.causes.pending
 
     def run_pending(self) -> None:
-        """Search for a lost gripper and work out what moved, which takes the time of some frames, in another thread
-        than :meth:`process` if need be.  Without it :meth:`process` does that; the records are the same.
+        """Search for a lost gripper and analyse causes, which takes as long as some frames; possibly in another thread
+        than :meth:`process`.  Without it :meth:`process` does both; the records are the same.
         """
         self._tracker.searching.run_pending()
         self._analysis.causes.run_pending()
@@ -250,12 +248,12 @@ class Monitor:
         return trace_of(self._newest, self._camera, self._gripper)
 
     def notes(self) -> MonitorNotes:
-        """What the newest record was judged by; costs some microseconds."""
+        """The limits behind the newest record; takes some microseconds."""
         measured = self._newest is not None and self._newest.trusted
         return self._notes.take(self._analysis.watch, self._analysis.baseline, self._average, measured)
 
     def _tick(self, frame: Frame) -> None:
-        """Time passes to the frame's stamp; a clock that was set back stops it for this one frame only."""
+        """Advance time to the frame's stamp; a clock that was set back stops it for this frame only."""
         stamp_s = 1e-9 * frame.stamp_ns
         elapsed_s = max(stamp_s - self._stamp_s, 0.0) if self._stamp_s is not None else 0.0
         self._stamp_s = stamp_s
@@ -263,7 +261,7 @@ class Monitor:
         self._average.wander(elapsed_s)
 
     def command(self, command: Command, stamp_ns: int) -> CommandReply:
-        """Do what an operator asks, between two frames; what can't be done is refused and changes nothing."""
+        """Carry out an operator's command between two frames; one that can't be carried out changes nothing."""
         before, done = self.reference, True
         try:
             measurable = self._newest is not None and self._newest.trusted
@@ -278,7 +276,7 @@ class Monitor:
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:
-        """Drift is reckoned from the reference in force."""
+        """Measure drift from the reference in force."""
         book = self._renewal.book
         configured = book.in_force == book.configured
         self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
@@ -295,7 +293,7 @@ class Monitor:
         explanation: Explanation,
         refusal: Refusal | None = None,
     ) -> FrameRecord:
-        """The last transform held with a covariance that grows, or none when it is too old."""
+        """The last transform, held with a growing covariance, or none when it is too old."""
         judgement = self._policy.unmeasured(self._now_s, frame.stamp_ns, refusal, self._measured_s, explanation)
         self._renewal.moved()
         blank = unmeasured_record(

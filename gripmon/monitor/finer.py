@@ -1,4 +1,4 @@
-"""The gripper's look as a measurement: it refines what the edges show, and says when the gripper looks different."""
+"""The gripper's look as a measurement: it refines the edges' pose, and reports a gripper that looks different."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ from gripmon.track.look import (
 )
 
 DIFFERENT = 0.5
-"""Share of a finger's blocks that no longer look as at first, from which it looks different: grasps hide a half."""
+"""Share of a finger's blocks that no longer look as learnt, above which it looks different: grasps hide half."""
 
 DIFFERENT_S = 300.0
-"""For how long it does, or the look contradicts the edges, until an alert reports it and the look is learnt again, s:
-robots hold what they grasp for seconds or a minute.
+"""How long a finger has to look different, or the look to contradict the edges, before an alert and a new look, s:
+robots hold a grasped object for seconds or a minute.
 """
 
 
@@ -66,8 +66,8 @@ class _Pending(NamedTuple):
 
 
 class FinerLook:
-    """Refines one monitor's poses.  ``look`` tells one background from another; ``floor`` (6, 6): the systematic part
-    of the edges' covariance; ``edges``: digest of what was taught of them.
+    """Refines one monitor's poses.  ``look`` distinguishes backgrounds; ``floor`` (6, 6): the systematic part of the
+    edges' covariance; ``edges``: digest of the taught edges.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class FinerLook:
         """Of the look that is learnt; None before its first frame."""
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """The reference in force.  What is learnt against the edges stays; the next version names the new reference."""
+        """Set the reference in force.  The learnt look stays; the next version names the new reference."""
         self._reference = reference
 
     def state(self) -> FinerLookRecord | None:
@@ -108,8 +108,8 @@ class FinerLook:
         return FinerLookRecord(self._edges, self.version, pixels, self._fusion.state(), tuple(self._since_ns))
 
     def restore(self, record: FinerLookRecord) -> None:
-        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it is of another gripper, or was
-        learnt against other edges.
+        """Continue with a kept look.  Raises :class:`LookRefused`, and begins again, if it is of another gripper, or
+        was learnt with other taught edges.
         """
         if record.edges != self._edges:
             raise LookRefused("the kept look was learnt against edges that were taught otherwise; it is learnt again")
@@ -123,14 +123,14 @@ class FinerLook:
             self._alignment.forget()
             raise
         self.version, self._number, self._reported = record.version, record.version.number, False
-        # For how long it has looked so without anyone watching is not known: that is counted from here.
+        # How long it looked different while the monitor was off is not known: that is counted from here.
         self._since_ns = list(record.different_since_ns)
         self._since_s = np.array([np.inf if since is None else 0.0 for since in self._since_ns])
 
     def refine(self, frame: Frame, standing: Standing, now_s: float, swing: Array) -> Standing:
-        """The pose fused from edges and look, with bounds wider by how far it is from the edges' pose.  Unchanged where
-        the look measures nothing, contradicts the edges, or the gripper isn't rigid: a finger or the jaw isn't where it
-        should be.  ``swing`` (6,): variance of the vibration by the edges.
+        """The pose fused from edges and look, with bounds increased by its distance from the edges' pose.  Unchanged
+        where the look measures nothing or contradicts the edges, or where a finger or the jaw isn't where it should be.
+        ``swing`` (6,): variance of the vibration according to the edges.
         """
         self._pending = None
         measurement = standing.measurement
@@ -178,7 +178,7 @@ class FinerLook:
         self._report_lasting(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
 
     def _count(self, stamp_ns: int) -> None:
-        """The version that the frame belongs to; an alert reports when it begins to measure."""
+        """Update the version with this frame; an alert reports when it begins to measure."""
         if not self._alignment.views:
             return
         if self.version is None:
@@ -191,7 +191,7 @@ class FinerLook:
             self._report(Severity.INFO, f"the gripper's look refines the edges: {begun}", None)
 
     def _opening(self, frame: Frame, standing: Standing) -> tuple[float | None, float]:
-        """The jaw's opening with its standard deviation, m: as earlier frames showed it, which errs alike in all."""
+        """The jaw opening and its standard deviation, m: from earlier frames, so that its error is the same in all."""
         measurement = standing.measurement
         if not self._gripper.has_jaw:
             return None, 0.0
@@ -205,7 +205,7 @@ class FinerLook:
         return due
 
     def _report_lasting(self, different: NDArray[np.bool_], now_s: float, stamp_ns: int) -> None:
-        """Fingers (f,) that look different, and a look that contradicts the edges, once they have for long enough."""
+        """Report fingers (f,) that look different, or a look that contradicts the edges, after :data:`DIFFERENT_S`."""
         wrong = np.append(different, self._fusion.contradicts)
         self._since_s = np.where(wrong, np.minimum(self._since_s, now_s), np.inf)
         self._since_ns = [

@@ -1,9 +1,9 @@
-"""The fit of one frame repeated under each hypothesis, and the anchor: the average of the poses that proved themselves.
+"""The fit of one frame repeated under each hypothesis, and the anchor: the average of the proven poses.
 
-An edge that has belonged to something else since the first frame bends the average, too, so that the average is kept
-without it as well: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
-time).  Frames err together before a background that stands still: what their scatter doesn't show stays in the
-average's covariance, as in :mod:`gripmon.judge.smoothing`.
+An edge that has belonged to something else since the first frame biases the average, too, so that the average is also
+kept without it: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
+time).  In front of a background that stands still all frames have the same error: what their scatter doesn't show stays
+in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
 
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
-"""Stands for no bound at all."""
+"""Published where there is no bound."""
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
-"""Frames that the prior (errors don't scatter at all) is worth, and frames over which the scatter is averaged."""
+"""Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
 
 YOUNG_VARIANCE_RATIO = 0.2
-"""Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
-little more off than is believed of any average.
+"""Least variance of the average over that of a frame: it has to follow a creep, and averaging more than five frames
+would gain little, given the least variance that an average may claim.
 """
 
 CONFIRMING_FRAMES = 5
-"""Frames after a knock, besides the first, that have to prove the new place in full."""
+"""Frames after a knock, besides the first, that need the full proof of the new place."""
 
 NOTHING, UNKNOWN = -1, 1e12
-"""Stands for no fit, and the factor on another one's covariance that makes it tell nothing."""
+"""Number of a missing fit, and the factor on the covariance of the fit in its place that removes its information."""
 
 
 @cache
@@ -50,8 +50,8 @@ def _vague(count: int, m: int) -> Array:
 
 
 class Anchored(NamedTuple):
-    """Fits with the anchor's pose as one more measurement, and the normalised innovation ``square`` (h,) of that
-    against each fit without.
+    """Fits with the anchor's pose as one more measurement, and the ``square`` (h,) of its normalised innovation against
+    each fit without it.
     """
 
     fits: Separation
@@ -86,7 +86,7 @@ def protection_of(doubts: Doubts, risk: float) -> Protection:
 
 
 class Refits:
-    """One measurement's fits under h hypotheses, alone and with what is ``known`` from the anchor."""
+    """One measurement's fits under h hypotheses, alone and with the anchor as a ``known`` measurement."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class Refits:
         of_model = longer, model.finger[normal.edge], model.fingers
         of = normal.pull, normal.information, normal.middle, of_model, hypotheses.keep, held, pull
         self.anchored: Anchored | None = None
-        """The same with the anchor; None where nothing is known of one."""
+        """The same with the anchor; None without one."""
         if known is None:
             self._free = Sums.of_kept(*of).fits()
         else:
@@ -123,7 +123,7 @@ class Refits:
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
-        """(h, f, 6) of how those are off where a finger is longer by its standard deviation."""
+        """(h, f, 6) their errors if a finger is longer by its standard deviation."""
 
     @property
     def edges(self) -> NDArray[np.intp]:
@@ -150,7 +150,7 @@ class Refits:
 
 
 def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:
-    """The bound of a pose made that of another pose, ``away`` (6,) from it."""
+    """A pose's bound, increased to include another pose, ``away`` (6,) from it."""
     return Protection(
         bound.position_m + float(np.linalg.norm(away[:3])),
         bound.rotation_rad + float(np.linalg.norm(away[3:])),
@@ -176,7 +176,7 @@ class Lasting(NamedTuple):
 
     @classmethod
     def of(cls, every: Hypotheses) -> Lasting:
-        """Those of some hypotheses about all edges that don't begin at some moment."""
+        """Those of the hypotheses about all edges that aren't sudden."""
         rows = np.flatnonzero(~every.sudden)
         doubted = _doubted(every, np.arange(every.keep.shape[1]))
         return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
@@ -198,12 +198,12 @@ def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[
 
 
 class Anchor:
-    """The average of poses that proved themselves, from the first one on."""
+    """The average of the proven poses, from the first one on."""
 
     def __init__(
         self, lasting: Lasting, base_T: Array, fits: Refits, rows: NDArray[np.intp], now_s: float, knocked: bool = False
     ):
-        """``knocked``: the first pose stands elsewhere than before."""
+        """``knocked``: the first pose differs from the one expected before."""
         self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
@@ -214,12 +214,12 @@ class Anchor:
 
     @property
     def confirmed(self) -> bool:
-        """Whether enough frames have proved the place since a knock; a further one needs to prove less then."""
+        """Whether enough frames have proven the place since a knock; later ones need a weaker proof."""
         return self._to_confirm <= 0
 
     def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float) -> None:
-        """One more proven pose, by its frame's fits; ``rows`` (g,) of those; ``creep`` (6,) variances of the way since
-        the last.
+        """Add a proven pose, given by its frame's fits, ``rows`` (g,) of them; ``creep`` (6,): variances of the motion
+        since the last one.
         """
         self.now_s = now_s
         self._to_confirm -= 1
@@ -229,7 +229,7 @@ class Anchor:
         share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
         self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
         self._scatter += (share - self._scatter) / self._weight
-        # A frame that leaves a direction open says little of what frames usually tell.
+        # A frame that leaves a direction open isn't typical of the frames' variance.
         worth = np.minimum((self._frames_variance / variance).min(axis=1), 1.0)
         usual = worth**2 * gains / 6.0
         self._frames_variance += usual[:, None] * (variance - self._frames_variance)
@@ -241,7 +241,7 @@ class Anchor:
         scale = np.sqrt(np.maximum(YOUNG_VARIANCE_RATIO / young, 1.0))
         self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
         young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
-        # Of errors that last, averaging takes away less than of independent ones.
+        # Averaging reduces persistent errors less than independent ones.
         kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, SMALLEST_VARIANCE_RATIO * self._scatter)
         scale = np.sqrt(kept / young)
         self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
@@ -250,10 +250,10 @@ class Anchor:
         self.of_model: Array = self._filters.of_model[0]
 
     def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
-        """What may have been wrong since the first frame with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,)
-        of them; ``wander`` (6,): variance of the motion since the anchor.
+        """The lasting hypotheses about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of them; ``wander`` (6,):
+        variance of the motion since the anchor.
 
-        Under each hypothesis the average or the frame counts, whichever knows more; the frame where they differ.
+        Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
         """
         at = perturbation_between(self._base_T, cam_T_grip)
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)

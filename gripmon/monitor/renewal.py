@@ -1,4 +1,4 @@
-"""The reference renewed: measured again past the limit, accepted by an operator, or taken back by one."""
+"""Renewal of the reference: measured again past the limit, accepted by an operator, or undone by one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ KEEP_AGAIN_S = 10.0
 
 
 class Renewal:
-    """The references and what changes them.  Who calls it finds out by ``book.current`` whether it has."""
+    """The references and what changes them.  Callers see a change in ``book.current``."""
 
     def __init__(
         self,
@@ -49,9 +49,9 @@ class Renewal:
         state: MonitorState | None,
         keep: Keep,
     ):
-        """``floor`` (6, 6): covariance of the systematic error; ``keep`` comes before any new reference.
+        """``floor`` (6, 6): covariance of the systematic error; ``keep`` is called before any new reference.
 
-        ValueError for a state that doesn't hold together.
+        Raises ValueError for an inconsistent state.
         """
         self._gripper, self._policy, self._settings = gripper, policy, settings.recalibration
         self._settle_frames = settings.policy.settle_frames
@@ -60,11 +60,11 @@ class Renewal:
         )
         self._collects = False
         self.outcome: Proposal | Refusal | None = None
-        """What came of the newest attempt at a new reference; None before the first one."""
+        """Outcome of the newest attempt at a new reference; None before the first one."""
         self.wanted = False
         """Whether an operator wants a new reference."""
         self._rejected: ReferenceRecord | None = None  # by an operator, in place of the reference in force
-        self._unkept: ReferenceRecord | None = None  # the proposal, where it is one for want of a disk alone
+        self._unkept: ReferenceRecord | None = None  # the proposal, if it waits only because it couldn't be kept
         self._keep_again_s = 0.0
         self.book = (
             ReferenceBook(reference, keep)
@@ -73,14 +73,14 @@ class Renewal:
         )
 
     def moved(self) -> None:
-        """The camera doesn't stand still, or needs no new reference: begin to collect again."""
+        """The camera doesn't stand still, or needs no new reference: discard the collected frames."""
         if self._collects:
             self._recalibrator.forget()
             self._collects = False
 
     def collect(self, frame: Frame, standing: Standing, judgement: Judgement) -> bool:
-        """Past the limit, or when an operator wants it, collect a frame whose pose is believed: whether there are
-        enough to measure the reference again.
+        """Past the limit, or when an operator wants it, collect a frame whose pose is believed; return whether there
+        are enough to measure the reference again.
         """
         if judgement.state is not State.RECALIBRATING and not self.wanted:
             self.moved()
@@ -94,7 +94,7 @@ class Renewal:
         return judgement.recalibrate or (self.wanted and still_frames >= self._settle_frames)
 
     def still(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array) -> None:
-        """One more frame of a camera that stands still."""
+        """Add a frame of a camera that stands still."""
         self._collects = True
         corners, jaw_opening_m = measurement.corners, measurement.jaw_opening_m
         self._recalibrator.add(
@@ -112,7 +112,7 @@ class Renewal:
         )
 
     def _want(self) -> str:
-        """An operator wants a new reference: it is measured as soon as the camera stands still for long enough."""
+        """Note that an operator wants a new reference: it is measured once the camera stands still for long enough."""
         if self._settings.mode == "off":
             raise CommandRefused("recalibration is switched off (monitor.recalibration.mode)")
         self.wanted = True
@@ -123,8 +123,8 @@ class Renewal:
     def recalibrate(
         self, drift: Drift, cam_T_grip: Array, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
-        """The frames since the camera came to rest become the reference, or a proposal, or neither: what there is to
-        say of it.  ``cam_T_grip`` (4, 4) is where the gripper is now.
+        """Make the frames since the camera came to rest a reference, or a proposal, or neither; return the alerts.
+        ``cam_T_grip`` (4, 4): where the gripper is now.
         """
         cause = explanation.probable.cause
         if self.wanted and cause in NO_REFERENCE:
@@ -172,7 +172,7 @@ class Renewal:
     def _not_kept(
         self, draft: ReferenceRecord, why: str, asked: bool, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
-        """A new reference that would be forgotten waits: until it can be kept, or until an operator accepts it."""
+        """Propose a new reference that can't be kept: until it can, or until an operator accepts it."""
         self._keep_again_s = now_s + KEEP_AGAIN_S
         if not asked and self._unkept is not None and self._unkept is self.book.proposal:
             return ()  # the alert is open already
@@ -182,7 +182,9 @@ class Renewal:
         return self._policy.proposed(text, explanation, now_s, stamp_ns)
 
     def _holds(self, proposal: ReferenceRecord | None, cam_T_grip: Array) -> bool:
-        """Whether there is a proposal and the gripper is where it has it, by what would be worth a warning at least."""
+        """Whether there is a proposal and the gripper is there, to within six standard deviations or what would be
+        worth a warning, whichever is more.
+        """
         if proposal is None:
             return False
         away = perturbation_between(from_record(proposal.cam_T_grip), cam_T_grip)
@@ -192,7 +194,7 @@ class Renewal:
     def obey(
         self, command: Command, cam_T_grip: Array, measurable: bool, now_s: float, stamp_ns: int
     ) -> tuple[str, tuple[Alert, ...]]:
-        """Carry out what an operator asks, between two frames: what was done, in words, and the alerts of it.
+        """Carry out an operator's command between two frames; return a text for the operator, and the alerts.
 
         ``cam_T_grip`` (4, 4) is where the gripper is; ``measurable``: the newest frame shows it.  ``now_s`` is the
         frames' time, ``stamp_ns`` the wall clock's.  Raises :class:`CommandRefused`; then nothing has changed.
@@ -228,7 +230,7 @@ class Renewal:
             self.book.reset(stamp_ns)
         else:
             assert_never(name)
-        # What was wanted before is overtaken: it must not undo what was just asked for.
+        # An earlier request is obsolete: it must not undo this command.
         self.wanted, self._rejected = False, None
         current = self.book.current
         text = f"{current.reference_id} is in force, revision {current.revision}"

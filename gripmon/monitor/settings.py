@@ -1,4 +1,4 @@
-"""What a person may set about the whole method, a section for each step."""
+"""Settings of the whole method, a section for each step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a measurement is worth, and what is published of a frame in which the gripper was measured."""
+"""How far a measurement can be trusted, and what is published of a frame in which the gripper was measured."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gripmon.track.look import Fused
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """What one measurement is worth.
+    """How far one measurement can be trusted.
 
-    ``protection``: of the pose that was asked about.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
-    ``displaced``: the pose is not where the anchor has it.  ``ambiguous``: something else than a knock of the mount
-    explains that as well; ``grasped``: an object between the fingers may be that.  ``may_have_slid``: a lone finger may
-    have moved along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
-    hypothesis; None where all are excluded.  ``ends``: as they were seen.  ``fits``: what the bound was made of,
-    without the ends where they aren't needed; None where no edge is seen.
+    ``protection``: of the pose in question.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
+    ``displaced``: the pose is not where the anchor has it.  ``ambiguous``: something other than a knock of the mount
+    may explain that; ``grasped``: an object between the fingers may.  ``may_have_slid``: a lone finger may have moved
+    along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
+    hypothesis; None where all are excluded.  ``ends``: as they were seen.  ``fits``: those behind the bound, without
+    the ends where they aren't needed; None where no edge is seen.
     """
 
     protection: Protection
@@ -47,11 +47,11 @@ class Trust:
 class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
 
-    ``believed``: the gripper is taken to be there, so that averages, the drift test and learning use it.
+    ``believed``: averages, the drift test and learning use the pose.
     ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
     edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
     nothing in the frame proves the pose, though an earlier frame proved one.  ``finer``: the fusion of edges and look
-    that the pose is; None: the edges' alone.
+    behind the pose; None: it is from the edges alone.
     """
 
     measurement: Measurement

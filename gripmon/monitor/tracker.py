@@ -1,4 +1,4 @@
-"""From one frame to the corrected transform: measure, take what is known of the jaw into account, update."""
+"""From one frame to the corrected transform: measure, fuse the jaw opening with earlier knowledge, update."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from gripmon.track.edges import (
 from gripmon.track.jaw import JawKnowledge
 
 USUAL_SHARE = 0.6
-"""Share of agreeing profiles that is expected before anything is known about this gripper, and when teaching."""
+"""Inlier ratio that is expected before anything is known about this gripper, and when teaching."""
 
 USUAL_RATES = (0.02, 0.1)
-"""How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
+"""How fast the usual inlier ratio follows a smaller and a larger one, per frame: a few bad frames hardly lower it."""
 
 CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
-"""Most corners that a variant takes; named as in the paper."""
+"""Largest number of corners of each variant, named as in the paper."""
 
 
 class GripperSearch:
-    """Searches for a gripper that isn't seen, one search at a time, beside the frames: begun with one frame's image,
-    followed in a later frame.  Only the first search after the gripper was lost runs within its frame: a knocked
-    gripper is found at once, and one frame is late.
+    """Searches for a gripper that isn't seen, one search at a time in the background: started with one frame's image,
+    its result used in a later frame.  Only the first search after the gripper was lost runs within its frame: a
+    knocked gripper is found at once, and one frame is late.
 
-    A doubtful fit pays for looking further from a credit that good frames refill slowly.  A lost gripper is searched
-    for all the time as long as the last transform is held, and then in one of several frames: it goes on moving, and
-    may come back at any moment.  What was found beside a doubtful fit is followed for as long: a place has to show the
+    A doubtful fit may search further at the cost of a credit that good frames refill slowly.  A lost gripper is
+    searched for continuously while the last transform is held, and then in one of several frames: it keeps moving, and
+    may come back at any moment.  A place found during a doubtful fit is followed for as long: it has to show the
     fingers' ends, and clutter hides them in some frames.
     """
 
     def __init__(self, meter: FingertipMeter, settings: SearchSettings, hold_s: float):
-        """``meter``: the search's own, for it runs beside the frames."""
+        """``meter``: for the search alone, since it runs in parallel with the frames."""
         self._meter, self._settings, self._hold_s = meter, settings, hold_s
         self._backlog: Backlog[Sequence[Expected]] = Backlog()
         self._found: Sequence[Expected] | None = None  # for the newest frame
@@ -66,11 +66,11 @@ class GripperSearch:
         return self._backlog.undone
 
     def run_pending(self) -> None:
-        """Do what is waiting; in any thread."""
+        """Run the waiting searches; in any thread."""
         self._backlog.run()
 
     def begin_frame(self, now_s: float) -> Patience:
-        """Whether this frame may look further than where the gripper is expected.  Raises what a search has raised."""
+        """Whether this frame may look beyond where the gripper is expected.  Raises a failed search's exception."""
         self._now_s, self._found = now_s, None
         for found in self._backlog.results(now_s):
             if isinstance(found, Exception):
@@ -88,8 +88,8 @@ class GripperSearch:
         return Patience(self._credit >= 1.0, when_lost, at_once)
 
     def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
-        """Places to follow in this frame: those that an earlier frame's search found, or this one's if the gripper was
-        just lost; else none, and a search begins with a copy of the image.
+        """Places to follow in this frame: those found by an earlier frame's search, or by this one's if the gripper was
+        just lost; else none, and a search starts with a copy of the image.
         """
         if self._found is not None:
             return self._found
@@ -101,7 +101,7 @@ class GripperSearch:
         return ()
 
     def end_frame(self, measurement: Measurement) -> None:
-        """Count what the frame has shown."""
+        """Update the credit and the counters with the frame's measurement."""
         pays = measurement.looked_far and self._found is None
         earned = -1.0 if pays else 1.0 / self._settings.refill_frames
         self._credit = min(max(self._credit + earned, 0.0), float(self._settings.eager_frames))
@@ -122,20 +122,20 @@ class Tracker:
         self.floor: Array = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
         """(6, 6) covariance of the systematic error that no averaging removes."""
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
-        """By how much the model may have each finger out of its place; teaching measures that."""
+        """Standard deviation of each finger's length in the model, m; 0 with taught edges, which include it."""
         self.taught_digest = "" if taught is None else taught.digest
-        """Of what was taught; empty: nothing was."""
-        self._jaw_opening_m = gripper.jaw_nominal_m  # where it was seen last
+        """Digest of the taught edges; empty without any."""
+        self._jaw_opening_m = gripper.jaw_nominal_m  # as measured last
         self._usual_share = USUAL_SHARE
-        # Of their own, since they may run beside a measurement.
+        # Separate meters, since they may run in parallel with a measurement.
         searcher = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         self.searching = GripperSearch(searcher, settings.corners.search, settings.policy.hold_s)
         self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
 
     def measure(self, frame: Frame, cam_T_grip: Array, now_s: float, rivals: tuple[Array, ...] = ()) -> Measurement:
-        """Measure about ``cam_T_grip`` (4, 4), where the gripper is expected, and look further when clearly fewer edge
-        points agree than usually: at the ``rivals`` (4, 4) first.  An opening that isn't reported is expected where it
-        was last.
+        """Measure around ``cam_T_grip`` (4, 4), where the gripper is expected, and look further if clearly fewer edge
+        points than usual are inliers: at the ``rivals`` (4, 4) first.  An opening that isn't reported is expected to
+        be as measured last.
         """
         assert frame.image is not None
         patience = self.searching.begin_frame(now_s)
@@ -158,7 +158,7 @@ class Tracker:
         return self._jaw_opening_m if frame.jaw_opening_m is None else frame.jaw_opening_m
 
     def measure_held(self, frame: Frame, cam_T_grip: Array, sigma: Array) -> Measurement:
-        """Measure at ``cam_T_grip`` (4, 4), with what lies within the standard deviations (6,) of it; nowhere else."""
+        """Measure only at ``cam_T_grip`` (4, 4), with the edges within its standard deviations (6,)."""
         assert frame.image is not None
         measurement = self._meter.measure_held(
             frame.image, cam_T_grip, sigma, self._opening_m(frame), self._usual_share
@@ -166,8 +166,8 @@ class Tracker:
         return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
     def learn(self, measurement: Measurement, opening: bool) -> None:
-        """Learn from a frame whose pose is believed: the share of search lines that usually agree, and, if the seen
-        ``opening`` is believed as well, the report's error.
+        """Learn from a frame whose pose is believed: the usual inlier ratio, and, if the measured ``opening`` is
+        believed as well, the error of the reported one.
         """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
@@ -175,13 +175,13 @@ class Tracker:
             self._jaw.learn()
 
     def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""
+        """Whether the fingers' ends are seen as ends; takes a quarter of a measurement's time."""
         assert frame.image is not None
         return self._meter.ends(frame.image, measurement, strict)
 
     @property
     def finger_axis(self) -> Array:
-        """(3,) the way that the fingers run, gripper frame; zero where they have none."""
+        """(3,) the fingers' direction, gripper frame; zero if they have none."""
         return self._meter.finger_axis
 
     @property
@@ -190,7 +190,7 @@ class Tracker:
         return self._meter.along
 
     def with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
-        """The measurement with the opening's error as earlier frames have shown it."""
+        """The measurement, corrected by the reported opening's error as learnt from earlier frames."""
         if reported_m is None or not self._gripper.has_jaw:
             return measurement
         if self._jaw.exact:
@@ -211,9 +211,7 @@ class Tracker:
         )
 
     def update(self, measurement: Measurement) -> tuple[Array, Array]:
-        """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation
-        (17).
-        """
+        """The corrected transform and its covariance: from all inlier edgels, or from the corners and equation (17)."""
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         if self._settings.measurement == "edges":
             return cam_T_grip, covariance + self.floor
@@ -225,13 +223,13 @@ class Tracker:
                 cam_T_grip = perturb(measurement.prediction.cam_T_grip, update.xi)
                 covariance = update.covariance
                 if self._gripper.has_jaw:
-                    # The corners take the opening as known: what its uncertainty does to the motion comes on top.
+                    # The corners assume the opening known: add its uncertainty's effect on the motion.
                     jaw_sigma_m = float(np.sqrt(measurement.covariance[6, 6]))
                     opened_m = measurement.jaw_opening_m + jaw_sigma_m
                     opened = self._corner_update(measurement, taken, covariance_xy, opened_m)
                     covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
             except DegenerateGeometry:
-                pass  # The corners that are left lie on a line: the edges still determine the motion.
+                pass  # The remaining corners lie on a line: the edges still determine the motion.
         return cam_T_grip, covariance + self.floor
 
     @staticmethod
@@ -247,12 +245,12 @@ class Tracker:
         )
 
     def taken(self, measurement: Measurement) -> NDArray[np.bool_]:
-        """(c,) the usable corners that the configured variant takes."""
+        """(c,) the usable corners that the configured variant uses."""
         return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[self._settings.update_corners])
 
     def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
-        """What each finger shows by itself in a measured frame; takes several times as long as the measurement, and may
-        run in another thread.
+        """The evidence of each finger by itself in a measured frame; takes several times as long as the measurement,
+        and may run in another thread.
         """
         assert frame.image is not None
         reported = frame.jaw_opening_m is not None

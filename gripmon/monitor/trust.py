@@ -1,4 +1,4 @@
-"""Which pose is published, and what may rest on it: where a measurement and the anchor differ, one has to prove itself.
+"""Which pose is published, and how far it is trusted: where a measurement and the anchor differ, one must be proven.
 
 A pose that isn't where the gripper was is believed when the fingers' ends are seen there as ends and the gripper's
 learned look doesn't contradict: mounts are knocked rarely, objects hide fingers in every grasp.
@@ -28,14 +28,12 @@ from gripmon.track.edges import Measurement
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, LookRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
-"""Frames from one look at the fingers' ends to the next, while the gripper is where it was and the last look proved
-it.
-"""
+"""Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
 
 
 class _Candidate(NamedTuple):
-    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), where the fingers are
-    seen along themselves from there, and its worth.
+    """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), the fingers' slide from
+    there according to their strips, and how far the place is trusted.
     """
 
     measurement: Measurement
@@ -89,7 +87,7 @@ class Integrity:
         return self._weigher.swing if self._finer_swing is None else self._finer_swing
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """Tell the look which reference is in force."""
+        """Pass the reference in force to the look."""
         if self._finer is not None:
             self._finer.refer(reference)
 
@@ -98,7 +96,7 @@ class Integrity:
         self._weigher.rebase(reference)
 
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
-        """Go on after a restart: from the pose (4, 4) that was known last, with the look that was learnt."""
+        """Continue after a restart: from the last known pose (4, 4), with the kept look."""
         self._weigher.rebase(reference, last_T)
         if state is not None and state.look is not None:
             try:
@@ -111,7 +109,7 @@ class Integrity:
                 self.look_refused = str(refused)
 
     def learn(self) -> None:
-        """Learn the look of the newest frame that proved where the gripper is; nothing if that has been done."""
+        """Learn the look from the newest frame that proved the pose, once."""
         learn_from, self._learn_from = self._learn_from, None
         if learn_from is not None:
             self._look.learn(*learn_from)
@@ -129,18 +127,18 @@ class Integrity:
         return cam_T_grip if self._believed or anchor is None else anchor.cam_T_grip
 
     def rivals(self, ref_cam_T_grip: Array) -> tuple[Array, ...]:
-        """Where else the gripper may be: where it proved to be last, and where the reference has it."""
+        """Where else the gripper may be: at the anchor, and where the reference has it."""
         anchor = self._weigher.anchor
         return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
 
     def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The bounds of what stood ``unseen_s`` ago, with the covariance (6, 6) of what may have happened since on top;
-        ``hidden``: the image is good, and nothing is seen of the gripper.
+        """The bounds of a pose published ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
+        ``hidden``: the image is good, but the gripper isn't seen.
         """
         return self._weigher.held(standing.protection, growth, unseen_s, hidden)
 
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
-        """What to publish of a measurement, and what may rest on it; None where the gripper isn't seen."""
+        """What to publish of a measurement, and how far it is trusted; None where the gripper isn't seen."""
         if measurement.trusted:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)
@@ -177,15 +175,15 @@ class Integrity:
             ends = self._tracker.ends(frame, measurement, strict=True)
             strictly = weigh(measurement, cam_T_grip, ends, now_s)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
-            # A knock is rare: even odds speak against it.
+            # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
-        """A candidate, corrected where the fingers' look shows that it has slid along them, because something else was
+        """A candidate, corrected where the fingers' strips show that it has slid along them, because something else was
         taken for their ends: also at the expected place, if a knock brought it there.  If the gripper isn't measured
-        where the look has it either: the same pose, bounded without the ends.
+        where the strips have it either: the same pose, bounded without the ends.
         """
         weigher, (measurement, cam_T_grip, _, along, trust) = self._weigher, here
         if along.slide_m is not None:
@@ -207,9 +205,9 @@ class Integrity:
         return measurement.prediction.moved_px(perturbation_between(self._weigher.expected[0], cam_T_grip))
 
     def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
-        """A displaced pose against the expected place.  The proven one is published; where both or neither are, the
-        expected place, since mounts are knocked rarely.  ``at_first``: what the displaced pose was worth before its
-        ends were looked at strictly.
+        """Decide between a displaced pose and the expected place.  The proven one is published; where both or neither
+        are, the expected place, since mounts are knocked rarely.  ``at_first``: the trust in the displaced pose before
+        the strict check of its ends.
         """
         there = self._at_its_place(frame, now_s)
         proven = here.trust.proven
@@ -223,7 +221,7 @@ class Integrity:
         return _reaching(standing, here.cam_T_grip, "the fingers stand elsewhere, where their ends are seen, too")
 
     def _held(self, frame: Frame, now_s: float) -> Standing | None:
-        """For a frame in which the gripper wasn't found: what is measured at the anchor.  None without an anchor, where
+        """For a frame in which the gripper wasn't found: the measurement at the anchor.  None without an anchor, where
         too little is seen there, or where the bound is past an alert limit.
         """
         there = None if self._weigher.anchor is None else self._at_its_place(frame, now_s)
@@ -280,16 +278,16 @@ class Integrity:
         standing = Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
         if moved or trust.ambiguous or not trust.displaced:
             return standing
-        # Until another frame says so, too, it may as well be where it was.
+        # Until another frame confirms it, the gripper may as well be where it was.
         why = "the fingers stand elsewhere, or the mount was knocked just now"
         return _reaching(standing, self._weigher.expected[0], why)
 
     def _knocked(self, trust: Trust, beside_px: float, seen_along: bool) -> bool:
-        """Whether the mount was knocked; the edges show ``beside_px`` from the old place.  Knocks are so rare that one
-        frame doesn't suffice, unless what the fingers show along themselves is seen there, too, or the motion is as
-        small as a creep.  Further frames have to prove the new place before the old one is proven again or something
-        else explains the motion; the mount may ring meanwhile.  Before the fingers' look is known they prove nothing:
-        that a mark was taken for the ends is less rare than a knock.
+        """Whether the mount was knocked; the edges are ``beside_px`` from the old place.  Knocks are so rare that one
+        frame doesn't suffice, unless the fingers' strips are seen there, too, or the motion is as small as a creep.
+        Further frames have to prove the new place before the old one is proven again or something else explains the
+        motion; the mount may ring meanwhile.  Before the strips are learnt even these prove nothing: a mark taken for
+        the ends is less rare than a knock.
         """
         if not trust.proven:
             return False
@@ -300,8 +298,8 @@ class Integrity:
         return self._elsewhere >= self._policy.confirm_frames and not unknown
 
     def _by_anchor(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
-        """Publish the pose under the most probable hypothesis, by the anchor and the edges that it keeps: the frame
-        alone leaves it open.
+        """Publish the pose under the most probable hypothesis, from the anchor and the edges that it keeps: the frame
+        alone doesn't determine it.
         """
         measurement, _, _, along, trust = candidate
         assert trust.instead is not None
@@ -313,16 +311,14 @@ class Integrity:
         return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
     def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
-        """Whether the gripper's look is seen at the expected place, and so much less at this pose that it can't be
-        here.
-        """
+        """Whether the gripper's look excludes this pose: it is seen at the expected place, and much less here."""
         if not self._look.ready or frame.image is None:
             return False
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
     def _along(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, risk: float = LOOK_ODDS) -> StripsSeen:
-        """Where the gripper is seen to stand along its fingers, against a pose (4, 4), at odds of one to ``risk``."""
+        """Where the strips have the gripper along its fingers, from a pose (4, 4), at odds of one to ``risk``."""
         if frame.image is None:
             return StripsSeen()
         return self._strips.compare(frame.image, cam_T_grip, measurement.jaw_opening_m, risk)
@@ -335,6 +331,6 @@ class Integrity:
 
 
 def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
-    """The same with a bound that includes another possible pose (4, 4), and not believed."""
+    """The same, not believed, with a bound that includes another possible pose (4, 4)."""
     away = perturbation_between(standing.cam_T_grip, other_T)
     return replace(standing, protection=reaching(standing.protection, away, why), believed=False)

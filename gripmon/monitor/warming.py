@@ -1,4 +1,4 @@
-"""Before the first frame: machine code for the arithmetic of all of them."""
+"""Machine code for the frames' arithmetic, loaded or compiled before the first frame."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from gripmon.track import edges, integrity, look
 _log = logging.getLogger(__name__)
 
 LOADED_WITHIN_S = 2.0
-"""What takes longer was compiled, not only loaded."""
+"""A longer warm-up has compiled something, not only loaded it."""
 
 MOST_UNKEPT = 1000
-"""Functions that could not be kept on the disk, more than there are: something else is wrong."""
+"""Bound on retries for functions that can't be kept on the disk: more than there are functions."""
 
 
 def warm_up() -> str:
-    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine; what a person
-    should know of it, or empty.
+    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine; return a message
+    for the user, or an empty string.
     """
     begin_s = time.perf_counter()
     unkept = ""
@@ -43,7 +43,7 @@ def warm_up() -> str:
 
 
 def _warm(part: Callable[[], object]) -> str:
-    """Why something could not be kept, or empty."""
+    """Run one part's warm-up; return why its code could not be kept on the disk, or an empty string."""
     unkept = ""
     for _ in range(MOST_UNKEPT):
         try:

@@ -1,8 +1,8 @@
-"""How far a measured pose may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+"""How far a measured pose may be off: bounds over all fault hypotheses (see ``docs/integrity.md``).
 
-Two things keep a fit honest beside its own residuals.  Only the fingers' ends show a motion along the fingers: it is
-checked whether they are seen as ends.  And a mount stays where it was a moment ago, but for its creep, unless it was
-knocked, which is rare: the average of the poses that proved themselves is the anchor.
+Two things check a fit besides its own residuals.  Only the fingers' ends show a motion along the fingers: it is
+checked whether they are seen as ends.  And a mount stays where it was a moment ago, except for its creep, unless it was
+knocked, which is rare: the average of the proven poses is the anchor.
 """
 
 from __future__ import annotations
@@ -44,27 +44,27 @@ VIBRATION_FRAMES = 20.0
 
 MISREAD_PROBABILITY = 0.1
 """Probability that what is seen where a finger's end is expected is something else, and that each further corner of it
-is: what a border shows that may be anywhere within the search lines' reach, and is within a tenth of it.
+is: that of a border anywhere within the search lines' reach to lie within a tenth of it.
 """
 
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
 
 JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
-"""Squared normalised innovation of the opening from which a displaced pose is more than a knock: noise exceeds it once
-in a thousand knocks, which then count as one a frame later.
+"""Squared normalised innovation of the opening above which a displaced pose isn't explained by a knock alone: noise
+exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
 KNOCK_UNSEEN_PROBABILITY = 5e-4
-"""Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
-that the rate of knocks over all the time says too little.
+"""Probability that the mount is knocked while something hides the fingers' ends: the gripper touches things then, so
+that the average rate of knocks is too low.
 """
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
 
 CORNERS_WHERE_EXPECTED = 3
-"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
+"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers."""
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
@@ -100,8 +100,8 @@ class Weigher:
         self.rebase(reference)
 
     def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
-        """Expect the gripper at a reference, or at the pose (4, 4) that was known last, until a frame proves where it
-        is.  What was unexplained at an older reference no longer counts.
+        """Expect the gripper at a reference, or at the last known pose (4, 4), until a frame proves a pose.  An
+        unexplained difference from an older reference no longer counts.
         """
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
@@ -128,12 +128,11 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
     ) -> Trust:
-        """Bound the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
+        """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
-        ``ends``: the fingers' ends as seen; None where they were not looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.
-        ``slid``: the fingers are seen elsewhere along themselves, so that what was taken for their ends is something
-        else.
+        ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
+        the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
+        strips are seen elsewhere, so that something else was taken for their ends.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -141,24 +140,24 @@ class Weigher:
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses, anchor = fits.hypotheses, self.anchor
-        # The gate: a hypothesis that also needs a knock of the mount is not what happened.
+        # The gate: a hypothesis that also needs a knock of the mount is excluded.
         holds = anchored.square <= CONTRADICTION_SQUARE
         displaced = not holds[0] and explained is None
-        # The proof: the fingers' ends, where they may not be something else.
+        # The proof: fingers' ends that can't be something else.
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         may_have_slid = self._lone and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
-        # The priors: only that of the ends depends on the frame.  Then the probability that nothing but the frame tells
-        # where the fingers are along themselves.
+        # The priors: only that of the ends depends on the frame.  Then the probability that only the frame shows where
+        # the fingers are along their direction.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         alone = 1.0
         if anchor is not None and not (displaced or may_have_slid):
             alone = self._knocked(now_s - anchor.now_s, hidden=True)
         jumped = alone * prior[hypotheses.ends] > risk
-        # What may have been wrong all along: by the frame, or by the anchor, to whose place the ends belong then.
+        # Lasting hypotheses: from the frame, or from the anchor, whose place the ends confirm then.
         made_of = fits
         if displaced or jumped or anchor is None:
             all_along, without = self._doubts_of_frame(measurement, fits, prior, cam_T_grip, alone if jumped else None)
@@ -172,7 +171,7 @@ class Weigher:
                 away = perturbation_between(self._expected[0], cam_T_grip)
                 protection = larger(protection, self._not_as_expected(away))
             return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
-        # What may be wrong since the anchor, and the most probable of it.
+        # Hypotheses since the anchor, and the most probable one.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
@@ -184,7 +183,7 @@ class Weigher:
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
         if displaced and not ambiguous and opened:
-            # A knock leaves the jaw alone: fingers that flex and shadows beside them look like both at once.
+            # A knock doesn't move the jaw: flexing fingers and shadows beside them look like both at once.
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
             protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
@@ -193,14 +192,13 @@ class Weigher:
     def _doubts_of_frame(
         self, measurement: Measurement, fits: Refits, prior: Array, cam_T_grip: Array, alone: float | None
     ) -> tuple[Doubts, Refits | None]:
-        """What may have been wrong since the first frame, by this frame's ``fits`` alone, with probabilities ``prior``
-        (h,).
+        """The lasting hypotheses from this frame's ``fits`` alone, with probabilities ``prior`` (h,).
 
-        ``alone``: the probability that only this frame shows where the fingers' ends are, if what looks like them may
-        be something else; then the fits without the ends are returned as well.
+        ``alone``: the probability that only this frame shows where the fingers' ends are, if they may be something
+        else; then the fits without the ends are returned as well.
         """
         hypotheses = fits.hypotheses
-        # What knocks the mount bends a finger, too; but a finger is taken to be straight at first.
+        # A knock of the mount may bend a finger, too; but fingers are assumed straight at first.
         counts = ~hypotheses.sudden if self.anchor is None else np.ones_like(hypotheses.sudden)
         rows = counts.copy()
         rows[hypotheses.ends] = True
@@ -213,7 +211,7 @@ class Weigher:
         return doubts + without.doubts(cam_T_grip, besides).among(counts & more), without
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
-        """Take a proven pose (4, 4) with its covariance (6, 6) into the anchor, or begin a new anchor with it."""
+        """Add a proven pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it."""
         assert trust.fits is not None
         rows = self._about(trust.fits.edges)[1]
         self._slid = trust.may_have_slid
@@ -221,7 +219,7 @@ class Weigher:
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
-            # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to say which.
+            # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
             self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
@@ -230,9 +228,10 @@ class Weigher:
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
-        """Whether a lone finger may have slid along itself though corners are seen: they may be those of a mark on it
-        or of what lies beside it.  They prove a place that the edges don't distinguish from the reference's, and then
-        each place within a step of the proven one; elsewhere a person has to say so, by a new reference.
+        """Whether a lone finger may have slid along itself though corners are seen: they may belong to a mark on it or
+        to something beside it.  They prove a place that the edges don't distinguish from the reference's, and then
+        each place less than :data:`ONE_EDGE_PX` from the proven one; elsewhere a person has to confirm it by a new
+        reference.
         """
         if self._slid is None:
             covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor
@@ -261,8 +260,8 @@ class Weigher:
         return max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
-        """How often the fingers' ends are seen where the pose has them: for each finger once by its edges, and once
-        more by each further corner.
+        """How many times the fingers' ends are seen where the pose has them: once for each finger by its edges, and
+        once more for each further corner.
         """
         return self._times(self._across(measurement), ends)
 
@@ -277,8 +276,8 @@ class Weigher:
 
     def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
         """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
-        measured edges that count.  A finger's root is no end, and a single straight border shows what edges on one line
-        do, of whatever fingers they are.
+        measured edges that count.  A finger's root isn't an end, and edges on one line count once, of whichever
+        fingers: a single straight border may show them all.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]
@@ -292,7 +291,7 @@ class Weigher:
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock; each side may be
-        misread as an end may.
+        misread with the same probability as an end.
         """
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
@@ -301,8 +300,8 @@ class Weigher:
         return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
-        """Whether the protection level of a pose (4, 4) by some fits is within the alert limits.  Curved and tapered
-        fingers show without their ends where they are along themselves.
+        """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
+        fingers show a motion along themselves even without their ends.
         """
         bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
         return past_alert_limit(bound, self._policy) is None
@@ -323,7 +322,7 @@ class Weigher:
 
     def _refitted(self, measurement: Measurement, now_s: float, wander: Array) -> tuple[Refits, Anchored]:
         """The fits of a measurement, alone and with the anchor after a motion of variances ``wander`` (6,).  They are
-        kept for the frame, which is weighed again once its ends are looked at, and for another pose that it allows.
+        kept while the same measurement is weighed again: with its ends checked, or for another pose.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
@@ -349,7 +348,7 @@ class Weigher:
 
 
 def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
-    """Whether the fingers' ends are seen as ends.  Where the gripper is expected fewer corners suffice; where its
+    """Whether the fingers' ends are seen as ends.  Where the gripper is expected, fewer corners suffice; where its
     innovation is within noise (``again``), one of each finger.
     """
     if ends is None:
@@ -381,7 +380,7 @@ def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
 def foresee_protection(
     tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
 ) -> Protection:
-    """The protection level of a single frame that shows what the measurement does, with its fingers' ends proven."""
+    """The protection level of a single frame with the given measurement and proven fingers' ends."""
     if not len(measurement.normal.edge):
         return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
     hypotheses = _hypotheses_about(

@@ -110,7 +110,7 @@ def pose_from_corners(
     hand = [i for i, c in enumerate(snapped.corners) if c.name in by_hand_px]
     for name in (snapped.corners[i].name for i in hand):
         if not np.isfinite(camera.undistort(np.reshape(by_hand_px[name], (1, 2)))).all():
-            raise PoseRefused(f"{name} was put where the lens shows nothing; inside the lens's view, or not by hand")
+            raise PoseRefused(f"{name} was placed outside the lens's view; inside it, or not by hand")
     every = [*measured, *hand]
     taken = np.isin(np.arange(len(snapped.corners)), measured)
     uv_px = np.array([snapped.corners[i].uv_px for i in measured] + [by_hand_px[snapped.corners[i].name] for i in hand])

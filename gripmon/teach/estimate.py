@@ -295,7 +295,7 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
     if off_px[worst] > AGREEING_PX:
         raise ImageRefused(
             views[worst].image,
-            f"the gripper shows {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
+            f"the gripper appears {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
             "px: images without motion of the camera, each with its own jaw opening",
         )
 
@@ -325,8 +325,8 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         )
     if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:
         faults.append(
-            f"the jaw shows an opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m is "
-            f"reported, at most {1e3 * allowed_m:.3f} mm may be between them: the opening corrected "
+            f"the image shows a jaw opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m is "
+            f"reported; at most {1e3 * allowed_m:.3f} mm apart: correct the opening "
             "(timestamps.csv, --jaw-opening), or a larger monitor.jaw_sigma_m"
         )
     if faults:
@@ -336,8 +336,8 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
     if away_px <= NOTED_PX:
         return None
     return (
-        f"the reference is taken at its word, though the gripper shows up to {away_px:.1f} px beside it, "
-        f"{viewer.distance(pose)}; taught there it holds over a wider range: {viewer.pose(pose)}"
+        f"the reference is assumed exact, though the gripper appears up to {away_px:.1f} px off it, "
+        f"{viewer.distance(pose)}; taught at its own pose it holds over a wider range: {viewer.pose(pose)}"
     )
 
 
@@ -350,7 +350,7 @@ def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeL
         away_px = float(np.abs(edge.mean_px).max())
         if away_px > allowed_px:
             raise TeachingRefused(
-                f"edge {viewer.gripper.edge_ids[index]} shows {away_px:.1f} px "
+                f"edge {viewer.gripper.edge_ids[index]} appears {away_px:.1f} px "
                 f"({1e3 * away_px / edge.sampled.per_m:.2f} mm) from the reference; at most {allowed_px:.1f} px, which "
                 "a bevel and the standard deviations of reference and jaw explain: correct the gripper file"
             )

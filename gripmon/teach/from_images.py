@@ -172,13 +172,13 @@ def gripper_from_images(
         opening_m, moved = as_gaps(placed, moved, scale[0])
         notes.append(
             f"openings: the gap between the fingertips, as the images show it, {1e3 * min(opening_m, *moved):.2f} to "
-            f"{1e3 * max(opening_m, *moved):.2f} mm; what the jaws report may be another number"
+            f"{1e3 * max(opening_m, *moved):.2f} mm; the jaws may report another number"
         )
     described = Seen(made, seen, outlines, placed, moved, scale[0], opening_m)
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
     except GripperError as error:
-        raise NoResultError(f"what the images show is not a gripper that can be tracked: {error}") from None
+        raise NoResultError(f"the gripper in the images can't be tracked: {error}") from None
     if pose is None:
         cam_T_grip = make_transform(placed.rotation, placed.tcp * scale[0])
         covariance = _covariance(made.fx_px, placed, scale, seen)
@@ -227,7 +227,7 @@ def _see_openings(
     first, *others = seen
     pronged = apart_by_motion(camera, seen[first], [seen[opening] for opening in others])
     if pronged is not None:
-        notes.append("what joins the fingers in the image, and stays where it is as they move, isn't used")
+        notes.append("parts of the image that join the fingers and don't move with them aren't used")
     return pronged or seen[first], {opening: seen[opening] for opening in others}
 
 
@@ -239,9 +239,9 @@ def _check(
     count: int,
 ) -> None:
     if count < FEWEST_IMAGES:
-        raise InputError(f"{count} images; at least {FEWEST_IMAGES}, each before another background", "images")
+        raise InputError(f"{count} images; at least {FEWEST_IMAGES}, each in front of another background", "images")
     if count > MOST_IMAGES:
-        raise InputError(f"{count} images; at most {MOST_IMAGES}, each before another background", "images")
+        raise InputError(f"{count} images; at most {MOST_IMAGES}, each in front of another background", "images")
     lengths = {"distance_m": distance_m, "finger_width_m": finger_width_m, "reference": reference}
     given = [key for key, value in lengths.items() if value is not None]
     if len(given) > 1:
@@ -253,7 +253,7 @@ def _check(
             raise InputError("some images have one and others don't; of all images or of none", "openings_m")
     if not given and (openings_m is None or _spread(openings_m) <= SAME_OPENING_M):
         raise InputError(
-            "nothing tells the size: --distance M (fingertips from the camera), --finger-width M, --reference FILE, or "
+            "the scale is unknown: --distance M (fingertips from the camera), --finger-width M, --reference FILE, or "
             "images at several jaw openings, in metres in their timestamps.csv"
         )
 
@@ -280,8 +280,8 @@ def _groups(
     runs.sort(key=lambda run: -len(run))
     if len(runs[0]) < FEWEST_IMAGES:
         raise InputError(
-            f"at most {len(runs[0])} images are of one opening; {FEWEST_IMAGES} or more before changing backgrounds, "
-            "the jaws standing",
+            f"at most {len(runs[0])} images are of one opening; {FEWEST_IMAGES} or more with changing backgrounds, "
+            "the jaws at rest",
             "openings_m",
         )
     return {round(float(np.mean([openings_m[k] or 0.0 for k in run])), 6): sorted(run) for run in runs}
@@ -323,7 +323,7 @@ def _scale(
         return float(reference[0][2, 3]), float(np.sqrt(reference[1][2, 2]))
     if opening_m is None or not moved or len(placed.points) < 2:
         raise NoResultError(
-            "the openings don't tell the size: two fingers that move with the jaws, at two openings at least; or "
+            "the openings don't give the scale: two fingers that move with the jaws, at two openings at least; or "
             "--distance M, --finger-width M"
         )
     values, weights = [], []
@@ -364,19 +364,19 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
         )
     if placed.flat:
         notes.append(
-            "the outline is taken as flat, facing the camera: no three long edges of the fingers meet in one point. "
+            "the outline is assumed flat, facing the camera: no three long edges of the fingers meet in one point. "
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
         )
     elif reference is None and len(placed.points) == 1:
-        notes.append(
-            "the finger's long edges are taken as parallel: a taper would be taken for another direction of it"
-        )
+        notes.append("the finger's long edges are assumed parallel: a taper would look like another direction of it")
     if placed.by_motion:
-        notes.append("depths are from the fingers' motion: both are taken to move equally far, against each other")
+        notes.append(
+            "depths are from the fingers' motion: both are assumed to move equally far, in opposite directions"
+        )
     if placed.round_tips:
         notes.append(
-            "round fingertips are taken to lie in the plane of their sides. Corrections of the camera's tilt, and of "
+            "round fingertips are assumed to lie in the plane of their sides. Corrections of the camera's tilt, and of "
             "motions of some per cent of the distance, are too small or too large by what they stand out of it"
         )
     if left_out:

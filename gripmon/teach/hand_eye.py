@@ -86,7 +86,7 @@ class KnownGripper:
             cam_T_plate = plate_pose(self.camera.lens, sighting)[0]
             expected = rough_pose(camera, gripper, cam_T_plate, rough, opening_m, contact_m)
         if expected is None:
-            raise CalibrationError("nothing says where the gripper is in the image; rough corners, or a calibration")
+            raise CalibrationError("the gripper's place in the image is unknown; rough corners, or a calibration")
         corners, missing = measure_known(camera, gripper, image, expected, opening_m, rough)
         places = [gripper.point_ids.index(name) for name in corners.names]
         found = calibrate_image(self.camera, sighting, corners, KnownCorners(points_m[places], contact_m))
@@ -109,7 +109,7 @@ class UnknownGripper:
     def measure(self, image: Image, sighting: Sighting, rough: Rough | None) -> ImageOnPlate:
         """Raises :class:`CalibrationError`."""
         if rough is None:
-            raise InputError("a gripper that isn't known needs rough corners")
+            raise InputError("an unknown gripper needs rough corners")
         outline, camera = outlines_of(rough), make_camera(self.camera.lens)
         printed = plate_print(camera, plate_pose(self.camera.lens, sighting)[0], sighting, self.target, image)
         corners, snapped = measure_outlines(camera, image, outline, printed)
@@ -165,7 +165,7 @@ class HandEyeOnPlate:
         try:
             return Gripper(inferred_model(name, outline, points_m, jaw_range_m, jaw_opening_m, provenance))
         except GripperError as error:
-            raise CalibrationError(f"what the corners show is not a gripper: {error}") from None
+            raise CalibrationError(f"the corners don't form a gripper: {error}") from None
 
     def document(self, gripper: Gripper, provenance: Provenance) -> HandEyeCalibration:
         """The content of the calibration's file."""
@@ -307,9 +307,9 @@ def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
 def _notes(method: KnownGripper | UnknownGripper, given_m: float | None) -> tuple[str, ...]:
     notes = []
     if isinstance(method, KnownGripper) and method.gripper.has_jaw and given_m is None:
-        notes.append(f"jaw opening taken as {method.jaw_opening_m:g} m; --jaw-opening M if it was another")
+        notes.append(f"jaw opening assumed to be {method.jaw_opening_m:g} m; --jaw-opening M if it was another")
     if not method.camera.parameters:
-        notes.append("how certain the camera is isn't known: its errors are not in the covariance")
+        notes.append("the camera's uncertainty is unknown: its errors are not in the covariance")
     return tuple(notes)
 
 
@@ -387,7 +387,7 @@ def measure_tracked(
     if 2 * len(chosen) <= len(found) and len(found) > 1:
         share = f"only {len(chosen)}" if len(chosen) > 1 else "no two"
         raise CalibrationError(
-            f"{share} of {len(found)} images agree on where the gripper is; images of one pose, in which the "
+            f"{share} of {len(found)} images agree on the gripper's pose; images of one pose, in which the "
             "background doesn't hide its edges"
         )
     doubts = [f"left out: {reason}" for reason in reasons]
@@ -395,5 +395,5 @@ def measure_tracked(
         f"left out: {name}: contradicts the other images" for name, kept in zip(found, agree, strict=True) if not kept
     ]
     if len(found) == 1:
-        doubts.insert(0, f"{next(iter(found))} alone: nothing confirms what it shows; three images or more are better")
+        doubts.insert(0, f"{next(iter(found))} alone: nothing confirms it; three images or more are better")
     return (cam_T_grip, covariance), tuple(doubts)

@@ -66,7 +66,7 @@ def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
             Outline(name, points, np.concatenate(corner), tuple(pieces), finger.outwards, lengths, inner, inner_px)
         )
     if any(not (outline.length_px >= SHORTEST_EDGE_PX).any() for outline in out):
-        raise NoResultError("a part of what stays has no edge of 8 px; fingertips in view and in focus")
+        raise NoResultError("a static part has no edge of 8 px; fingertips in view and in focus")
     return out
 
 

@@ -92,8 +92,8 @@ def check_opened(moved: Mapping[float, Sequence[FingerMoved]], counts: Sequence[
             raise sets_refused(counts)
         if together > MOST_TOGETHER * float(np.linalg.norm(np.ptp(shifts, axis=0))):
             raise NoResultError(
-                f"the images fall into sets of {' and '.join(map(str, counts))}, between which all that stays has "
-                "moved together: the camera moved; a camera fixed to the gripper, jaws alone that move"
+                f"the images fall into sets of {' and '.join(map(str, counts))}, between which everything static "
+                "moved together: the camera moved; a camera fixed to the gripper, only the jaws moving"
             )
 
 

@@ -67,7 +67,7 @@ def see_opening(
         if found.blur_px > MOST_BLUR_PX:
             raise NoResultError(
                 f"the outline is blurred by {found.blur_px:.1f} px in all images; at most {MOST_BLUR_PX:g} px: "
-                "fingertips in focus, no motion while exposing"
+                "fingertips in focus, no motion during exposure"
             )
         bad = _unlike(matte, stations, found)
         if not bad or turn == 2:
@@ -78,7 +78,7 @@ def see_opening(
         if len(good) < max(FEWEST_IMAGES, (len(images) + 2) // 2):
             raise NoResultError(
                 f"{len(left_out)} of {len(images)} images can't be used ({next(iter(bad.values()))}); a camera that is "
-                "fixed to the gripper, jaws that stand, sharp images"
+                "fixed to the gripper, jaws at rest, sharp images"
             )
         again = find_matte([images[matte.kept[k]] for k in good], least_noise)
         matte = replace(again, kept=tuple(matte.kept[good[k]] for k in again.kept))
@@ -109,7 +109,7 @@ def _around(matte: Matte) -> tuple[Stations, Transitions, list[tuple[NDArray[np.
     """Stations along all contours, the transitions measured there, and the contours with their parts."""
     contours = [(part, contour) for part in _parts(matte.still) for contour in trace(part, SHORTEST_CONTOUR_PX)]
     if not contours:
-        raise NoResultError("nothing that stays has an outline; a gripper of which the fingertips are in view")
+        raise NoResultError("nothing static has an outline; the gripper's fingertips in view")
     each = [stations_along(contour, part, BORDER_PX) for part, contour in contours]
     stations = Stations(
         np.vstack([s.uv_px for s in each]),
@@ -119,7 +119,7 @@ def _around(matte: Matte) -> tuple[Stations, Transitions, list[tuple[NDArray[np.
     found = measure_transitions(matte.images, stations, matte.noise, wide=True)
     if np.count_nonzero(found.usable) < _FEWEST_STATIONS:
         raise NoResultError(
-            f"the outline shows along {np.count_nonzero(found.usable)} px only; at least {_FEWEST_STATIONS} px: "
+            f"the outline is visible along only {np.count_nonzero(found.usable)} px; at least {_FEWEST_STATIONS} px: "
             "backgrounds of other grey levels than the fingers, changing between the images"
         )
     return stations, found, contours
@@ -192,7 +192,7 @@ def _fingers(
             "images, or they show too few backgrounds"
         )
     if not seen:
-        raise NoResultError("nothing that stays has a straight or curved edge of 8 px; fingertips in view and in focus")
+        raise NoResultError("nothing static has a straight or curved edge of 8 px; fingertips in view and in focus")
     centres = np.array([np.argwhere(f.mask)[:, ::-1].mean(axis=0) for f in seen])
     axis = int(np.ptp(centres, axis=0).argmax()) if len(seen) > 1 else 0
     return tuple(seen[k] for k in np.argsort(centres[:, axis]))

@@ -112,7 +112,7 @@ def sets_refused(counts: Sequence[int]) -> NoResultError:
     said = " and ".join(map(str, counts))
     return NoResultError(
         f"the images fall into {len(counts)} sets, of {said}, in which different parts stay the same; images of one "
-        "gripper, a camera fixed to it, jaws that stand, each before another background"
+        "gripper, a camera fixed to it, jaws at rest, each with another background"
     )
 
 
@@ -187,14 +187,14 @@ def _statistics(
     share = float(still.mean())
     if share > MOST_STILL_SHARE:
         raise NoResultError(
-            f"{100.0 * share:.0f} % of the image stays the same; images before changing backgrounds: move the robot "
+            f"{100.0 * share:.0f} % of the image stays the same; images with changing backgrounds: move the robot "
             "between them"
         )
     still = _cleaned(still)
     if still.mean() < FEWEST_STILL_SHARE:
         raise NoResultError(
             f"only {100.0 * float(still.mean()):.1f} % of the image stays the same; a camera that is fixed to the "
-            "gripper, one gripper, jaws that stand, light that stays"
+            "gripper, one gripper, jaws at rest, constant light"
         )
     return mean, scatter, still, noise
 

@@ -171,7 +171,7 @@ def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
         if own is not None and own.seen >= SEEN_SHARE:
             shown[number] = own
     if 2 * len(shown) < images:
-        return f"its line shows along {100.0 * line.seen:.0f} % of it"
+        return f"its line is visible along {100.0 * line.seen:.0f} % of it"
     ends_px = np.array([own.ends_px for own in shown.values()])
     within_px2 = np.mean([own.covariance_px2.diagonal() for own in shown.values()], axis=0)
     return EdgeLines(seen, line, tuple(shown), ends_px, within_px2)
@@ -188,8 +188,8 @@ def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtE
         explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE_SQUARE
         worst_px = max(worst_px, away_px)
         if away_px > max(CLOSED_PX, refused_px) and not (found.trusted and explained):
-            shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"
-            why = f"measured with what was taught the gripper {shows}; at most {CLOSED_PX:g} px: images in focus, "
+            shows = f"appears {away_px:.2f} px off the reference" if found.trusted else "isn't found"
+            why = f"measured with the taught edges the gripper {shows}; at most {CLOSED_PX:g} px: images in focus, "
             refused, refused_px = ImageRefused(image, f"{why}without motion, the fingers free"), away_px
     if refused is not None:
         raise refused

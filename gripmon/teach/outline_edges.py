@@ -161,7 +161,7 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
     if line is None or line.seen < SEEN_SHARE:
         seen = 0.0 if line is None else 100.0 * line.seen
         raise CalibrationError(
-            f"{names}: its edge shows along {seen:.0f} % of it within {reach_px:.0f} px; at least "
+            f"{names}: its edge is visible along {seen:.0f} % of it within {reach_px:.0f} px; at least "
             f"{100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, an image in focus"
         )
     return SeenEdge(line, points, np.asarray(found.width_px[near]))

@@ -134,7 +134,7 @@ def inferred_model(
         low, high = jaw_range_m
         if not low <= nominal_m <= high:
             raise CalibrationError(
-                f"the jaws stand {nominal_m:.4f} m open, beyond --jaw-range {low:g}:{high:g}; a range that holds this "
+                f"the jaws are {nominal_m:.4f} m open, beyond --jaw-range {low:g}:{high:g}; a range that holds this "
                 "opening, or --jaw-opening with what the robot reports"
             )
         jaw = JawModel(nominal_m=round(nominal_m, 7), min_m=low, max_m=high)
@@ -223,8 +223,9 @@ def measure_known(
     found = meter.measure(image, expected_cam_T_grip, opening_m, USUAL_SHARE, EVERYWHERE)
     if not found.trusted:
         raise CalibrationError(
-            f"the gripper isn't seen where it should be ({100.0 * found.consensus.share:.0f} % of its edges' profiles "
-            "agree); rough corners nearer to the real ones, the right gripper file and jaw opening, an image in focus"
+            f"the gripper isn't seen where it should be ({100.0 * found.consensus.share:.0f} % of its edges' "
+            "search lines are inliers); rough corners nearer to the real ones, the right gripper file and jaw opening, "
+            "an image in focus"
         )
     corners = found.corners
     named = np.array([wanted is None or name in wanted for name in gripper.corner_ids])

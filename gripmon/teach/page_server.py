@@ -240,7 +240,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.FORBIDDEN, "this is not the host that was asked for")
         origin = self.headers.get("Origin")
         if origin is not None and origin not in {f"http://{host}" for host in server.hosts}:
-            raise _Refused(HTTPStatus.FORBIDDEN, "asked by another site")
+            raise _Refused(HTTPStatus.FORBIDDEN, "requested by another site")
         _, _, path = self.path.partition("/")
         token, slash, rest = path.partition("/")
         if not slash or not secrets.compare_digest(token.encode(), server.token.encode()):
@@ -367,7 +367,7 @@ class OutlineSession:
 
     def look(self, put: Put) -> Reply:
         """Always :class:`BadRequest`."""
-        raise BadRequest("nothing snaps without a gripper file; corners are put and saved")
+        raise BadRequest("corners don't snap without a gripper file; they are placed and saved")
 
     def take(self) -> tuple[PictureInfo, ...]:
         """Always :class:`BadRequest`."""

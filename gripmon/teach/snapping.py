@@ -43,8 +43,8 @@ _OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; gain
 _ALIKE = 0.25  # of the smallest distance between two corners
 
 ON_A_LINE = (
-    "the corners lie on a line, which leaves open how the gripper is turned about it; one more beside it, or "
-    "a calibration of hand and eye (--reference FILE)"
+    "the corners lie on a line: the gripper's rotation about it is undetermined; one more corner beside it, or "
+    "a hand/eye calibration (--reference FILE)"
 )
 MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
 NOTHING_SEEN = "no fingers are seen here; corners nearer to the tips"
@@ -79,7 +79,7 @@ class Snapper:
         placed = place(self.camera, self.gripper, start_m, put_px, prior)
         if not known and len(put_px) < FEWEST_PUT:
             left = FEWEST_PUT - len(put_px)
-            return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
+            return self._rough(placed[0], start_m, f"place {left} more corner{'s' * (left > 1)} on the fingertips")
         if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
             return self._rough(placed[0], start_m, misfit)
         # Only the edges can show the gripper's turn about such a line; if they don't, that is the reason.
@@ -158,7 +158,7 @@ class Snapper:
         if away_px <= sigmas * rough_sigma_px(self.camera):
             return None
         beside = f"{away_px:.0f} px from where the others put it"
-        where = beside if np.isfinite(away_px) else "put out of the lens's view by the others"
+        where = beside if np.isfinite(away_px) else "put outside the lens's view by the others"
         return f"{name} is {where}; another corner, or another jaw opening?"
 
     def _on_a_line(self, put_px: Mapping[str, Array]) -> bool:

@@ -16,18 +16,18 @@ PICTURES = "accuracy"
 _CAPTIONS = {
     "errors_simulated.png": "Error of every frame on the simulator",
     "errors_rendered.png": "Error of every frame of the rendered sequences",
-    "peers.png": "Everybody's mean error and time",
-    "honesty.png": "Whether the published covariance is true",
+    "peers.png": "Mean error and time of all methods",
+    "honesty.png": "Consistency of the published covariance",
 }
 _METHOD = """\
-Every row of the first table is a condition on the project's own simulator: several scenes with another pose, jaw
-opening, gripper (two box fingers, tapered fingers, adaptive fingers that move on arcs), light, background and seed
-each, since systematic errors stay the same within a scene. A scene starts from a reference that is wrong by 0.1 mm
-and 1 mrad on each axis (standard deviations), and the monitor knows that; its first frame doesn't count. The rendered
-sequences come from another renderer (not in this repository); their jaw opening is as
+Every row of the first table is a condition on the project's own simulator: several scenes, each with another pose, jaw
+opening, gripper (two box fingers, tapered fingers, adaptive fingers that move on arcs), light, background and seed,
+since systematic errors stay the same within a scene. A scene starts from a reference that is wrong by 0.1 mm
+and 1 mrad on each axis (standard deviations), which the monitor is given as covariance; its first frame doesn't count.
+The rendered sequences come from another renderer (not in this repository); their jaw opening is as
 reported (rounded to 0.1 mm; the default `jaw_sigma_m`), then the true one.
 
-The peers look at the same frames: `cv2.cornerSubPix` from where their last pose puts the corners, then
+The peers get the same frames: `cv2.cornerSubPix` from where their last pose puts the corners, then
 `cv2.solvePnP`; `cv2.rapid` on a mesh of the fingers; two AprilTags printed onto the fingers of the same scene, found
 by `cv2.aruco` (sub-pixel corners) and by `pyapriltags`, then `solvePnP`. A frame in which a peer is off by more than
 2 mm counts as not given, not as an error."""
@@ -45,13 +45,13 @@ def as_markdown(results: dict[str, Any], pictures: list[Path]) -> str:
     rows = results["rows"]
     parts = [
         "# Accuracy",
-        "Written by `tools/bench accuracy --out docs/results`; the figures behind it: `accuracy.json` beside it.",
+        "Written by `tools/bench accuracy --out docs/results`; its `accuracy.json` isn't in the repository.",
         "\n".join(f"- {line}" for line in about(results)),
         _METHOD,
         "## Results",
         "\n".join(f"- {line}" for line in summary(results)),
         "\n".join(f"- {line}" for line in LEGEND),
-        _ours(rows, "edges", "### By all agreed edge points (`measurement: edges`, the default)"),
+        _ours(rows, "edges", "### By all inlier edgels (`measurement: edges`, the default)"),
         _ours(rows, "corners", "### By the corners and equation (17) (`measurement: corners`)"),
         _smoothed(rows),
         _unmet(rows),

@@ -36,11 +36,11 @@ protection level; at most: exact 95 % upper bound on the rate, as if frames were
 one of either
 suspect > PL: published with a bound but not valid, and beyond the bound
 valid: share where the whole gripper is seen, where something hides part of it but both tips' outlines are seen, where \
-one tip is hidden, and where both are; without conditions in which the gripper isn't as told, without the frames just \
-after a jump or after the view became free
+one tip is hidden, and where both are; without conditions in which the gripper differs from its file, without the \
+frames just after a jump or after the view became free
 PL µm, error µm: medians of valid frames; NEES: mean of valid frames
 back: valid within 3 frames after the view is free again; latest: the most frames that it took
-alerts: new ones that name what isn't wrong: the mount, another camera, a finger, the opening, the lens""".splitlines()
+alerts: new ones that name a wrong cause: the mount, another camera, a finger, the opening, the lens""".splitlines()
 )
 
 _POSSIBLE = (
@@ -214,5 +214,5 @@ def about(results: dict[str, Any]) -> list[str]:
     return [
         f"commit {', '.join(results['commits'])}, {machine['date']}, {machine['cpu']}",
         f"seed {plan['seed']}, {plan['scenes']} scenes a condition, {plan['frames']} frames a scene",
-        f"alert limit {limits}; {each_s:.1f} s a scene on one core, {seconds / 60.0:.1f} min in all",
+        f"alert limit of the first scene {limits}; {each_s:.1f} s a scene on one core, {seconds / 60.0:.1f} min in all",
     ]

@@ -11,22 +11,22 @@ PROFILE = "profile"
 _METHOD = """\
 The daemon's own loop (`gripmon.daemon.running.run`, with a Zenoh publisher and a subscriber in another process) gets
 frames of the demo's camera that the simulator rendered beforehand: boxes, cables and print move behind the gripper
-while the mount creeps to and fro. It is timed from a frame handed over until its transform has left, back to back on
-one core. What is compared takes turns with it in the same run, on the same core and the same images: tags printed onto
-both fingers (`cv2.aruco`, family 36h11, sub-pixel corners, `solvePnP`), and ViSP's model-based edge tracker
+while the mount creeps to and fro. Each frame is timed from its arrival until its transform has left, back to back on
+one core. The trackers it is compared with alternate with it in the same run, on the same core and images: tags printed
+onto both fingers (`cv2.aruco`, family 36h11, sub-pixel corners, `solvePnP`), and ViSP's model-based edge tracker
 (`vpMbGenericTracker` with moving edges, the settings of its tutorial) on images without the lens's distortion, whose
 removal isn't counted. For "hidden" a hand covers the whole view, for "lost" the gripper is outside it, again and
-again, at 60 frames/s. "daemon" is a live camera in a process of its own, with recording; what its loop's thread takes
-is its own processor time. "start" is `gripmon run` with a camera on the network, from the start of the process until a
+again, at 60 frames/s. "daemon" is a live camera in a process of its own, with recording; the time of its loop's thread
+is processor time. "start" is `gripmon run` with a camera on the network, from the start of the process until a
 subscriber has the first measured transform; "replay" is `gripmon replay`, less the time for reading and decoding files.
 
-The 99 % of "frame" are frames that share their core with the analysis of causes: a drift that goes on asks for it in
-one frame of 60, and it takes some 25 ms. Traced in 6,000 frames, all above 3 ms came in such bursts of about six, while
-`Monitor.process` alone stays below 2.7 ms. Neither handing over between threads sooner (0.05 ms) nor letting the result
-count a second later changes it, a lower priority of that thread makes it worse: on one core the operating system's time
-slices decide. Where there is a second core, as for "daemon", 99 % are below twice the median.
+The slowest 1 % of "frame" share their core with the cause analysis: a lasting drift requests it in
+one frame of 60, and it takes some 25 ms. In a trace of 6,000 frames, all above 3 ms came in such bursts of about six,
+while `Monitor.process` alone stays below 2.7 ms. Neither a shorter switch interval between threads (0.05 ms) nor using
+the result a second later changes this, and a lower priority of that thread makes it worse: on one core the operating
+system's time slices decide. With a second core, as for "daemon", the 99th percentile is below twice the median.
 
-What the way to other processes takes is in [The network, measured](network.md), what recording costs in
+The time to reach other processes is in [The network, measured](network.md), the cost of recording in
 [Recording, measured](recording.md)."""
 
 

@@ -80,7 +80,7 @@ def reference_transform(settings: ReferenceSettings) -> Array:
     elif depth_m <= 0.0:
         wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
     elif depth_m < NEAREST_M:
-        wrong = f"puts the TCP {1e3 * depth_m:g} mm before the camera"
+        wrong = f"puts the TCP {1e3 * depth_m:g} mm in front of the camera"
     if wrong:
         raise SettingsError(Fault("reference.cam_T_grip.translation_m", wrong, right))
     return make_transform(rotation_from_xyzw((x, y, z, w)), translation_m)

@@ -61,7 +61,7 @@ def chosen(fits: Sequence[Fit]) -> int | str:
     if len(left) == 1:
         return left[0]
     if left:
-        return f"gripper: {' and '.join(fits[n].name for n in left)} fit alike; a file less, or images that part them"
+        return f"gripper: {' and '.join(fits[n].name for n in left)} fit alike; one file fewer, or images that differ"
     return f"gripper: none fits; {'; '.join(f'{fits[n].name}: {fault}' for n, fault in sorted(faults.items()))}"
 
 

@@ -149,7 +149,7 @@ def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSe
     words += ["--target", camera if known else "TARGET", "--infer", "--corners", folder / ROUGH]
     words += ["--gripper-out", folder / "gripper.yaml", "--out", folder / "hand_eye.yaml"]
     plate = (
-        f"the plate is taken to be the camera's target, {target}; for another one give --target"
+        f"the plate is assumed to be the camera's target, {target}; for another one give --target"
         if known
         else "TARGET is the plate, such as circles:12x10:0.008:0.004"
     )

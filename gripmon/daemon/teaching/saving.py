@@ -198,7 +198,7 @@ class FileSaving:
                 load_config(trial, check_source=False, with_taught="taught" in texts)
             except (ConfigError, yaml.YAMLError, OSError) as error:
                 wrong = str(error).replace(f"{name}{os.sep}", "")
-                raise SavingRefused(f"the configuration would not be sound: {wrong}") from None
+                raise SavingRefused(f"the configuration would be refused: {wrong}") from None
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Write each file whole or not at all; the configuration last, since it names the others."""

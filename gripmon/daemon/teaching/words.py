@@ -13,7 +13,7 @@ def in_words(found: Evaluation) -> list[str]:
     """The measured corners and the expected accuracy, for a terminal."""
     snapped = found.snapped
     width = max(len(corner.name) for corner in snapped.corners)
-    lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]
+    lines = [f"{'corner':<{width}}  measured at (px)      +- px  inliers"]
     for corner in snapped.corners:
         agree = "" if corner.inliers is None else f"{100.0 * corner.inliers:4.0f} %"
         if corner.uv_px is None or corner.sigma_px is None:
@@ -24,14 +24,18 @@ def in_words(found: Evaluation) -> list[str]:
     if found.reference is not None and found.pose is not None:
         sigmas = ", ".join(f"{1e3 * found.reference.covariance[k] ** 0.5:.3f}" for k in (0, 7, 14))
         by = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
-        lines.append(f"reference by {by}, TCP to {sigmas} mm: less exact than with a plate (gripmon calibrate plane)")
+        lines.append(
+            f"reference by {by}, TCP to {sigmas} mm: less accurate than with a plate (gripmon calibrate plane)"
+        )
         if found.pose.rival:
-            rival = "another pose explains these corners as well; a corner outside of their plane would decide"
+            rival = (
+                "another pose explains these corners as well; a corner outside of their plane would distinguish them"
+            )
             lines.append(f"note: {rival}")
     expected = found.expected
     if expected is not None:
         lines.append(f"expected of a frame   {_axes(expected.sigma)}")
-        lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
+        lines.append(f"smallest drift        {_axes(expected.smallest)}")
         lines.append(f"promise               {expected.promise}")
     return lines
 

@@ -1,4 +1,4 @@
-// The page of gripmon watch --web.  Whatever a monitor says goes into text nodes: names and texts come from the network.
+// The page of gripmon watch --web.  All texts of monitors go into text nodes: they come from the network.
 
 import { get, post } from "./server.js";
 
@@ -44,8 +44,8 @@ function ask(entry, name, argument) {
   const order = { robot: card.robot, camera: card.camera, monitor_id: card.monitor_id, name, argument, revision: card.revision };
   if (["accept", "reject"].includes(name)) order.argument = card.proposal_id;
   const questions = {
-    accept: `Take ${card.proposal_id} as reference of ${who}? Drift counts from it.`,
-    reject: `Forget the proposal ${card.proposal_id} of ${who}?`,
+    accept: `Accept ${card.proposal_id} as reference of ${who}? Drift is measured from it.`,
+    reject: `Discard the proposal ${card.proposal_id} of ${who}?`,
     undo: `Go back from ${card.reference_id} (revision ${card.revision}) to the reference before it, on ${who}?`,
   };
   entry.asked = order;
@@ -84,7 +84,7 @@ function numbers(card) {
   ];
 }
 
-// Its texts change under way: only they are replaced, never a button that someone is about to press.
+// Only texts are replaced, never a button that someone is about to press.
 function showAlerts(list, alerts, more) {
   const items = new Map([...list.children].map((item) => [item.dataset.id, item]));
   const wanted = alerts.map((alert) => {
@@ -121,8 +121,8 @@ function show(entry) {
   root.dataset.condition = card.condition;
   setText($("h2", root), named(card));
   setText($(".condition", root), card.condition);
-  const since = card.gone_since_ns === null ? "" : `${card.condition} since ${clock(card.gone_since_ns)}; below is what it said last`;
-  const silent = card.condition === "silent" ? `no word for ${card.heard_s.toFixed(0)} s: it hangs; below is what it said last` : "";
+  const since = card.gone_since_ns === null ? "" : `${card.condition} since ${clock(card.gone_since_ns)}; last known values below`;
+  const silent = card.condition === "silent" ? `no message for ${card.heard_s.toFixed(0)} s: it hangs; last known values below` : "";
   const several = card.condition === "several" ? `one of several monitors of this name (${card.monitor_id}): use neither, stop one` : "";
   setText($(".said", root), [since || silent || several, card.state && (gone ? `was ${card.state}` : card.state), card.message].filter(Boolean).join("; "));
   const list = $("dl", root), values = numbers(card);
@@ -183,7 +183,7 @@ function arrange(shown) {
     show(entry);
     return entry.root;
   });
-  // Never under a hand that is about to press a button.
+  // Cards never move while someone is about to press a button.
   const held = (hover || main.contains(document.activeElement)) && nodes.every((node) => node.parentNode === main);
   if (!held && nodes.some((node, k) => main.children[k] !== node)) main.replaceChildren(...nodes);
 }
@@ -207,14 +207,14 @@ async function look() {
     say(shown.fault || none, shown.fault ? "bad" : "warn");
     arrange(shown);
     $("#hidden").hidden = !shown.hidden;
-    setText($("#hidden"), `${shown.hidden} more, none in more trouble; find them by name`);
+    setText($("#hidden"), `${shown.hidden} more, none in a worse state; find them by name`);
     for (const entry of cards.values()) {
       const there = !["gone", "stopped"].includes(entry.card.condition);
       if (there && !entry.loading && entry.root.dataset.visible === "true" && Date.now() >= entry.next) loadPicture(entry);
     }
   } catch (error) {
     ended = true;
-    say(`${error.message}${last ? `; what is shown is of ${clock(last)}` : ""}`, "bad");
+    say(`${error.message}${last ? `; shown: state of ${clock(last)}` : ""}`, "bad");
     for (const entry of cards.values()) show(entry);
   }
   document.body.dataset.ended = ended;

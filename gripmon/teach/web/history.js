@@ -1,4 +1,4 @@
-// Corners put by hand, with undo and redo.  A corner is {at: [u, v] (px), hand: bool}; one that is not there is not put.
+// Corners placed by hand, with undo and redo.  A corner is {at: [u, v] (px), hand: bool}; missing ones are not placed.
 
 export class Corners {
   #states = [new Map()];

@@ -68,7 +68,7 @@ function tell() {
   else {
     const measured = reply.corners.filter((corner) => corner.uv_px).length;
     const corners_ = reply.corners.length ? `${measured} of ${reply.corners.length} corners measured; ` : "";
-    const found = `${corners_}${Math.round(100 * reply.share)} % of the edges agree.`;
+    const found = `${corners_}${Math.round(100 * reply.share)} % of the edges are inliers.`;
     panel.status(reply.reference ? found : `${found} ${reply.no_reference}`, reply.reference ? "good" : "warn");
   }
 }
@@ -87,7 +87,7 @@ function put() {
   };
 }
 
-// One request at a time; while it runs the newest wish waits.
+// One request at a time; meanwhile the newest one waits.
 async function look() {
   clearTimeout(timer);
   timer = null;
@@ -171,7 +171,7 @@ async function choose(number) {
   } catch (error) { panel.status(error.message, "bad"); }
 }
 
-// The live image, again and again while it is the one that is shown.
+// Refresh the live image while it is shown.
 async function follow() {
   for (let count = 0; !ended; count += 1) {
     let pause = LIVE_MS;
@@ -189,7 +189,7 @@ async function take() {
   try {
     state.pictures = await post("take", {});
     panel.pictures(state.pictures, state.live, chosen);
-    panel.status(`${state.pictures.length} image${state.pictures.length > 1 ? "s" : ""} taken; three to ten, each before another background, are best.`, "good");
+    panel.status(`${state.pictures.length} image${state.pictures.length > 1 ? "s" : ""} taken; three to ten, each in front of another background, are best.`, "good");
   } catch (error) { panel.status(error.message, "bad"); }
 }
 
@@ -235,7 +235,7 @@ async function begin() {
   stage = new Stage($("#stage"), {
     select,
     put: (name, at) => { corners.put(name, at, false); changed(); },
-    // A corner that has followed the others is right where it is: a click says so.
+    // A click confirms the place of a corner that has followed the others.
     click: (name, at) => { if (!state.corners_only && shown(name).state === "idle" && corners.current.size) { corners.put(name, at, false); changed(); } },
     viewed: (scale) => { $("#zoom").textContent = `${Math.round(100 * scale)} %`; },
   });

@@ -67,7 +67,7 @@ export function corners(list, reply, selected, choose) {
       const off = away === null ? "" : `, ${away.toFixed(2)} px from the edges`;
       row.append(element("td", `set by hand${off}`, { colspan: 2, class: "quiet" }));
     } else if (corner?.sigma_px != null) {
-      const agree = element("td", "", { title: `${Math.round(100 * corner.inliers)} % of the profiles on its edges agree` });
+      const agree = element("td", "", { title: `${Math.round(100 * corner.inliers)} % of its edges' search lines are inliers` });
       const meter = element("meter", "", { min: 0, max: 1, low: 0.4, high: 0.6, optimum: 1, value: corner.inliers });
       agree.append(meter, ` ${Math.round(100 * corner.inliers)} %`);
       row.append(element("td", corner.sigma_px.toFixed(3)), agree);
@@ -88,7 +88,7 @@ export function jaw(reply, given, state) {
   else if (reply?.jaw_opening_m != null && !reply.refused) {
     const seen = `${(1e3 * reply.jaw_opening_m).toFixed(2)} ± ${mm(reply.jaw_sigma_m)} mm`;
     note.textContent = `The image shows ${seen}, but it can hardly separate that from the distance: better use what the robot reports.`;
-  } else note.textContent = "Better what the robot says than what the image shows.";
+  } else note.textContent = "Better use what the robot reports than what the image shows.";
 }
 
 export function expected(reply, state) {
@@ -98,9 +98,9 @@ export function expected(reply, state) {
   const shown = (all, from, words) => all.slice(from, from + 3).map(words);
   const rows = [
     ["one frame ±", shown(values.sigma, 0, mm), "mm"],
-    ["drift seen from", shown(values.smallest, 0, mm), "mm"],
-    ["its turn ±", shown(values.sigma, 3, degrees), "°"],
-    ["turn seen from", shown(values.smallest, 3, degrees), "°"],
+    ["smallest drift", shown(values.smallest, 0, mm), "mm"],
+    ["rotation ±", shown(values.sigma, 3, degrees), "°"],
+    ["smallest turn", shown(values.smallest, 3, degrees), "°"],
   ];
   if (reference && !state.reference) rows.push(["reference ±", shown(reference.sigma, 0, mm), "mm"]);
   const weakest = values.sigma.slice(0, 3).indexOf(Math.max(...values.sigma.slice(0, 3)));
@@ -113,9 +113,9 @@ export function expected(reply, state) {
   $("#promise").textContent = `${values.promise[0].toUpperCase()}${values.promise.slice(1)}.`;
   $("#promise").classList.toggle("warn", !values.reachable);
   const delays = values.delay_frames.map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `within ${frames} frames`}`);
-  const notes = [`A step of the TCP by 0.1 mm is noticed on average: ${delays.join(", ")}.`];
-  if (reference?.rival) notes.push("Another pose explains these corners as well: put one outside of their plane.");
-  if (reference && !state.reference) notes.push("The reference comes from these corners; a plate (gripmon calibrate plane) tells it more exactly.");
+  const notes = [`A step of the TCP by 0.1 mm is detected on average: ${delays.join(", ")}.`];
+  if (reference?.rival) notes.push("Another pose explains these corners as well: place one outside of their plane.");
+  if (reference && !state.reference) notes.push("The reference comes from these corners; a plate (gripmon calibrate plane) measures it more accurately.");
   if (values.recalibration) notes.push(`No new pose from corners later: ${values.recalibration}.`);
   $("#expected-note").textContent = notes.join(" ");
 }

@@ -1,4 +1,4 @@
-// Requests to the one server that this page came from.  What it refuses is thrown as an Error with its one line.
+// Requests to the server that this page came from.  Refusals are thrown as an Error with their one line.
 
 async function answer(response) {
   if (response.ok) return response;

@@ -1,4 +1,4 @@
-// One step at a time: its form and buttons, what the camera or the monitor shows, and what came of it.
+// One step at a time: its form and buttons, what the camera or the monitor shows, and the result.
 
 import { get, post } from "./server.js";
 
@@ -26,7 +26,7 @@ function shape(tag, attributes, parent) {
 
 const step = () => state.steps.find((each) => each.state.name === chosen);
 const capture = () => (state.capturing === chosen ? state.capture : null);
-// Of this step, and what was typed before and not yet sent: whoever goes on at once has said it, too.
+// The values of this step, and those typed before and not yet sent: they count, too.
 const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value])) });
 
 function choose(name) {
@@ -54,7 +54,7 @@ function showSteps() {
   if (active) $(`[data-step=${active}]`)?.focus();
 }
 
-// What a person types must not be drawn over by what the server says meanwhile.
+// The server's answers must not overwrite what a person is typing.
 function showFields() {
   const { fields } = step(), now = said();
   const asked = fields.filter(({ only }) => !only || only[1].includes(now[only[0]]));
@@ -118,7 +118,7 @@ function showButtons() {
 function status() {
   const { state: now, error } = step(), taking = capture(), { monitor } = state;
   const wrong = refused || error;
-  if (state.busy) return state.busy === chosen ? ["at work …", ""] : [`at work on another step (${state.busy}) …`, ""];
+  if (state.busy) return state.busy === chosen ? ["working …", ""] : [`working on another step (${state.busy}) …`, ""];
   if (wrong) return [wrong, "bad"];
   if (chosen === "run" && (monitor.running || monitor.ended)) {
     const last = monitor.lines.at(-1) ?? "";
@@ -240,7 +240,7 @@ async function done() {
   try { await post("done", {}); } catch (error) { refused = error.message; show(); return; }
   ended = true;
   const page = element("div", "", { class: "over" });
-  page.append(element("h1", "Done."), element("p", "gripmon setup has ended; this page may be closed. gripmon setup in the same folder goes on."));
+  page.append(element("h1", "Done."), element("p", "gripmon setup has ended; this page may be closed. gripmon setup in the same folder continues."));
   for (const part of document.body.children) part.hidden = true;
   document.body.append(page);
 }

@@ -1,4 +1,4 @@
-// The image with zoom and pan, and what is drawn over it.  Pixel centres lie at whole coordinates.
+// The image with zoom and pan, and its overlay.  Pixel centres lie at whole coordinates.
 
 const SVG = "http://www.w3.org/2000/svg";
 const ENLARGED = 10, SIGMAS = 3, LARGEST = 64, CLOSE = 5, LOUPE = 8;
@@ -77,7 +77,7 @@ export class Stage {
     this.draw();
   }
 
-  // Enlarged by what the image has to be shrunk or stretched by to be seen whole: a corner keeps its surroundings.
+  // Enlarged relative to the scale at which the whole image fits, so that a corner keeps its surroundings.
   centre(at) {
     this.scale = Math.min(Math.max(this.scale, CLOSE * this.#whole()), LARGEST);
     this.shift = [0, 0];
@@ -157,7 +157,7 @@ export class Stage {
       [g.dataset.u, g.dataset.v] = here.map((v) => v.toFixed(4));
       const [x, y] = this.toStage(here);
       g.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
-      // Near the right border its name stands on the left.
+      // Near the right border the name is on the left.
       const text = g.lastElementChild, before = x + 24 + 7 * name.length > this.root.clientWidth;
       text.setAttribute("x", before ? -13 : 13);
       text.setAttribute("text-anchor", before ? "end" : "start");
@@ -169,7 +169,7 @@ export class Stage {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  // Handles lie close together when the image is small: the nearest one is meant.
+  // Handles lie close together when the image is small: take the nearest one.
   #under([x, y]) {
     let best = null, nearest = 17;
     for (const { name, at } of this.corners ?? []) {

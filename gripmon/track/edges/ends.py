@@ -27,7 +27,7 @@ END_CORNERS = 2
 """Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
 
 BEYOND_PX = (3.0, 16.5)
-"""Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and as long as the stretch of an edge
+"""Stretch beyond a corner that is searched, px: clear of the corner's own blur, and as far as the stretch of an edge
 that makes a corner seen (``corners.neighbourhood_px``).
 """
 
@@ -61,8 +61,8 @@ class FingerEndsSeen:
 
     @property
     def sure(self) -> bool:
-        """Whether enough of them are seen, wherever the gripper was expected: two of each of two fingers or as many in
-        all; two of the only one whose end the view has.
+        """Whether enough of them are seen, wherever the gripper was expected: four in all on two fingers or more; two
+        if the view has the end of only one finger.
         """
         fingers = int(np.count_nonzero(self.might >= END_CORNERS))
         if fingers < 2:
@@ -71,7 +71,7 @@ class FingerEndsSeen:
 
     @property
     def at_each(self) -> bool:
-        """Whether one is seen of each of the fingers whose ends the view has, which are two or more."""
+        """Whether one is seen on each of the fingers whose ends the view has, which are two or more."""
         in_view = self.might > 0
         return bool(np.count_nonzero(in_view) >= 2 and (self.seen[in_view] > 0).all())
 
@@ -136,7 +136,7 @@ def edges_at_ends(gripper: Gripper) -> NDArray[np.bool_]:
 
 
 class FingerEnds:
-    """Looks beyond the ends of one gripper's fingers."""
+    """Checks the ends of one gripper's fingers: whether edges go on beyond them."""
 
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
@@ -157,7 +157,7 @@ class FingerEnds:
         return self._places.finger
 
     def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """How many of each finger's ends are seen; takes as long as a fourth of a measurement.  ``strict``: see
+        """How many of each finger's ends are seen; takes a quarter of a measurement's time.  ``strict``: see
         :meth:`at_places`.
         """
         fingers = len(self._gripper.finger_ids)
@@ -174,7 +174,7 @@ class FingerEnds:
         return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
     def at_places(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
-        """(s,) the measured places that are ends: looks beyond them.
+        """(s,) the measured places that are ends: no edge goes on beyond them.
 
         ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
@@ -197,7 +197,7 @@ class FingerEnds:
         return measured & ~goes_on
 
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
-        """(c,) which of the extended edges go on."""
+        """(c,) which of the extended edges have a continuation."""
         prediction, candidates = measurement.prediction, measurement.candidates
         # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi

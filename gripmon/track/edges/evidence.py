@@ -1,8 +1,8 @@
-"""Each finger by itself: where its own edge points agree, whatever the others do.
+"""Each finger by itself: the pose of its own inlier edgels, independently of the other fingers.
 
-The joint fit may have followed a bent finger, or split the difference between pose and jaw opening.  What has moved is
-therefore judged from the edgel hypotheses again, with a rigid motion for every finger: all that one cause can do
-(camera moved, one finger bent, jaw elsewhere) are special cases of that.
+The joint fit may have followed a bent finger, or a compromise between pose and jaw opening.  For the cause analysis the
+edgel hypotheses are therefore fitted again with a rigid motion of each finger: the effects of all causes (camera moved,
+one finger bent, jaw elsewhere) are special cases of that.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
 
 FINGER_ELSEWHERE_RATIO = 1.2
-"""Factor by which more search lines of a finger must agree elsewhere than where the gripper as a whole shows."""
+"""Least ratio of a finger's inliers elsewhere to those at the pose of the whole gripper."""
 
 FINGER_SEEN_SHARE = 0.5
-"""Share of a finger's search lines that must agree with where it is expected, or it is looked for farther away.  What
-fewer show may be anything that has an edge or two: a shadow, a finger's other side, what lies behind.
+"""Inlier ratio of a finger at its expected place below which it is searched for farther away: anything with an edge or
+two may give less, such as a shadow, the finger's other side, or something behind it.
 """
 
 FINGER_FOUND_SHARE = 0.55
-"""Share of a finger's search lines that must agree there: other things have a straight edge or two as well."""
+"""Least inlier ratio of a finger there: other things have a straight edge or two as well."""
 
 FEWEST_SHARE = 0.4
-"""Part of a stretch's search lines, and no fewer than an edge needs, that must agree for it to count as seen."""
+"""Least inlier ratio of a stretch that counts as seen; at least as many inliers as an edge needs."""
 
 _STEP_PX = 2.0
 _REFINED = 3
@@ -48,7 +48,7 @@ _FIXED = 1e12  # information of an opening that stays
 
 
 class _Place(NamedTuple):
-    """A finger's own fit on some edgels, and the share of its search lines that agree."""
+    """A finger's own fit on some edgels, and the inlier ratio of its search lines."""
 
     edgels: Edgels
     fit: RobustFit
@@ -56,17 +56,17 @@ class _Place(NamedTuple):
 
 
 class FingerMeter(Settler):
-    """Looks at the fingers one by one, in a frame that was measured."""
+    """Fits the fingers one by one in a measured frame."""
 
     def evidence(
         self, image: Image, measurement: Measurement, *elsewhere: Array, jaw_reported: bool = True
     ) -> EdgeEvidence:
-        """What the fingers show one by one in a measured frame; takes about as long as the measurement, some times
-        longer where a finger has to be looked for, and again as long where one has moved.
+        """The evidence of each finger in a measured frame; takes about as long as the measurement, several times longer
+        if a finger has to be searched for, and as long again if one has moved.
 
-        ``elsewhere``: poses (4, 4) that a finger may have stayed at while the others moved, the reference for one.
-        ``jaw_reported``: the robot reported the opening of this frame.  A frame in which nothing agrees gives evidence
-        without stretches.
+        ``elsewhere``: poses (4, 4) at which a finger may have stayed while the others moved, such as the reference.
+        ``jaw_reported``: the robot reported the opening of this frame.  A frame without inliers gives evidence without
+        stretches.
         """
         self._zoom = measurement.candidates.zoom
         settings = self._settings.consensus

@@ -258,7 +258,7 @@ def _judge(
     sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, independence: Any,
     start_width_px: float, gate_px: float, support_sigmas: float, support_share: float,
 ) -> tuple[Any, Any, Any, float]:  # fmt: skip
-    """Who agrees: the search lines (n,), each edge's share of them and whether it is seen (e,), and the share of pairs.
+    """The inliers: search lines (n,), each edge's ratio and whether it is seen (e,), and the ratio of pairs.
 
     Held against chance: the density of edgel hypotheses tells how many would lie in the gate anyway, of N independent
     search lines N p +- sqrt(N p (1 - p)); search lines that see the same pixels agree by the same chance.  Edge
@@ -331,7 +331,7 @@ def assess(
     sample: Any, weight: Any, residual_px: Any, information: Any, stiffness: float, jacobian: Any, edge: Any,
     stretch: Any, edge_spread_px: Any, cut_off_px: Any, prior: Any, expected_shared_px: float,
 ) -> Any:  # fmt: skip
-    """The covariance of ``uncertainty.assess``, whose equation stands there: whether it could be solved, then
+    """The covariance of ``robust_fit.assess``, which gives the equation: whether it could be solved, then
     covariance, line weights, shared spread and contradiction, and edge, pull, information and middle of the
     ``NormalEquations``.
     """

@@ -1,5 +1,4 @@
-"""Step 5 of the corner measurement: a line for each edge through the points that agreed, corners where adjacent lines
-meet.
+"""Step 5 of the corner measurement: a line for each edge through its inlier edgels, corners where adjacent lines meet.
 
 Lines live in ideal coordinates, where a straight edge is straight: the offset ``e`` of a point from its predicted
 line is fitted by ``e = a + b * along``.  Corners come with a 2x2 covariance each, and a reason when they are refused.
@@ -141,7 +140,7 @@ def intersect_edges(
     geometry: CornerGeometry,
     settings: CornerSettings,
 ) -> Corners:
-    """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges
+    """Corners as intersections of the lines through the inlier edgels; weighted least squares where three edges
     meet.  ``line_weight`` (k,) is what each edgel hypothesis is worth for the line of its edge, 1/px².
 
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
@@ -209,7 +208,7 @@ def _fit_lines(
         determinant = s0 * s2 - s1 * s1
         if points[v] < FEWEST_SAMPLES or not determinant > 0.0:
             continue
-        # What an edge's points share moves the whole line.
+        # The error that an edge's points share moves the whole line.
         common = (edge_spread_px[edges[v]] ** 2 + cut_off_px[edges[v]] ** 2) * gain[first[v]] ** 2
         lines[v, 0], lines[v, 1] = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
         lines[v, 2], lines[v, 3], lines[v, 4] = s2 / determinant + common, -s1 / determinant, s0 / determinant

@@ -1,4 +1,4 @@
-"""The corner measurement as one: from an image and an expected pose to edge points that agree, and corners.
+"""The whole corner measurement: from an image and an expected pose to inlier edgels and corners.
 
 The cheap way is tried first: search lines about the expected pose and one robust fit.  Only when too few search lines
 agree are other starts tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
@@ -31,13 +31,13 @@ from gripmon.track.edges.search import search_poses
 from gripmon.track.edges.settling import ZOOMS, Effort, Expected, Measurement
 
 FOUND_EDGE_SHARE = 0.85
-"""Part of the sampled edges that must be seen where the gripper was looked for."""
+"""Least fraction of the sampled edges that is seen at a place found by a search."""
 
 EVEN_SIDES = (0.35, 0.7)
 """Unevenness of the edges' calmer sides up to which a smaller part suffices, and that part."""
 
 UNEVEN_SIDES = 0.6
-"""Unevenness from which all edges must be seen: neither side of them is of one shade."""
+"""Unevenness from which all edges must be seen: neither of their sides is of one shade."""
 
 FITTED_AGAIN, SETTLED = 4, 2
 """Places elsewhere that are fitted roughly once more, and that are followed to the end."""
@@ -46,13 +46,13 @@ PROMISING, NEARLY_AS_GOOD = 0.8, 0.9
 """What places must show in a rough fit to be followed: parts of the share to beat, and of the best one's."""
 
 SATISFYING_SHARE_RATIO = 0.65
-"""Part of the usual share below which the gripper may be elsewhere."""
+"""Fraction of the usual inlier ratio below which the gripper may be elsewhere."""
 
 TRUSTED_SHARE_RATIO = 0.4
-"""Part of the usual share below which a fit is not believed, whatever the settings allow."""
+"""Fraction of the usual inlier ratio below which a fit is not believed, whatever the settings allow."""
 
 ELSEWHERE_SHARE_RATIO = 1.3
-"""Factor by which the share elsewhere must exceed a trusted one where the gripper was expected."""
+"""Least inlier ratio elsewhere over that of a trusted fit where the gripper was expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class _Place:
 
 
 class FingertipMeter(FingerMeter):
-    """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
+    """Measures one gripper with one camera, and searches elsewhere if it isn't seen where it is expected."""
 
     _lost = 0  # frames in a row in which it wasn't seen there
 
@@ -103,7 +103,7 @@ class FingertipMeter(FingerMeter):
 
     @property
     def finger_axis(self) -> Array:
-        """(3,) the way that the fingers run, gripper frame; zero where they have none."""
+        """(3,) the fingers' direction, gripper frame; zero if they have none."""
         return self._ends.axis
 
     @property
@@ -151,7 +151,7 @@ class FingertipMeter(FingerMeter):
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
             at_an_end = best.consensus.edge_seen[self._at_ends].any()
-            # Gone along themselves, the fingers show most of their outline still.
+            # Slid along themselves, the fingers still show most of their outline.
             if not best.trusted or at_an_end or not self._looks_at_ends(best.prediction):
                 self._lost = 0
                 return best
@@ -220,7 +220,7 @@ class FingertipMeter(FingerMeter):
         return min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
 
     def ends(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """Whether the fingers' ends are seen as such where they were measured."""
+        """Whether the fingers' ends are seen as ends where they were measured."""
         return self._ends.seen(image, measurement, strict)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
@@ -365,7 +365,7 @@ def _shows_nearly_all(measurement: Measurement) -> bool:
 
 
 def _seen_part(consensus: RobustFit, prediction: Prediction) -> float:
-    """Part of the sampled edges that are seen."""
+    """Fraction of the sampled edges that is seen."""
     edges = prediction.layout.edges
     return np.count_nonzero(consensus.edge_seen[edges]) / max(len(edges), 1)
 

@@ -25,7 +25,7 @@ from gripmon.track.edges.settings import SamplingSettings
 from gripmon.track.edges.taught import TaughtEdges
 
 STRETCH = 16
-"""Neighbouring search lines of an edge whose errors are taken together."""
+"""Neighbouring search lines of an edge that form a stretch, with a common error."""
 
 STEP_PX = 0.5
 """Distance of samples along a search line, px."""
@@ -42,10 +42,10 @@ CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
 SHORTEST_PX = float(FEWEST_AGREEING - 1)
-"""Less of an edge isn't sampled: as many search lines as must agree would be closer than a pixel."""
+"""A shorter edge isn't sampled: the least number of inliers would be closer than a pixel."""
 
 PLACES = 65
-"""Places of an edge, evenly spaced, at which it is seen whether it lies in the image."""
+"""Places of an edge, evenly spaced, at which it is checked whether it lies in the image."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def lay_out(
     lengths = ranges[:, 2]
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
-        # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most
+        # Short edges across the fingers show what long ones along them can't, so density falls with length.  At most
         # one search line a pixel: closer ones see the same pixels again.
         share = np.sqrt(lengths)
         wanted_counts = np.maximum(np.round(settings.samples * share / share.sum()), FEWEST_AGREEING)

@@ -1,7 +1,7 @@
 """Step 3 of the corner measurement: sub-pixel edgel hypotheses on the sampled search lines, and what each is worth.
 
 The derivative of a Gaussian is applied to all search lines; every local extremum that stands out of the noise is an
-edgel hypothesis.  Which of them belong to the gripper the joint fit decides.
+edgel hypothesis.  The joint fit decides which of them belong to the gripper.
 """
 
 from __future__ import annotations

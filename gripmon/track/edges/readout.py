@@ -1,4 +1,4 @@
-"""What else is read of a measurement: sums for a new reference, pixels for people who look."""
+"""Further results of a measurement: sums for a new reference, pixels for display."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gripmon.track.edges.settling import Measurement
 
 
 def edge_sums(measurement: Measurement, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float) -> EdgeSums:
-    """Sums over the stretches of agreed points, with residuals about a pose and opening near the measured ones."""
+    """Sums over the stretches of inlier edgels, with residuals about a pose and opening near the measured ones."""
     prediction, candidates, consensus = measurement.prediction, measurement.candidates, measurement.consensus
     inlier = np.flatnonzero(consensus.weight)
     sample, weight = candidates.sample[inlier], consensus.weight[inlier]

@@ -14,14 +14,14 @@ PARALLEL_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""
 
 MAJORITY = 0.5
-"""Part of the edges' length that has to run one way for the fingers to have a direction at all."""
+"""Fraction of the edges' length that has to run one way for the fingers to have a direction at all."""
 
 DISTINCT_M = 1e-4
 """A finger's edges that are nearer to each other than a gripper file's points may be have no inner and outer one, m."""
 
 
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
-    """The way (3,) that most of the edges' length has, gripper frame, and (e,) which edges run along it.
+    """The direction (3,) of most of the edges' length, gripper frame, and (e,) which edges run along it.
 
     Where no way has most of it: zero, and all True, so that nothing is an end.
     """
@@ -38,7 +38,7 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def has_lone_end(gripper: Gripper) -> bool:
-    """Whether the end of a single finger alone tells where it is along itself."""
+    """Whether the gripper has a single finger, whose end alone shows a motion along it."""
     return len(gripper.finger_ids) == 1 and not along_fingers(gripper)[1].all()
 
 

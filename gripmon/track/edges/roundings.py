@@ -1,7 +1,7 @@
-"""Where two edges of an outline meet in a rounding that is small in this view: seen like a corner.
+"""Roundings between two edges of an outline that are small in this view, and seen like corners.
 
-The outline of a tip that is rounded towards the camera is straight, and so are its sides; of the rounding between them
-a few pixels show.  Nothing is intersected there for a pose: what counts is that both edges reach the rounding.
+The outline of a tip that is rounded towards the camera is straight, and so are its sides; the rounding between them
+covers a few pixels.  No intersection is measured there: what counts is that both edges reach the rounding.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class GoesOn(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """One in a prediction: its two ``edges``, of each the search lines beside it, outwards from it, and how they
-    ``go_on`` beyond it.
+    """A rounding in a prediction: its two ``edges``, the search lines of each ``beside`` it, outwards from it, and
+    their continuations ``go_on`` beyond it.
     """
 
     edges: frozenset[int]
@@ -39,9 +39,9 @@ class Rounding:
 def crossing(
     prediction: Prediction, profiles: NDArray[np.intp], at_px: Array, way: Array, cosine: float
 ) -> GoesOn | None:
-    """How an edge's ``profiles``, outwards from a line through ``at_px`` (2,) along the unit ``way`` (2,), go on across
-    it, by the tangent of the last one: what straight thing the edge may be.  None where they don't, or where the two
-    are nearly parallel, ``cosine`` that of the smallest angle.
+    """Continuation of an edge, by the tangent at the last of its ``profiles``, across a line through ``at_px`` (2,)
+    along the unit ``way`` (2,): as a straight border would go on.  The ``profiles`` are ordered outwards from the line.
+    None where it doesn't cross the line, or nearly parallel to it, ``cosine`` that of the smallest angle.
     """
     last = int(profiles[-1])
     tangent = _tangent(prediction, last, prediction.uv_px[profiles[0]])
@@ -52,7 +52,7 @@ def crossing(
 
 
 def _tangent(prediction: Prediction, profile: int, towards_px: Array) -> Array:
-    """(2,) the way of the edge at a search line, of the two the one towards a place (2,)."""
+    """(2,) the edge's direction at a search line, towards a place (2,)."""
     normal = prediction.normal[profile]
     way = np.array([-normal[1], normal[0]])
     return way if way @ (towards_px - prediction.uv_px[profile]) > 0.0 else -way

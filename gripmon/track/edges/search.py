@@ -2,7 +2,7 @@
 
 In a reduced image (``reduced``) the points on the predicted outlines vote for shifts, turns about the optical axis and
 scales.  The best places are shaken in all six directions, tilts included, then polished on an image of twice the
-resolution (``hypotheses``); what is left are a few starts for the joint fit on the full image, which decides.
+resolution (``hypotheses``); the result is a few starts for the joint fit on the full image, which decides.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ BLUR_AT_ZOOM = (0.7, 1.7)
 
 
 class Effort(enum.IntEnum):
-    """How far the gripper had to be looked for."""
+    """How far the gripper had to be searched for."""
 
     NARROW = 0
     GRID = 1
@@ -68,7 +68,7 @@ class Effort(enum.IntEnum):
 
 @dataclass(slots=True)
 class Measurement:
-    """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
+    """``cam_T_grip`` and ``jaw_opening_m`` from the inlier edgels, with all intermediate results.
 
     ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_innovation``: the seen jaw opening less the
     reported one (``jaw_reported_m``), in standard deviations of the latter.
@@ -106,7 +106,7 @@ class Measurement:
         return prediction.corners.cam_m + opened_m * prediction.corners.jaw_rate
 
     def moved_px(self, cam_T_grip: Array) -> float:
-        """How far the measured gripper shows from where ``cam_T_grip`` (4, 4) puts it, px."""
+        """Distance of the measured gripper from where ``cam_T_grip`` (4, 4) puts it, px."""
         return self.prediction.moved_px(perturbation_between(cam_T_grip, self.cam_T_grip))
 
     def corner_rms_px(self, cam_T_grip: Array) -> float | None:
@@ -202,7 +202,7 @@ class Settler:
                 consensus = fit_irls(edgels, free, consensus.xi, settings.consensus, RESTART_WIDTH_PX)
             moved_px = prediction.moved_px(consensus.xi)
             if moved_px > 2.0 * self._reach_px:
-                # Nothing was seen out there: the few points that agree don't determine the motion.
+                # Nothing was seen there: the few inliers don't determine the motion.
                 consensus = replace(consensus, share=0.0)
             if consensus.share == 0.0:
                 break

@@ -1,16 +1,16 @@
-"""The taught model: how each edge of this gripper really shows to this camera, against the sharp edges of its model.
+"""The taught model: where each edge of this gripper really appears to this camera, relative to its sharp model.
 
-Bevels, roundings, shading and the blur of the lens put an edge beside the line that the gripper file draws, by the
-same amount in every image.  Measured once, in images at the reference calibration, and taken into the prediction,
-like is compared with like and the bias cancels; the method's own reference corners, measured in the reference image,
-do the same ("Corners" of the self-viewing method).
+Bevels, roundings, shading and the blur of the lens shift an edge from its line in the gripper file, by the same amount
+in every image.  The offset is measured once, in images at the reference calibration, and added to the prediction, so
+that the bias cancels; the method's own reference corners, measured in the reference image, do the same ("Corners" of
+the self-viewing method).
 
 An edge's offset is a length across the line of sight, off the plane through the camera's centre and the model's edge
 (m), linear along the edge; positive to the right of someone who walks along the edge in the image.  The reference
-calibration is by definition the gripper's pose in the teaching images, so that what it is off by is in the offsets,
-too.  In the gripper frame an offset stays the same when the camera or the jaws move.  What it is along the line of
-sight (``depth_m``, positive away from the camera) images at one pose can't show; it follows from the shape of a bevel,
-with a wide standard deviation, and counts as much as the line of sight has turned since.
+calibration is by definition the gripper's pose in the teaching images, so that the offsets include its error.  In the
+gripper frame an offset stays the same when the camera or the jaws move.  The offset along the line of sight
+(``depth_m``, positive away from the camera) can't be measured from one pose; it follows from the shape of a bevel, with
+a wide standard deviation, and has the more effect the more the line of sight has turned since.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class TaughtImage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where a taught model comes from; ``closure_px``: how far its images, measured with it, show the gripper from the
-    reference, at most.
+    """Origin of a taught model; ``closure_px``: largest distance of the gripper from the reference in its images,
+    measured with the model.
     """
 
     gripmon: str
@@ -73,8 +73,8 @@ class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Grey level of the finger beside an edge over the median of all edges (no unit), and its robust spread along
-    the edge.
+    """Grey level of the finger beside an edge, divided by the median of all edges (no unit), and its robust spread
+    along the edge.
     """
 
     level: Annotated[float, Meta(ge=0.0)]
@@ -82,8 +82,8 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One edge: ``offset_m`` and ``sigma_m`` at the two ends ``share`` of the part that was seen, linear between, and
-    how much deeper than the model's edge it lies.
+    """One edge: ``offset_m`` and ``sigma_m`` at the two ends ``share`` of the visible part, linear between them, and
+    its depth behind the model's edge.
     """
 
     share: tuple[Share, Share]
@@ -107,7 +107,7 @@ class TaughtCorner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A file of ``gripmon teach`` as it is written."""
+    """The contents of a file of ``gripmon teach``."""
 
     provenance: Provenance
     camera: LensSettings
@@ -119,7 +119,7 @@ class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class Mismatch(NamedTuple):
-    """Why a taught model doesn't belong to what it is to be used with."""
+    """Why a taught model doesn't fit the configuration."""
 
     key: str
     wrong: str
@@ -127,8 +127,8 @@ class Mismatch(NamedTuple):
 
 
 def gripper_digest(gripper: Gripper, name: str | None = None) -> str:
-    """SHA-256 of what a gripper file says of the gripper, or would under another ``name``; comments, order and spelling
-    of numbers don't count.
+    """SHA-256 of a gripper file's contents, optionally under another ``name``; comments, order and spelling of numbers
+    don't count.
     """
     model = gripper.model if name is None else msgspec.structs.replace(gripper.model, name=name)
     return hashlib.sha256(msgspec.json.encode(contents_of(model), order="sorted")).hexdigest()
@@ -137,7 +137,7 @@ def gripper_digest(gripper: Gripper, name: str | None = None) -> str:
 def identity(
     camera: Camera, gripper: Gripper, reference_id: str, cam_T_grip: Array
 ) -> tuple[LensSettings, TaughtGripper, TaughtReference]:
-    """What a taught model is bound to."""
+    """Camera, gripper and reference that a taught model is bound to."""
     return (
         camera.settings,
         TaughtGripper(name=gripper.name, sha256=gripper_digest(gripper)),
@@ -148,7 +148,7 @@ def identity(
 def mismatch(
     model: TaughtModel, camera: Camera, gripper: Gripper, cam_T_grip: Array, edge_settings: EdgeSettings
 ) -> Mismatch | None:
-    """What of a taught model contradicts the configuration that it is to be used with; None if nothing does."""
+    """The first contradiction between a taught model and the configuration, or within the model; None without any."""
     again = "teach again (gripmon teach), or use what it was taught with"
     taught_kind, kind = (type(lens).__struct_config__.tag for lens in (model.camera, camera.settings))
     if taught_kind != kind:
@@ -191,12 +191,12 @@ def taught_pose(model: TaughtModel) -> Array:
 class TaughtEdges:
     """A taught model in arrays over all edges of the gripper.
 
-    ``known`` (e,) the edge was taught; ``crease`` (e,) as a line between two visible faces; ``share`` (e, 2) where on
-    it it was seen, ``shift_grip_m`` (e, 2, 3) the line's shift off both ends of the model's edge, gripper frame;
-    ``sigma_m`` (e,) its standard deviation across the line of sight, ``depth_grip`` (e, 3) the direction that was the
-    line of sight, across the edge, and ``depth_sigma_m`` (e,) the standard deviation along it; ``polarity`` (e,) int8
-    as in the gripper (1: brighter to the right).  Where an edge is not known the numbers are those of no shift.
-    ``usual_m``: how far taught edges lie from the sharp model's, root mean square; so far others may lie, too.
+    ``known`` (e,): the edge was taught; ``crease`` (e,): as a line between two visible faces; ``share`` (e, 2): its
+    visible part; ``shift_grip_m`` (e, 2, 3): the line's shift at both ends of the model's edge, gripper frame;
+    ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
+    taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
+    gripper (1: brighter to the right).  An edge that isn't known has no shift.  ``usual_m``: root mean square offset of
+    the taught edges, which others may have, too.
     """
 
     known: NDArray[np.bool_]
@@ -213,7 +213,7 @@ class TaughtEdges:
     def of(
         cls, edges: Mapping[str, TaughtEdge], gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None
     ) -> TaughtEdges:
-        """Arrays of edges that were taught at a pose and a jaw opening."""
+        """Arrays of edges taught at a pose and a jaw opening."""
         listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
         across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
         share = np.array([e.share for e in listed])
@@ -235,13 +235,13 @@ class TaughtEdges:
 
     @classmethod
     def of_model(cls, model: TaughtModel, gripper: Gripper) -> TaughtEdges:
-        """Arrays of a file that :func:`mismatch` has nothing against."""
+        """Arrays of a file without a :func:`mismatch`, at the mean of its images' jaw openings."""
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
         return cls.of(model.edges, gripper, taught_pose(model), float(np.mean(openings)) if openings else None)
 
     @property
     def digest(self) -> str:
-        """Of where it has the edges, to the nanometre."""
+        """Digest of the edges' shifts, to the nanometre."""
         places = np.rint(1e9 * self.shift_grip_m).astype("<i8")
         return hashlib.sha256(self.known.tobytes() + places.tobytes()).hexdigest()[:16]
 
@@ -251,9 +251,8 @@ class TaughtEdges:
         return shift_m[:, 0] + fraction[:, None] * (shift_m[:, 1] - shift_m[:, 0])
 
     def spread_m(self, gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> Array:
-        """(e,) standard deviation of each taught edge's offset seen from here, m.
-
-        Of its depth as much counts as the line of sight has turned.
+        """(e,) standard deviation of each taught edge's offset seen from a pose, m: that of its depth contributes by as
+        much as the line of sight has turned.
         """
         across, _ = sight_axes(gripper, points_grip_m, cam_T_grip)
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
@@ -274,7 +273,7 @@ def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tup
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Row by row; for a few rows np.cross spends most of its time on checks."""
+    """Cross products of the rows; np.cross would spend most of its time on checks."""
     out = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
