@@ -29,10 +29,11 @@ from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
-from gripmon.daemon.setup.project import Line
+from gripmon.daemon.setup.entries import target_in
+from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.robot_file import reference_text
 from gripmon.daemon.setup.site import CaptureOrder, Do
-from gripmon.daemon.setup.steps import defaults, target_in
+from gripmon.daemon.setup.steps import defaults
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, FolderSource, LiveSettings, NetworkSettings, SourceError, Waiting
