@@ -205,11 +205,7 @@ def test_the_camera_s_target_in_another_size_is_refused(
     ],
 )
 def test_the_same_pattern_in_another_size(recorded: str | None, given: str, refused: bool):
-    with (
-        pytest.raises(OtherSizeError, match="another size; .*other_target=True")
-        if refused
-        else contextlib.nullcontext()
-    ):
+    with pytest.raises(OtherSizeError, match="other_target=True") if refused else contextlib.nullcontext():
         refuse_other_size(parse_target(given), recorded)
 
 
