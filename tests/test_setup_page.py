@@ -38,6 +38,7 @@ def driver() -> Iterator[Any]:
 
 
 Walked = tuple[Path, dict[str, Any]]
+STANDS_OUT = "return [...document.querySelectorAll('#buttons .main')].map((b) => b.textContent)"
 
 
 def gone(folder: Path, driver: Any, go: Callable[[Walker, Callable[[str], object]], None]) -> Walked:
@@ -309,7 +310,9 @@ def test_another_target_than_the_lens_s_is_confirmed_on_the_page(walked: Walked,
         visitor.go("reference")
         assert visitor.script("return document.querySelector('[name=other_target]')") is None
         visitor.go("gripper")
-        visitor.fill(jaw_range="0:0.12")  # its opening is twice as large, too
+        assert visitor.script(STANDS_OUT) == ["Next: Gripper on the target →"]
+        visitor.fill(jaw_range="0:0.09")
+        assert visitor.script(STANDS_OUT) == ["Use it"] and "changed: press “Use it”" in visitor.text("#status")
         visitor.press("step")
         visitor.done("gripper")
         for size in ("0.012:0.006", "0.016:0.008"):
@@ -327,7 +330,14 @@ def test_another_target_than_the_lens_s_is_confirmed_on_the_page(walked: Walked,
             if size == "0.012:0.006":  # said of this one only
                 visitor.press("step")
                 visitor.done("reference")
-        assert f"circles:12x10:{size} is really another target than" in visitor.text("label.check")
+        visitor.press("step")
+        visitor.refused("the jaws stand 0.1000 m open, beyond “jaws move (m)” 0:0.09")  # the opening is twice as large
+        visitor.go("gripper")
+        visitor.fill(jaw_range="0:0.12")
+        visitor.press("step")
+        visitor.done("gripper")
+        visitor.go("reference")
+        assert f"circles:12x10:0.008:0.004, the gripper stands on circles:12x10:{size}" in visitor.text("label.check")
         assert visitor.ugly() == []
         visitor.press("step")
         visitor.done("reference")
@@ -343,12 +353,11 @@ def test_the_next_thing_to_do_stands_out_and_the_keyboard_reaches_it(walked: Wal
     folder.mkdir()
     for name in ("camera.yaml", "setup.yaml"):
         shutil.copy2(walked[0] / name, folder / name)
-    stands_out = "return [...document.querySelectorAll('#buttons .main')].map((b) => b.textContent)"
     has_focus = "return document.activeElement.id || document.activeElement.name"
     with page(folder, command=("setup",)) as running:
         visitor = Walker(driver, running.url)
         visitor.go("reference")
-        assert visitor.script(stands_out) == ["First: Gripper on the target →"]
+        assert visitor.script(STANDS_OUT) == ["First: Gripper on the target →"]
         visitor.press("first")
         visitor.wait(lambda: visitor.text("#title") == "Gripper on the target", "the step")
         assert visitor.script(has_focus) == "title" and "press “Start”" in visitor.text("#status")
@@ -356,9 +365,9 @@ def test_the_next_thing_to_do_stands_out_and_the_keyboard_reaches_it(walked: Wal
         visitor.script("document.querySelector('[name=reference_by]').focus()")
         visitor.fill(reference_by="a file")
         assert visitor.script(has_focus) == "reference_by"
-        assert visitor.script(stands_out) == ["Use it"]
+        assert visitor.script(STANDS_OUT) == ["Use it"]
         visitor.go("camera")
-        assert visitor.script(stands_out) == ["Next: Target →"]
+        assert visitor.script(STANDS_OUT) == ["Next: Target →"]
         visitor.script("document.querySelector('#do-step').focus()")
         visitor.keys("\ue007")
         visitor.wait(lambda: "768 x 576 px" in visitor.text("#said"), "the camera")

@@ -67,7 +67,8 @@ def other_target(values: Values) -> str:
     """What is confirmed then, else empty.  It names both targets, so that it confirms nothing about others."""
     if other_size(values) is None:
         return ""
-    return f"{name_of(target_in(values))} is really another target than {made_with(Path(LENS))}, the lens's"
+    lens, stands = made_with(Path(LENS)), name_of(target_in(values))
+    return f"There are two targets: the lens was calibrated with {lens}, the gripper stands on {stands}"
 
 
 def confirmed(values: Values) -> bool:

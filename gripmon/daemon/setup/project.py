@@ -257,7 +257,7 @@ class Project:
                 if frame is None:
                     break
                 if isinstance(frame, Waiting):
-                    why = frame.reason
+                    why = frame.reason.partition("; next attempt")[0]  # there is none here
                 elif frame.image is None:
                     why = frame.fault or "not an image"
                 else:

@@ -208,11 +208,12 @@ class SetupSite:
 
     def _work(self, step: str) -> None:
         try:
-            self._said[step] = tuple(self._project.do(step))
+            done = self._project.do(step)
+            self._said[step] = tuple(Line(steps.in_fields(e.text), e.level) if e.level else e for e in done)
         except OtherSizeError as error:
             self._errors[step] = str(error.worded("tick the box below"))
         except (InputError, NoResultError) as error:
-            self._errors[step] = str(error)
+            self._errors[step] = steps.in_fields(str(error))
         except Exception as error:  # noqa: BLE001  the page must report any failure, and continue
             self._errors[step] = in_short(error)
         finally:

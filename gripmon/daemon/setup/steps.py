@@ -4,6 +4,7 @@ same in the project's folder.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,6 +78,11 @@ def grippers() -> dict[str, Path]:
 
 
 _PLATE_SOURCE = "empty: the camera of step 1; or a folder of existing images"
+_OPTIONS = {
+    "paper": "--paper", "model": "--model", "cad_unit": "--unit", "cad_view": "--view", "distance": "--distance",
+    "jaw_range": "--jaw-range", "jaw_opening": "--jaw-opening",
+}  # fmt: skip
+"""The commands' options for fields."""
 
 
 def _step_command(name: str) -> Callable[[Values], list[str]]:
@@ -124,7 +130,7 @@ def _from_cad(values: Values) -> list[str]:
     files = _words(values, "cad_files")
     if not files:
         raise InputError("no file is given; a mesh for each finger, or one for both, a URDF or a .cao")
-    words = [*_given(values, jaw_range="--jaw-range", cad_unit="--unit", cad_view="--view"), *_words(values, "options")]
+    words = [*_given(values, "jaw_range", "cad_unit", "cad_view"), *_words(values, "options")]
     # A picture needs a view.
     viewed = any(word.startswith(("--view", "--reference")) for word in words)
     words += ["--camera", "camera.yaml", "--picture", "gripper.png"] if viewed else []
@@ -133,14 +139,14 @@ def _from_cad(values: Values) -> list[str]:
 
 def _from_images(values: Values) -> list[str]:
     """Also writes a reference."""
-    words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, distance="--distance")]
+    words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, "distance")]
     words += [*_words(values, "options"), "--picture", "gripper.png", "--reference-out", "hand_eye.yaml"]
     return ["gripmon", "gripper", "from-images", *words, "--out", "gripper.yaml", "--force"]
 
 
-def _given(values: Values, **options: str) -> list[str]:
+def _given(values: Values, *fields: str) -> list[str]:
     """Options from the fields with their values; empty fields are left out."""
-    return [word for field, option in options.items() if values[field] for word in (option, values[field])]
+    return [word for field in fields if values[field] for word in (_OPTIONS[field], values[field])]
 
 
 def _words(values: Values, field: str) -> list[str]:
@@ -166,10 +172,10 @@ def _reference(values: Values) -> list[str] | None:
     words += ["--camera", "camera.yaml"]
     if values["gripper"] == INFERRED:
         words += ["--corners", "standing/rough.yaml", "--infer", "--gripper-out", "gripper.yaml"]
-        words += _given(values, jaw_range="--jaw-range")
+        words += _given(values, "jaw_range")
     else:
         words += ["--corners", "standing/corners.yaml", "--gripper", "gripper.yaml"]
-    words += [*_given(values, jaw_opening="--jaw-opening"), *(["--other-target"] if confirmed(values) else [])]
+    words += [*_given(values, "jaw_opening"), *(["--other-target"] if confirmed(values) else [])]
     return [*words, "--out", "hand_eye.yaml", "--picture", "hand_eye.png", "--force"]
 
 
@@ -273,9 +279,9 @@ STEPS = (
             Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the "
                   "gripper's nominal opening, or of an inferred gripper the distance of its fingertips", (),
                   ("reference_by", (ON_PLATE,))),
-            Field("other_target", "another target", "", "the same pattern in two sizes: where one is a mistake, all "
-                  "lengths are wrong by as much, and no image shows it; mend it in the step Target then",
-                  asks=other_target),
+            Field("other_target", "another target", "", "It is one pattern in two sizes.  If there is only one "
+                  "target, correct its size in the step Target instead, or calibrate the lens again: no image shows "
+                  "that a size is wrong, and all lengths would be wrong by as much.", asks=other_target),
         ), "hand_eye.png",
     ),
     Step(
@@ -302,6 +308,14 @@ STEPS = (
 
 
 BY_NAME = {step.name: step for step in STEPS}
+
+
+def in_fields(text: str) -> str:
+    """A command's message with its options called as the page's fields are."""
+    labels = {field.name: field.label for step in STEPS for field in step.fields}
+    for name, option in _OPTIONS.items():
+        text = re.sub(rf"(?<!\S){option}(?![\w-])", f"“{labels[name]}”", text)
+    return text
 
 
 def defaults() -> dict[str, str]:

@@ -43,6 +43,9 @@ function redraw(parent, shown, make) {
 
 const step = () => state.steps.find((each) => each.state.name === chosen);
 const capture = () => (state.capturing === chosen ? state.capture : null);
+const taking = () => Boolean(capture()?.running && !capture().ended);
+// What is entered and not yet used: the server keeps it without blanks.
+const entered = () => step().fields.some(({ name, value }) => name in typed && typed[name].trim() !== value);
 // Of this step, and what was typed before and not yet sent: whoever goes on at once has said it, too.
 const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value])) });
 // Of all steps: what is asked may depend on another one's.
@@ -81,6 +84,7 @@ function changed(name, value) {
   typed[name] = value;
   showFields();
   showButtons();
+  showStatus();
 }
 
 function tickBox({ name, label: title, box, hint }, ticked) {
@@ -142,9 +146,10 @@ function showButtons() {
   const next = ["done", "skipped"].includes(progress) && later.find((each) => each.state.progress !== "skipped");
   const before = state.steps.find((each) => each.state.name === first);
   const nodes = buttonsOf(step());
-  // The one to press next stands out: while the camera runs, it is the camera's.
-  if (before || (next && !capture()?.running)) nodes.forEach((node) => node.classList.remove("main"));
-  if (next) nodes.push(towards(`Next: ${next.title} →`, "on", next, !capture()?.running));
+  // The one to press next stands out: the step's own while it isn't finished.
+  const onwards = next && !taking() && !entered() && !capture()?.coverage?.wants.length;
+  if (before || onwards) nodes.forEach((node) => node.classList.remove("main"));
+  if (next) nodes.push(towards(`Next: ${next.title} →`, "on", next, onwards));
   if (before) nodes.unshift(towards(`First: ${before.title} →`, "first", before, true));
   const parts = nodes.map(({ id, textContent, className, disabled }) => [id, textContent, className, disabled]);
   redraw($("#buttons"), [chosen, first, next?.title, parts], () => nodes);
@@ -157,7 +162,7 @@ function towards(text, id, { state: { name } }, main) {
 }
 
 function status() {
-  const { state: now, error } = step(), taking = capture(), { monitor } = state;
+  const { state: now, error } = step(), camera = capture(), { monitor } = state, own = $("#do-step")?.textContent;
   const wrong = refused || error;
   if (state.busy) return state.busy === chosen ? ["at work …", ""] : [`at work on another step (${state.busy}) …`, ""];
   if (wrong) return [wrong, "bad"];
@@ -168,10 +173,17 @@ function status() {
     const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
     return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
   }
-  if (taking && (taking.running || taking.ended)) return [taking.ended ? taking.note : `${taking.note}; ${taking.images.length} taken`, /^(taken|ready|no more)/.test(taking.note) ? "good" : "warn"];
+  if (camera && (camera.running || camera.ended)) return [camera.ended ? camera.note : `${camera.note}; ${camera.images.length} taken`, /^(taken|ready|no more)/.test(camera.note) ? "good" : "warn"];
+  if (now.progress === "done" && own && entered()) return [`changed: press “${own}”`, ""];
   const words = { done: "done", stale: now.note, waits: now.note, skipped: `not needed: ${now.note}`, ready: "" };
   const text = words[now.progress] || "";
-  return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || `not done yet: press “${$("#do-step")?.textContent}”`, { done: "good", stale: "warn" }[now.progress] ?? ""];
+  return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || `not done yet: press “${own}”`, { done: "good", stale: "warn" }[now.progress] ?? ""];
+}
+
+function showStatus() {
+  const [text, kind] = status();
+  if ($("#status").textContent !== text) $("#status").textContent = text;
+  $("#status").dataset.kind = kind;
 }
 
 function showCapture() {
@@ -243,12 +255,10 @@ function show() {
   $("#title").textContent = card.title;
   $("#about").textContent = card.about;
   // Broken between words only: within one it would break after "--".
-  redraw($("#command code"), card.state.command, () => card.state.command.split(" ").flatMap((word) => [element("span", word), " "]).slice(0, -1));
+  redraw($("#command code"), card.state.command, () => card.state.command.split(" ").filter(Boolean).flatMap((word) => [element("span", word), " "]).slice(0, -1));
   showFields();
   showButtons();
-  const [text, kind] = status();
-  if ($("#status").textContent !== text) $("#status").textContent = text;
-  $("#status").dataset.kind = kind;
+  showStatus();
   showCapture();
   showMonitor();
   showResult();
