@@ -24,7 +24,7 @@ from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
-from gripmon.model.targets import TargetError, parse_target, refuse_other_size
+from gripmon.model.targets import OtherSizeError, parse_target, refuse_other_size
 from gripmon.track.edges.taught import gripper_digest
 
 TRUE = nominal_cam_T_grip()
@@ -205,7 +205,7 @@ def test_the_camera_s_target_in_another_size_is_refused(
     ],
 )
 def test_the_same_pattern_in_another_size(recorded: str | None, given: str, refused: bool):
-    with pytest.raises(TargetError, match="another size") if refused else contextlib.nullcontext():
+    with pytest.raises(OtherSizeError, match="other_target=True") if refused else contextlib.nullcontext():
         refuse_other_size(parse_target(given), recorded)
 
 

@@ -234,7 +234,7 @@ def test_a_mesh_without_a_unit_asks_for_it(tmp_path: Path, capsys: pytest.Captur
     (path,) = write_meshes(box_meshes(sharp_gripper())[:1], tmp_path)
     assert from_cad(path, "--out", tmp_path / "g.yaml") == 2
     said = capsys.readouterr().err
-    assert "--unit: is missing" in said and "in m: 4e+04 mm long, in cm: 400 mm long, in mm: 40 mm long" in said
+    assert "--unit: is missing" in said and "in m: 40000 mm long, in cm: 400 mm long, in mm: 40 mm long" in said
     assert from_cad(path, "--unit", "m", "--out", tmp_path / "g.yaml") == 2
     assert "would be 40000 mm long" in capsys.readouterr().err
     assert not (tmp_path / "g.yaml").exists()

@@ -29,10 +29,11 @@ from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
-from gripmon.daemon.setup.project import Line
+from gripmon.daemon.setup.entries import other_target, target_in
+from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.robot_file import reference_text
 from gripmon.daemon.setup.site import CaptureOrder, Do
-from gripmon.daemon.setup.steps import defaults, target_in
+from gripmon.daemon.setup.steps import defaults, in_fields
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, FolderSource, LiveSettings, NetworkSettings, SourceError, Waiting
@@ -300,6 +301,32 @@ def test_grippers_from_cad_and_images_are_commands(tmp_path: Path):
     project.keep({"gripper": "two_box_fingers", "reference_by": "with the gripper's images"})
     with pytest.raises(InputError, match="this gripper wasn't made from images"):
         project.do("standing")
+
+
+def test_another_target_than_the_lens_s_is_confirmed_for_these_two_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "standing").mkdir()
+    for name in ("standing/000.png", "standing/rough.yaml"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "camera.yaml").write_text(f"target: {new_user.TARGET}\n")
+    project, twice = Project(tmp_path), "circles:12x10:0.016:0.008"
+    assert other_target(project.values) == ""
+    project.keep({"target": twice})
+    project.keep({"other_target": other_target(project.values)})
+    assert project.states()[7].command.endswith(" --other-target --out hand_eye.yaml --picture hand_eye.png --force")
+    project.keep({"target": "circles:12x10:0.012:0.006"})
+    assert "--other-target" not in project.states()[7].command
+    assert main(["setup", ".", "--step", "reference"]) == 2
+    said = capsys.readouterr().err
+    assert f"{new_user.TARGET}, the same pattern in another size; that one, or cd {tmp_path} && gripmon cal" in said
+    assert "--force --other-target if it is really another target" in said and said.count("\n") == 1
+
+
+def test_options_in_messages_are_called_as_the_fields():
+    said = "--unit: is missing; --units, or x--unit; beyond --jaw-range 0:0.06"
+    assert in_fields(said) == "“unit of the meshes”: is missing; --units, or x--unit; beyond “jaws move (m)” 0:0.06"
 
 
 def test_a_lens_from_a_file_needs_no_images_of_the_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -38,6 +38,7 @@ def driver() -> Iterator[Any]:
 
 
 Walked = tuple[Path, dict[str, Any]]
+STANDS_OUT = "return [...document.querySelectorAll('#buttons .main')].map((b) => b.textContent)"
 
 
 def gone(folder: Path, driver: Any, go: Callable[[Walker, Callable[[str], object]], None]) -> Walked:
@@ -170,7 +171,7 @@ def test_a_gripper_from_cad_is_taught_and_then_valid(walked: Walked, driver: Any
     assert before > 0.9 and after > 0.5
 
 
-def test_nothing_overflows_or_overlaps_at_three_widths(walked: Walked):
+def test_nothing_overflows_or_overlaps_at_any_width(walked: Walked):
     assert {step: each["ugly"] for step, each in walked[1].items() if each["ugly"]} == {}
 
 
@@ -295,5 +296,93 @@ def test_later_steps_refuse_in_one_line_and_keep_what_is_there(walked: Walked, d
         visitor.go("run")
         visitor.press("step")
         visitor.refused("config.yaml")
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+
+
+def test_another_target_than_the_lens_s_is_confirmed_on_the_page(walked: Walked, driver: Any, tmp_path: Path):
+    """The pattern in twice the size: refused until a box is ticked, and by no other target's box."""
+    folder = tmp_path / "other"
+    shutil.copytree(walked[0], folder, copy_function=shutil.copy2)
+    before = yaml.safe_load((folder / "hand_eye.yaml").read_text())["cam_T_grip"]["translation_m"]
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        visitor.go("reference")
+        assert visitor.script("return document.querySelector('[name=other_target]')") is None
+        visitor.go("gripper")
+        assert visitor.script(STANDS_OUT) == ["Next: Gripper on the target →"]
+        visitor.fill(jaw_range="0:0.09")
+        assert visitor.script(STANDS_OUT) == ["Use it"] and "changed: press “Use it”" in visitor.text("#status")
+        visitor.press("step")
+        visitor.done("gripper")
+        for size in ("0.012:0.006", "0.016:0.008"):
+            visitor.go("target")
+            visitor.fill(target=f"circles:12x10:{size}")
+            visitor.press("step")
+            visitor.wait(lambda size=size: size in visitor.text("#said"), "the target")
+            visitor.go("reference")
+            visitor.wait(lambda: visitor.progress("reference") == "stale", "it was measured on another target")
+            visitor.on_page("[name=other_target]")
+            visitor.press("step")
+            visitor.refused(size, "circles:12x10:0.008:0.004", "in another size", "tick the box below")
+            assert "--other-target" not in visitor.text("#status") + visitor.text("#command")
+            visitor.click("[name=other_target]")
+            if size == "0.012:0.006":  # said of this one only
+                visitor.press("step")
+                visitor.done("reference")
+        visitor.press("step")
+        visitor.refused("the jaws stand 0.1000 m open, beyond “jaws move (m)” 0:0.09")  # the opening is twice as large
+        visitor.go("gripper")
+        visitor.fill(jaw_range="0:0.12")
+        visitor.press("step")
+        visitor.done("gripper")
+        visitor.go("reference")
+        assert f"circles:12x10:0.008:0.004, the gripper stands on circles:12x10:{size}" in visitor.text("label.check")
+        assert visitor.ugly() == []
+        visitor.press("step")
+        visitor.done("reference")
+        assert "--other-target" in visitor.text("#command") and visitor.progress("intrinsics") == "done"
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+    after = yaml.safe_load((folder / "hand_eye.yaml").read_text())["cam_T_grip"]["translation_m"]
+    np.testing.assert_allclose(after, 2.0 * np.array(before), atol=1e-4)
+
+
+def test_the_next_thing_to_do_stands_out_and_the_keyboard_reaches_it(walked: Walked, driver: Any, tmp_path: Path):
+    folder = tmp_path / "keys"
+    folder.mkdir()
+    for name in ("camera.yaml", "setup.yaml"):
+        shutil.copy2(walked[0] / name, folder / name)
+    has_focus = "return document.activeElement.id || document.activeElement.name"
+    with page(folder, command=("setup",)) as running:
+        visitor = Walker(driver, running.url)
+        visitor.go("reference")
+        assert visitor.script(STANDS_OUT) == ["First: Gripper on the target →"]
+        visitor.press("first")
+        visitor.wait(lambda: visitor.text("#title") == "Gripper on the target", "the step")
+        assert visitor.script(has_focus) == "title" and "press “Start”" in visitor.text("#status")
+        # A choice that draws the fields anew, and a step that draws its buttons anew, keep the focus.
+        visitor.script("document.querySelector('[name=reference_by]').focus()")
+        visitor.fill(reference_by="a file")
+        assert visitor.script(has_focus) == "reference_by"
+        assert visitor.script(STANDS_OUT) == ["Use it"]
+        visitor.go("camera")
+        assert visitor.script(STANDS_OUT) == ["Next: Target →"]
+        visitor.script("document.querySelector('#do-step').focus()")
+        visitor.keys("\ue007")
+        visitor.wait(lambda: "768 x 576 px" in visitor.text("#said"), "the camera")
+        visitor.wait(lambda: visitor.script(has_focus) == "do-step", "the focus again")
+        # What it looked at, anew each time: the address differs.
+        shown = "const i = document.querySelector('#result img'); return i.naturalWidth > 0 && i.getAttribute('src')"
+        visitor.wait(lambda: visitor.script(shown), "the picture")
+        first = visitor.script(shown)
+        visitor.press("step")
+        visitor.wait(lambda: visitor.script(shown) not in (False, first), "another picture")
+        # A button that stays as it is stays the same node: a click on it isn't lost between two answers.
+        visitor.script("window.node = document.querySelector('[data-step=target]')")
+        visitor.script("return new Promise((done) => setTimeout(done, 1300))")
+        assert visitor.script("return window.node.isConnected")
+        spoken = visitor.script("return window.node.getAttribute('aria-label')")
+        assert spoken == "2. Target, done"
         visitor.click("#done")
         assert running.ended() == (0, "")

@@ -27,6 +27,15 @@ INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 SNAPPED_PX = 0.2
 
 
+_OVERLAPS = """
+const names = document.querySelectorAll(".handle:not([visibility=hidden]) text");
+const boxes = [...names].map((name) => name.getBoundingClientRect());
+const over = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1
+  && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 3;
+return boxes.flatMap((a, k) => boxes.slice(k + 1).filter((b) => over(a, b)).map((b) => `${a.left} ${b.left}`));
+"""
+
+
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     return make_rig(tmp_path_factory.mktemp("hand"))
@@ -58,6 +67,10 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
     with page(rig.image_path, *rig.options, "--out", tmp_path, "--robot", "arm7") as running:
         visitor = Visitor(driver, running.url)
         assert "Drag 4 corners" in visitor.text("#status")
+        for width_px in (600, 900, 1400):
+            driver.set_window_size(width_px, 900)
+            visitor.settle()
+            assert visitor.script(_OVERLAPS) == [], f"names of corners lie over each other at {width_px} px"
         assert not visitor.find("#expected").is_displayed()
         for name, (u, v) in rig.rough(*INNER, off_px=5.0).items():
             visitor.drag(name, u, v)

@@ -235,14 +235,19 @@ class _Found:
 
 
 def read_arm_poses(
-    tables: Sequence[Path], camera: GivenCamera | None = None, target: Target | None = None, progress: Progress = quiet
+    tables: Sequence[Path],
+    camera: GivenCamera | None = None,
+    target: Target | None = None,
+    progress: Progress = quiet,
+    *,
+    other_target: bool = False,
 ) -> ArmPoses:
     """All rows of all tables; rows that name images need the ``camera`` that took them and the ``target``.
 
     :class:`~gripmon.model.errors.InputError` for wrong tables, also for a ``target`` of the pattern of the camera's in
-    another size; :class:`CalibrationError` if no image shows it.
+    another size, unless ``other_target`` confirms it; :class:`CalibrationError` if no image shows it.
     """
-    if camera is not None and target is not None:
+    if camera is not None and target is not None and not other_target:
         refuse_other_size(target, camera.target)
     found = _Found()
     for path in tables:

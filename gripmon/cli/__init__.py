@@ -183,7 +183,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _in_words(error: InputError | NoResultError, arguments: Arguments) -> str:
     """The error's line; if a function's argument is wrong, its option is put in front."""
+    from gripmon.model.targets import OtherSizeError
+
     command: Command = arguments.command
+    if isinstance(error, OtherSizeError) and (option := command.arguments.get("other_target")):
+        error = error.worded(option)
     if isinstance(error, InputError):
         for name in (error.argument, error.argument.rpartition("_")[0]):
             if option := command.arguments.get(name):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
@@ -178,9 +177,7 @@ def robot_world(arguments: Arguments) -> None:
     arguments.check_outputs("out")
     target = None if arguments.target is None else target_of(arguments.target)
     camera = None if arguments.camera is None else read_given_camera(arguments.camera)
-    if camera is not None and arguments.other_target:
-        camera = replace(camera, target=None)
-    poses = read_arm_poses(arguments.data, camera, target, progress_bar)
+    poses = read_arm_poses(arguments.data, camera, target, progress_bar, other_target=arguments.other_target)
     note(poses.unseen)
     found = calibrate_robot_world(
         poses.base_T_ee, poses.cam_T_target, poses.covariance, common=poses.common, eye_in_hand=arguments.eye_in_hand,

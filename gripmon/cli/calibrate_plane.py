@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, jaw_opening, jaw_range, note, progress_bar
@@ -84,10 +83,9 @@ def plane(arguments: Arguments) -> None:
         arguments.camera, arguments.gripper, arguments.config, arguments.corners or (), arguments.jaw_opening,
         infer=arguments.infer,
     )  # fmt: skip
-    camera = replace(given.camera, target=None) if arguments.other_target else given.camera
     found = calibrate_plane(
-        paths, camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
-        cam_T_grip=given.cam_T_grip, progress=progress_bar,
+        paths, given.camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
+        cam_T_grip=given.cam_T_grip, other_target=arguments.other_target, progress=progress_bar,
     )  # fmt: skip
     note(f"not used: {reason}" for reason in found.not_used)
     # In full even if a file named it: the hand/eye calibration records its target nowhere else.

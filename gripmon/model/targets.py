@@ -26,6 +26,22 @@ class TargetError(InputError):
     argument = "target"
 
 
+class OtherSizeError(TargetError):
+    """A target has the pattern of a known one in another size, which may be meant.
+
+    ``fault`` says so without a remedy.  ``confirmed_by`` is how the caller's user confirms that it is really another
+    target; :meth:`worded` says it in the caller's own terms.
+    """
+
+    def __init__(self, fault: str, confirmed_by: str = "other_target=True") -> None:
+        super().__init__(f"{fault}; that one, or {confirmed_by} if it is really another target")
+        self.fault = fault
+
+    def worded(self, confirmed_by: str) -> OtherSizeError:
+        """The same error with another way to confirm it, e.g. an option."""
+        return OtherSizeError(self.fault, confirmed_by)
+
+
 class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="chequerboard"):
     """Squares in two colours; ``columns`` and ``rows`` count the *inner* corners, as OpenCV and ROS do."""
 
@@ -121,8 +137,8 @@ def name_of(target: Target) -> str:
 
 
 def refuse_other_size(target: Target, recorded: str | None, made: str = "the camera was calibrated with") -> None:
-    """Raise :class:`TargetError` if the target ``recorded`` in a file (as :func:`name_of` writes it; None: none is) has
-    the same pattern in another size: no image contradicts a wrong size, and what is measured scales with it.
+    """Raise :class:`OtherSizeError` if the target ``recorded`` in a file (as :func:`name_of` writes it; None: none is)
+    has the same pattern in another size: no image contradicts a wrong size, and what is measured scales with it.
     """
     try:
         known = None if recorded is None else parse_target(recorded)
@@ -134,8 +150,7 @@ def refuse_other_size(target: Target, recorded: str | None, made: str = "the cam
         return
     lengths = [name for name in known.__struct_fields__ if name.endswith("_m")]
     if not all(math.isclose(getattr(target, n), getattr(known, n), rel_tol=_AS_WRITTEN) for n in lengths):
-        wrong = f"{made} {name_of(known)}, the same pattern in another size"
-        raise TargetError(f"{name_of(target)}: {wrong}; that one, or --other-target if it is really another target")
+        raise OtherSizeError(f"{name_of(target)}: {made} {name_of(known)}, the same pattern in another size")
 
 
 def tells_its_turn(target: Target) -> bool:

@@ -247,18 +247,20 @@ def calibrate_plane(
     corners: Rough | Sequence[Rough] | None = None,
     jaw_opening_m: float | None = None,
     cam_T_grip: Array | None = None,
+    other_target: bool = False,
     progress: Progress = quiet,
 ) -> HandEyeOnPlate:
     """``cam_T_grip`` from images of the gripper standing on a calibration plate (the Plane Coincidence Constraint).
 
     Where to look for the gripper: rough ``corners`` (name: (u, v) in px; for all images or for each), or a rough
     calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, named as in
-    :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.  A camera
-    that was calibrated with the same pattern in another size is refused, unless its own ``target`` is None.
+    :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.
+    :class:`~gripmon.model.targets.OtherSizeError` for the pattern of the camera's target in another size, unless
+    ``other_target`` confirms it.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
-    refuse_other_size(target, given.target)
+    refuse_other_size(target, None if other_target else given.target)
     method = (
         UnknownGripper(given, target)
         if gripper is None

@@ -21,11 +21,11 @@ from support.loopback import wait_for_default_port
 from support.teach_page_browser import ROOT, Visitor, browser, page
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
-WIDTHS = (375, 1100, 1920)
+WIDTHS = (375, 768, 1280, 1920)
 WIDE = 1150
 """Of the pictures, px."""
 _CONTROLS = """
-const seen = [...document.querySelectorAll("button, input, select, a, label.check")]
+const seen = [...document.querySelectorAll("button, input, select, a, label.check, #legend")]
   .filter((node) => node.checkVisibility({visibilityProperty: true}) && node.getBoundingClientRect().width > 0);
 const out = [], named = (node) => node.id || node.name || node.textContent, wide = document.documentElement.scrollWidth;
 for (const [k, a] of seen.entries()) {

@@ -15,45 +15,43 @@ from typing import Literal
 
 import msgspec
 
+from gripmon.calibrate.lattice import to_bytes, to_grey
 from gripmon.calibrate.target_print import print_target
 from gripmon.daemon.config import read_gripper
 from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-from gripmon.daemon.setup import steps
+from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture
+from gripmon.daemon.setup.entries import target_in
+from gripmon.daemon.setup.lines import Line, findings, jaws, last_line
 from gripmon.daemon.setup.robot_file import reference_text
-from gripmon.daemon.setup.steps import BY_NAME, STEPS, Step, needed, own_camera, target_in, written
+from gripmon.daemon.setup.steps import BY_NAME, STEPS, Step, needed, own_camera, written
 from gripmon.daemon.teaching.source import open_named
 from gripmon.io.sources import Source, Waiting
 from gripmon.io.wire.session import check_name
 from gripmon.model.atomic import writable_folder, write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import IMAGE_SUFFIXES
-from gripmon.model.targets import name_of, parse_target
-from gripmon.model.units import jaw_range_in
+from gripmon.model.targets import OtherSizeError, name_of, parse_target
+from gripmon.teach.messages import encoded
 
-SETUP = "setup.yaml"
+SETUP, VIEW = "setup.yaml", "view.jpg"
 _FIRST_FRAME_S = 20
 """Number of reads, half a second each, within which the first image must arrive: network cameras take ten seconds to
 connect.
 """
 Progress = Literal["done", "stale", "ready", "waits", "skipped"]
-Level = Literal["", "OK", "WARN", "FAIL"]
-
-
-class Line(msgspec.Struct, frozen=True):
-    """A line of a step's output."""
-
-    text: str
-    level: Level = ""
 
 
 class StepState(msgspec.Struct, frozen=True, kw_only=True):
-    """``progress`` "stale": an input is newer than the result; ``note``: why the step isn't done, in words."""
+    """``progress`` "stale": an input is newer than the result; ``note``: why the step isn't done, in words; ``first``:
+    the step whose result it waits for.
+    """
 
     name: str
     progress: Progress
     note: str
+    first: str | None = None
     command: str
     files: tuple[str, ...]
 
@@ -143,7 +141,10 @@ class Project:
             command = f"cd {shlex.quote(str(self.folder))} && {state.command}"
             raise InputError(f"{name}: has a command of its own; {command}")
         if step.kind == "form":
-            return self.do(name)
+            try:
+                return self.do(name)
+            except OtherSizeError as error:
+                raise error.worded(f"cd {shlex.quote(str(self.folder))} && {state.command} --other-target") from None
         capture = self.capture(name)
         capture.start(self.open_camera(name))
         capture.by_itself(True)
@@ -169,13 +170,15 @@ class Project:
         if step.picture is not None:
             files = (*files, step.picture)
         present = tuple(name for name in files if (self.folder / name).exists())
-        return StepState(name=step.name, progress=progress, note=note, command=command, files=present)
+        missing = self._missing(step) if progress == "waits" else None
+        first = None if missing is None else missing[1].name
+        return StepState(name=step.name, progress=progress, note=note, first=first, command=command, files=present)
 
     def _progress(self, step: Step, files: tuple[str, ...], *, needs_doing: bool) -> tuple[Progress, str]:
-        inferred = step.name == "gripper" and self.values["gripper"] == steps.INFERRED
+        inferred = step.name == "gripper" and self.values["gripper"] == entries.INFERRED
         if inferred or step.name in ("camera", "target"):
             done = self._accepted.get(step.name) == self._said(step)
-            return ("done", "made in the step Hand and eye" if inferred else "") if done else ("ready", "")
+            return ("done", "the step Hand and eye makes its file" if inferred else "") if done else ("ready", "")
         if not needs_doing:
             by = "intrinsics_by" if step.name == "plate" else "reference_by"
             return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
@@ -191,9 +194,10 @@ class Project:
         newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
         # An inferred gripper is made together with the hand/eye calibration.
         newer = [name for name in newer if name not in files]
-        if step.name == "intrinsics" and self.values["intrinsics_by"] != steps.FROM_FILE and not newer:
-            made_with, now = read_yaml(self.folder / "camera.yaml").get("target"), name_of(target_in(self.values))
-            if made_with != now:
+        result = steps.measured_with_target(step, self.values)
+        if result is not None and not newer:
+            made_with, now = entries.made_with(self.folder / result), name_of(target_in(self.values))
+            if made_with != now and not (result == entries.LENS and entries.confirmed(self.values)):
                 return "stale", f"made with {made_with}, but the target is {now}: do this again"
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
 
@@ -218,7 +222,7 @@ class Project:
         name = next((name for name in needed(step, self.values) if not self._there(name)), None)
         if name is None:
             return None
-        inferred = name == "gripper.yaml" and self.values["gripper"] == steps.INFERRED
+        inferred = name == "gripper.yaml" and self.values["gripper"] == entries.INFERRED
         makers = [each for each in STEPS if name in written(each, self.values)]
         return name, makers[-1 if inferred else 0]
 
@@ -253,11 +257,12 @@ class Project:
                 if frame is None:
                     break
                 if isinstance(frame, Waiting):
-                    why = frame.reason
+                    why = frame.reason.partition("; next attempt")[0]  # there is none here
                 elif frame.image is None:
                     why = frame.fault or "not an image"
                 else:
                     height, width = frame.image.shape[:2]
+                    write_atomically(self.folder / VIEW, encoded(to_bytes(to_grey(frame.image)), ".jpg"))
                     self._accept("camera")
                     return [Line(f"{width} x {height} px, {8 * frame.image.itemsize} bits", "OK")]
         finally:
@@ -266,7 +271,7 @@ class Project:
 
     def _target(self) -> list[Line]:
         target, lines = parse_target(self.values["target"]), []
-        if self.values["have"] == steps.PRINT_IT:
+        if self.values["have"] == entries.PRINT_IT:
             bar_mm = print_target(target, self.values["paper"]).bar_mm
             self.values["bar_mm"] = f"{bar_mm:g}"
             lines = self._command(BY_NAME["target"].command(self.values) or [])
@@ -279,14 +284,15 @@ class Project:
     def _gripper(self) -> list[Line] | None:
         words = BY_NAME["gripper"].command(self.values)
         if words is None:
-            lines = [_jaws(self.values["jaw_range"]), Line("the step Hand and eye makes the gripper file", "OK")]
+            lines = [jaws(self.values["jaw_range"]), Line("the step Hand and eye makes the gripper file", "OK")]
             self._accept("gripper")
             return lines
-        if self.values["gripper"] == steps.FROM_IMAGES:
+        if self.values["gripper"] == entries.FROM_IMAGES:
             return self._gripper_from_images(words)
-        if self.values["gripper"] == steps.FROM_CAD:
+        if self.values["gripper"] == entries.FROM_CAD:
             # Its notes need a person's attention: edges that aren't taught, a small finger, an open surface.
-            return [Line(e.text, "WARN") if e.text.startswith("note: ") else e for e in self._command(words)]
+            lines, note = self._command(words), "note: "
+            return [Line(e.text.removeprefix(note), "WARN") if e.text.startswith(note) else e for e in lines]
         path = Path(words[1])
         if not words[1] or not path.is_file():
             raise InputError(f"{words[1] or 'the file'}: there is no such file; a gripper file such as the library's")
@@ -297,8 +303,8 @@ class Project:
     def _gripper_from_images(self, words: list[str]) -> list[Line]:
         """Existing images on the target stay the reference."""
         lines = self._command(words)
-        if self.values["reference_by"] == steps.ON_PLATE and not self._count("standing"):
-            self.keep({"reference_by": steps.BY_IMAGES})
+        if self.values["reference_by"] == entries.ON_PLATE and not self._count("standing"):
+            self.keep({"reference_by": entries.BY_IMAGES})
             lines.append(
                 Line("the reference comes with it; choose another one in the step Gripper on the target", "OK")
             )
@@ -306,14 +312,17 @@ class Project:
 
     def _reference_by(self) -> list[Line]:
         by = self.values["reference_by"]
-        if by != steps.ON_PLATE and self.values["gripper"] == steps.INFERRED:
+        if by != entries.ON_PLATE and self.values["gripper"] == entries.INFERRED:
             raise InputError("an inferred gripper needs its images on the target; these, or another gripper")
-        if by == steps.BY_IMAGES and self.values["gripper"] != steps.FROM_IMAGES:
+        if by == entries.BY_IMAGES and self.values["gripper"] != entries.FROM_IMAGES:
             raise InputError("this gripper wasn't made from images; another reference")
         return [Line(f"reference: {by}", "OK")]
 
     def _reference(self) -> list[Line] | None:
-        if self.values["reference_by"] != steps.FROM_FILE:
+        if self.values["reference_by"] != entries.FROM_FILE:
+            other = entries.other_size(self.values)
+            if other is not None and not entries.confirmed(self.values):
+                raise other
             return None
         path = Path(self.values["reference_file"])
         text, said = reference_text(path)
@@ -321,7 +330,7 @@ class Project:
         return [Line(said, "OK")]
 
     def _lens(self) -> list[Line] | None:
-        if self.values["intrinsics_by"] != steps.FROM_FILE:
+        if self.values["intrinsics_by"] != entries.FROM_FILE:
             return None
         path = Path(self.values["camera_file"])
         if not self.values["camera_file"] or not path.is_file():
@@ -339,20 +348,20 @@ class Project:
         try:
             found = msgspec.json.decode(done.stdout)["findings"]
         except (msgspec.DecodeError, KeyError):
-            raise NoResultError(_last(done.stderr) or "gripmon check printed nothing") from None
+            raise NoResultError(last_line(done.stderr) or "gripmon check printed nothing") from None
         write_atomically(self.folder / "check.json", done.stdout.encode())
-        return _findings(found)
+        return findings(found)
 
     def checked(self) -> list[Line]:
         """The lines of the last forecast; empty if there is none."""
         with contextlib.suppress(OSError, msgspec.DecodeError, KeyError):
-            return _findings(msgspec.json.decode((self.folder / "check.json").read_bytes())["findings"])
+            return findings(msgspec.json.decode((self.folder / "check.json").read_bytes())["findings"])
         return []
 
     def _command(self, words: list[str]) -> list[Line]:
         done = self._run(words)
         if done.returncode != 0:
-            raise NoResultError(_last(done.stderr) or f"{shlex.join(words)} ended with {done.returncode}")
+            raise NoResultError(last_line(done.stderr) or f"{shlex.join(words)} ended with {done.returncode}")
         lines = [Line(text) for text in done.stdout.splitlines()]
         return [*lines, *(Line(text, "WARN") for text in done.stderr.splitlines())]
 
@@ -362,27 +371,6 @@ class Project:
             [sys.executable, "-m", *words], cwd=self.folder, capture_output=True, text=True, check=False,
             stdin=subprocess.DEVNULL,
         )  # fmt: skip
-
-
-def _jaws(text: str) -> Line:
-    """The jaw range of an inferred gripper, in words."""
-    if not text:
-        return Line("no jaw range is given: the jaws are assumed never to move", "WARN")
-    try:
-        low_m, high_m = jaw_range_in(text)
-    except ValueError as error:
-        raise InputError(f"jaws move: {error}") from None
-    return Line(f"the jaws move from {1e3 * low_m:g} to {1e3 * high_m:g} mm", "OK")
-
-
-def _findings(found: list[dict[str, str]]) -> list[Line]:
-    return [Line(f"{each['about']}: {each['text']}", each["level"]) for each in found]  # type: ignore[arg-type]
-
-
-def _last(text: str) -> str:
-    """The last line of an error output, which is the message."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1].removeprefix("gripmon: ") if lines else ""
 
 
 def _texts(path: Path, kept: Mapping[str, object], key: str) -> dict[str, str]:

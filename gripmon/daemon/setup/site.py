@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,13 +11,15 @@ import msgspec
 from msgspec import Meta
 
 from gripmon import __version__
-from gripmon.daemon.setup import steps
+from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture, Captured
-from gripmon.daemon.setup.project import Line, Project, StepState
+from gripmon.daemon.setup.lines import Line
+from gripmon.daemon.setup.project import VIEW, Project, StepState
 from gripmon.daemon.setup.running import MonitorProcess, Seen
 from gripmon.daemon.setup.steps import STEPS, grippers
 from gripmon.daemon.teaching import outline_session, page_session, read_inputs
 from gripmon.model.errors import InputError, NoResultError, in_short
+from gripmon.model.targets import OtherSizeError
 from gripmon.teach.messages import BadRequest, Nothing, Request
 from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite, web_files
 from gripmon.teach.session import TeachSession
@@ -24,7 +27,8 @@ from gripmon.teach.session import TeachSession
 _Name = Annotated[str, Meta(max_length=40)]
 _Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
 _PICTURES = {
-    "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png", "target.pdf": "application/pdf"
+    VIEW: "image/jpeg", "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png",
+    "target.pdf": "application/pdf",
 }  # fmt: skip
 
 
@@ -45,16 +49,21 @@ class CaptureOrder(Request, frozen=True):
 
 
 class FieldState(msgspec.Struct, frozen=True, kw_only=True):
+    """``box``: text of a box to tick, which is the value then; None: another field."""
+
     name: str
     label: str
     value: str
     hint: str
     choices: tuple[str, ...]
     only: tuple[str, tuple[str, ...]] | None
+    box: str | None
 
 
 class StepCard(msgspec.Struct, frozen=True, kw_only=True):
-    """The constant and the changing part of a step; ``said``: output of the last run; ``error``: why it failed."""
+    """The constant and the changing part of a step; ``picture``: its newest picture's address; ``said``: output of the
+    last run; ``error``: why it failed.
+    """
 
     title: str
     about: str
@@ -151,21 +160,37 @@ class SetupSite:
         fields = tuple(
             FieldState(
                 name=field.name, label=field.label, value=values[field.name], hint=field.hint,
-                choices=self._choices(field), only=field.only,
+                choices=self._choices(field), only=field.only, box=box,
             )
             for field in step.fields
+            if (box := self._box(field)) != ""
         )  # fmt: skip
         return StepCard(
             title=step.title, about=step.about, kind=step.kind, button=step.button, fields=fields, state=state,
-            picture=step.picture if step.picture in state.files else None, said=self._said.get(step.name, ()),
-            error=self._errors.get(step.name, ""),
+            picture=self._picture(step), said=self._said.get(step.name, ()), error=self._errors.get(step.name, ""),
         )  # fmt: skip
+
+    def _picture(self, step: steps.Step) -> str | None:
+        """With the time at which it was written, so that the browser asks for each anew."""
+        if step.picture is None:
+            return None
+        with contextlib.suppress(FileNotFoundError):
+            return f"file/{step.picture}?{(self._project.folder / step.picture).stat().st_mtime_ns}"
+        return None
 
     @staticmethod
     def _choices(field: steps.Field) -> tuple[str, ...]:
         if field.name != "gripper":
             return field.choices
         return (*field.choices, *grippers())
+
+    def _box(self, field: steps.Field) -> str | None:
+        """Empty where nothing is to be confirmed, or no target is known yet."""
+        if field.asks is None:
+            return None
+        with contextlib.suppress(InputError):
+            return field.asks(self._project.values)
+        return ""
 
     def _do(self, order: Do) -> None:
         """Start a step; the state shows when and how it ends."""
@@ -183,9 +208,12 @@ class SetupSite:
 
     def _work(self, step: str) -> None:
         try:
-            self._said[step] = tuple(self._project.do(step))
+            done = self._project.do(step)
+            self._said[step] = tuple(Line(steps.in_fields(e.text), e.level) if e.level else e for e in done)
+        except OtherSizeError as error:
+            self._errors[step] = str(error.worded("tick the box below"))
         except (InputError, NoResultError) as error:
-            self._errors[step] = str(error)
+            self._errors[step] = steps.in_fields(str(error))
         except Exception as error:  # noqa: BLE001  the page must report any failure, and continue
             self._errors[step] = in_short(error)
         finally:
@@ -254,7 +282,7 @@ class SetupSite:
     def _session(self, step: str, command: str) -> TeachSession | OutlineSession:
         values, camera = self._project.values, Path("camera.yaml")
         images = [Path("standing" if step == "corners" else "teaching") / name for name in self._images(step)]
-        if step == "corners" and values["gripper"] == steps.INFERRED:
+        if step == "corners" and values["gripper"] == entries.INFERRED:
             return outline_session(images[0], camera, Path("standing"))
         corners = step == "corners"
         return page_session(
@@ -264,7 +292,7 @@ class SetupSite:
                 out=Path("standing" if corners else "."),
                 camera=camera,
                 gripper=Path("gripper.yaml"),
-                reference=None if corners or values["reference_by"] == steps.BY_CORNERS else Path("hand_eye.yaml"),
+                reference=None if corners or values["reference_by"] == entries.BY_CORNERS else Path("hand_eye.yaml"),
                 source=None if corners else values["source"],
                 robot=values["robot"],
                 camera_name=values["camera_name"],

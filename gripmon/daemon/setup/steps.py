@@ -4,24 +4,38 @@ same in the project's folder.
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import msgspec
-
 from gripmon.daemon.config import builtin_config
+from gripmon.daemon.setup.entries import (
+    BY_CORNERS,
+    BY_IMAGES,
+    FROM_CAD,
+    FROM_FILE,
+    FROM_IMAGES,
+    HAND_EYE,
+    HAVE_ONE,
+    INFERRED,
+    LENS,
+    ON_PLATE,
+    PRINT_IT,
+    Values,
+    confirmed,
+    on_plate,
+    other_target,
+    target_in,
+)
 from gripmon.model.errors import InputError
-from gripmon.model.targets import CircleGrid, Target, name_of, parse_target
+from gripmon.model.targets import CircleGrid, name_of
 
-Values = Mapping[str, str]
 Kind = Literal["form", "capture", "page", "run"]
 DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
 """Mostly light, so that dark fingers are visible before it, and small enough for A5."""
-INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
-ON_PLATE, BY_CORNERS, BY_IMAGES = "on the plate", "from corners alone", "with the gripper's images"
 _WITHOUT = "when teaching, less accurately"
 
 
@@ -35,6 +49,8 @@ class Field:
     hint: str = ""
     choices: tuple[str, ...] = ()
     only: tuple[str, tuple[str, ...]] | None = None
+    asks: Callable[[Values], str] | None = None
+    """The text of a box to tick, which is the field's value then; empty: nothing is to be confirmed now."""
 
 
 @dataclass(frozen=True)
@@ -55,35 +71,18 @@ class Step:
     picture: str | None = None
 
 
-def target_in(values: Values) -> Target:
-    """The target as printed, scaled by its bar.  Raises :class:`~gripmon.model.errors.InputError`."""
-    target = parse_target(values["target"])
-    text, nominal = values["bar_measured"].strip(), values.get("bar_mm", "")
-    if values["have"] != PRINT_IT or not text:
-        return target
-    try:
-        measured = float(text.replace(",", "."))  # decimal comma
-    except ValueError:
-        measured = 0.0
-    bar_mm = float(nominal or "0") or measured
-    if not 0.5 * bar_mm < measured < 2.0 * bar_mm:
-        raise InputError(f"the bar measures '{text}' mm; a number near the {bar_mm:g} mm that were printed")
-    lengths = {
-        name: round(value * measured / bar_mm, 9)
-        for name, value in msgspec.structs.asdict(target).items()
-        if name.endswith("_m")
-    }
-    return msgspec.structs.replace(target, **lengths)
-
-
 def grippers() -> dict[str, Path]:
     """Gripper files that come with gripmon, by name."""
     folder = builtin_config("demo.yaml").parent / "grippers"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-PRINT_IT, HAVE_ONE = "print it", "I have one"
 _PLATE_SOURCE = "empty: the camera of step 1; or a folder of existing images"
+_OPTIONS = {
+    "paper": "--paper", "model": "--model", "cad_unit": "--unit", "cad_view": "--view", "distance": "--distance",
+    "jaw_range": "--jaw-range", "jaw_opening": "--jaw-opening",
+}  # fmt: skip
+"""The commands' options for fields."""
 
 
 def _step_command(name: str) -> Callable[[Values], list[str]]:
@@ -131,7 +130,7 @@ def _from_cad(values: Values) -> list[str]:
     files = _words(values, "cad_files")
     if not files:
         raise InputError("no file is given; a mesh for each finger, or one for both, a URDF or a .cao")
-    words = [*_given(values, jaw_range="--jaw-range", cad_unit="--unit", cad_view="--view"), *_words(values, "options")]
+    words = [*_given(values, "jaw_range", "cad_unit", "cad_view"), *_words(values, "options")]
     # A picture needs a view.
     viewed = any(word.startswith(("--view", "--reference")) for word in words)
     words += ["--camera", "camera.yaml", "--picture", "gripper.png"] if viewed else []
@@ -140,14 +139,14 @@ def _from_cad(values: Values) -> list[str]:
 
 def _from_images(values: Values) -> list[str]:
     """Also writes a reference."""
-    words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, distance="--distance")]
+    words = [*_words(values, "free_images"), "--camera", "camera.yaml", *_given(values, "distance")]
     words += [*_words(values, "options"), "--picture", "gripper.png", "--reference-out", "hand_eye.yaml"]
     return ["gripmon", "gripper", "from-images", *words, "--out", "gripper.yaml", "--force"]
 
 
-def _given(values: Values, **options: str) -> list[str]:
+def _given(values: Values, *fields: str) -> list[str]:
     """Options from the fields with their values; empty fields are left out."""
-    return [word for field, option in options.items() if values[field] for word in (option, values[field])]
+    return [word for field in fields if values[field] for word in (_OPTIONS[field], values[field])]
 
 
 def _words(values: Values, field: str) -> list[str]:
@@ -157,12 +156,8 @@ def _words(values: Values, field: str) -> list[str]:
         raise InputError(f"{field}: {error}; words as on a command line") from None
 
 
-def _on_plate(values: Values) -> bool:
-    return values["reference_by"] == ON_PLATE
-
-
 def _corners(values: Values) -> list[str] | None:
-    if not _on_plate(values):
+    if not on_plate(values):
         return None
     words = ["gripmon", "teach", "--page", "standing/000.png", "--camera", "camera.yaml", "--out", "standing"]
     return words if values["gripper"] == INFERRED else [*words, "--gripper", "gripper.yaml"]
@@ -171,16 +166,16 @@ def _corners(values: Values) -> list[str] | None:
 def _reference(values: Values) -> list[str] | None:
     if values["reference_by"] == FROM_FILE:
         return ["cp", values["reference_file"], "hand_eye.yaml"]
-    if not _on_plate(values):
+    if not on_plate(values):
         return None
     words = ["gripmon", "calibrate", "plane", "standing", "--target", name_of(target_in(values))]
     words += ["--camera", "camera.yaml"]
     if values["gripper"] == INFERRED:
         words += ["--corners", "standing/rough.yaml", "--infer", "--gripper-out", "gripper.yaml"]
-        words += _given(values, jaw_range="--jaw-range")
+        words += _given(values, "jaw_range")
     else:
         words += ["--corners", "standing/corners.yaml", "--gripper", "gripper.yaml"]
-    words += _given(values, jaw_opening="--jaw-opening")
+    words += [*_given(values, "jaw_opening"), *(["--other-target"] if confirmed(values) else [])]
     return [*words, "--out", "hand_eye.yaml", "--picture", "hand_eye.png", "--force"]
 
 
@@ -199,7 +194,7 @@ STEPS = (
                   "ros2:1280x720:/camera/image_raw"),
             Field("robot", "robot", "robot1", "names in messages: gripmon/<robot>/<camera name>/…"),
             Field("camera_name", "camera name", "wrist"),
-        ),
+        ), "view.jpg",
     ),
     Step(
         "target", "Target", "A flat pattern of known size.  Print it at 100 %, glue it onto something flat, and hold a "
@@ -216,8 +211,9 @@ STEPS = (
     ),
     Step(
         "plate", "Images of the target", "Ten to thirty images that fill the view, the target tilted by 20 to 45° to "
-        "all sides.  Images are taken automatically when the camera stands still and the target is sharp.  With a lens "
-        "file none are needed: choose it in the next step.", "capture", "Start", ("setup.yaml",), ("plate",),
+        "all sides.  Start shows what the camera sees; Take automatically takes an image whenever the camera stands "
+        "still and the target is sharp.  With a lens file none are needed: choose it in the next step.", "capture",
+        "Start", ("setup.yaml",), ("plate",),
         _plate,
         (Field("plate_source", "images from", "", _PLATE_SOURCE),),
     ),
@@ -262,7 +258,7 @@ STEPS = (
         "standing", "Gripper on the target", "For the hand/eye calibration the fingertips stand on the target, as flat "
         "as they can.  Three to ten images, put down again for each, with the jaws unchanged.  Or choose another "
         "reference.", "capture", "Start", ("camera.yaml",),
-        ("standing",), lambda v: _step_command("standing")(v) if _on_plate(v) else None,
+        ("standing",), lambda v: _step_command("standing")(v) if on_plate(v) else None,
         (
             Field("reference_by", "reference", ON_PLATE, f"{BY_CORNERS}: {_WITHOUT}",
                   (ON_PLATE, FROM_FILE, BY_CORNERS, BY_IMAGES)),
@@ -276,10 +272,17 @@ STEPS = (
         "fine.  Save, then Done.", "page", "Drag them", ("camera.yaml", "standing"), ("standing/rough.yaml",), _corners,
     ),
     Step(
-        "reference", "Hand and eye", "The gripper's pose in the camera frame, with its uncertainty.", "form",
-        "Calibrate", ("camera.yaml", "standing", "standing/rough.yaml"), ("hand_eye.yaml", "gripper.yaml"), _reference,
-        (Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the "
-               "gripper's nominal opening, or of an inferred gripper the distance of its fingertips"),), "hand_eye.png",
+        "reference", "Hand and eye", "The gripper's pose in the camera frame, with its uncertainty: from the images on "
+        "the target, or the file chosen in the step Gripper on the target.", "form", "Calibrate",
+        ("camera.yaml", "standing", "standing/rough.yaml"), ("hand_eye.yaml", "gripper.yaml"), _reference,
+        (
+            Field("jaw_opening", "jaw opening (m)", "", "in these images, as the robot reports it; empty: the "
+                  "gripper's nominal opening, or of an inferred gripper the distance of its fingertips", (),
+                  ("reference_by", (ON_PLATE,))),
+            Field("other_target", "another target", "", "It is one pattern in two sizes.  If there is only one "
+                  "target, correct its size in the step Target instead, or calibrate the lens again: no image shows "
+                  "that a size is wrong, and all lengths would be wrong by as much.", asks=other_target),
+        ), "hand_eye.png",
     ),
     Step(
         "teaching", "Gripper at work", "One to ten images as at work, each before another background, the fingers free "
@@ -288,9 +291,9 @@ STEPS = (
         _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
     ),
     Step(
-        "teach", "Teach", "Drag the corners, see the edges snap and the expected accuracy.  Save, then Done.  Without "
-        "this step a gripper from CAD is hardly ever valid: its real edges are unknown.", "page", "Teach",
-        ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
+        "teach", "Teach", "See the edges snap, and the expected accuracy; drag the corners that the page asks for.  "
+        "Save, then Done.  Without this step a gripper from CAD is hardly ever valid: its real edges are unknown.",
+        "page", "Teach", ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
     ),
     Step(
         "check", "Forecast", "The monitor's expected performance in this view.", "form", "Check", ("config.yaml",),
@@ -305,6 +308,14 @@ STEPS = (
 
 
 BY_NAME = {step.name: step for step in STEPS}
+
+
+def in_fields(text: str) -> str:
+    """A command's message with its options called as the page's fields are."""
+    labels = {field.name: field.label for step in STEPS for field in step.fields}
+    for name, option in _OPTIONS.items():
+        text = re.sub(rf"(?<!\S){option}(?![\w-])", f"“{labels[name]}”", text)
+    return text
 
 
 def defaults() -> dict[str, str]:
@@ -330,6 +341,13 @@ def needed(step: Step, values: Values) -> tuple[str, ...]:
     if step.name == "reference" and values["reference_by"] == FROM_FILE:
         names = ("camera.yaml", "gripper.yaml")
     return names
+
+
+def measured_with_target(step: Step, values: Values) -> str | None:
+    """The step's result that was measured with the target of the page, if it is one."""
+    if step.name == "intrinsics" and values["intrinsics_by"] != FROM_FILE:
+        return LENS
+    return HAND_EYE if step.name == "reference" and on_plate(values) else None
 
 
 def written(step: Step, values: Values) -> tuple[str, ...]:

@@ -135,11 +135,11 @@ def _wants(sightings: Sequence[Sighting], tilts: Array, size_px: tuple[int, int]
     has = [bool(np.any(tilted & (side > 0.5 * np.linalg.norm(tilts, axis=1)))) for side in towards]
     if sum(has) < FEWEST_SIDES:
         missing = " or ".join(name for name, there in zip(SIDES, has, strict=True) if not there)
-        out.append(f"the plate tilted by {math.degrees(TILTED_RAD):.0f}° or more, farther away on the side {missing}")
+        out.append(f"the target tilted by {math.degrees(TILTED_RAD):.0f}° or more, farther away on the side {missing}")
     half_px = 0.5 * np.array(size_px)
     reach = max((float(np.linalg.norm(s.uv_px - half_px, axis=1).max()) for s in sightings), default=0.0)
     if reach < COVERED * float(np.linalg.norm(half_px)):
-        out.append("the plate nearer to the image's corners")
+        out.append("the target nearer to the image's corners")
     return out
 
 

@@ -90,8 +90,12 @@ def checked_size(body: Body, what: str, extent: Array, argument: str) -> Body:
 
 def _as_units(extent: Array) -> str:
     """The extents (3,) of a file's numbers in each possible unit."""
-    size = " x ".join(f"{v:.3g}" for v in extent)
-    sizes = (f"{unit}: {1e3 * float(extent.max()) * scale:.3g} mm long" for unit, scale in UNITS_M.items())
+
+    def rounded(value: float) -> str:
+        return f"{float(f'{value:.3g}'):.7g}"  # to three digits, without a power of ten
+
+    size = " x ".join(map(rounded, extent))
+    sizes = (f"{unit}: {rounded(1e3 * float(extent.max()) * scale)} mm long" for unit, scale in UNITS_M.items())
     return f"it spans {size}, that is in {', in '.join(sizes)}; one of {', '.join(UNITS_M)}"
 
 

@@ -7,8 +7,10 @@ const SVG = "http://www.w3.org/2000/svg";
 const QUIET_MS = 1000, LIVELY_MS = 250;
 const MARKS = { done: "✓", stale: "!", skipped: "–" };
 const NAMED = { ready: "", done: "", stale: "do this again", waits: "", skipped: "not needed" };
+const READ = { ...NAMED, ready: "not done yet", done: "done" };
+const drawn = new Map(), lost = new Map();
 
-let state, chosen = null, drawn = "", refused = "", typed = {}, frame = { live: 0, monitor: 0 }, ended = false, timer = null;
+let state, chosen = null, refused = "", typed = {}, frame = { live: 0, monitor: 0 }, ended = false, timer = null;
 
 function element(tag, text = "", attributes = {}) {
   const node = document.createElement(tag);
@@ -24,24 +26,49 @@ function shape(tag, attributes, parent) {
   return node;
 }
 
+// Nodes that are drawn again lose the focus, and a click that has begun: only what differs is, and the focus returns, once
+// it can: a button that is at work can't have it.
+function redraw(parent, shown, make) {
+  const key = JSON.stringify(shown), named = (node) => node.dataset.step ?? (node.id || node.name);
+  if (drawn.get(parent) === key) return;
+  drawn.set(parent, key);
+  const active = document.activeElement, held = parent.contains(active) ? named(active) : active === document.body && lost.get(parent);
+  parent.replaceChildren(...make());
+  lost.delete(parent);
+  if (!held) return;
+  const nodes = [...parent.querySelectorAll("button, input, select")];
+  (nodes.find((node) => named(node) === held) ?? nodes.find((node) => !node.disabled))?.focus();
+  if (!parent.contains(document.activeElement)) lost.set(parent, held);
+}
+
 const step = () => state.steps.find((each) => each.state.name === chosen);
 const capture = () => (state.capturing === chosen ? state.capture : null);
+const taking = () => Boolean(capture()?.running && !capture().ended);
+// What is entered and not yet used: the server keeps it without blanks.
+const entered = () => step().fields.some(({ name, value }) => name in typed && typed[name].trim() !== value);
 // The values of this step, and those typed before and not yet sent: they count, too.
 const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value])) });
+// Of all steps: what is asked may depend on another one's.
+const everything = () => ({ ...Object.fromEntries(state.steps.flatMap((each) => each.fields).map((field) => [field.name, field.value])), ...said() });
 
 function choose(name) {
   chosen = name;
   refused = "";
   history.replaceState(null, "", `#${name}`);
   show();
-  $("main").scrollIntoView({ block: "nearest" });
+  $("#title").scrollIntoView({ block: "nearest" });
+}
+
+// To another step by its button in this one, which is gone then: reading goes on at its title.
+function goOn(name) {
+  choose(name);
+  $("#title").focus();
 }
 
 function showSteps() {
-  const active = document.activeElement?.dataset?.step;
-  $("#steps").replaceChildren(...state.steps.map((each, number) => {
-    const { name, progress, note } = each.state;
-    const button = element("button", "", { "data-step": name, "data-progress": progress, title: each.title });
+  redraw($("#steps"), [chosen, state.steps.map(({ state: { name, progress, note } }) => [name, progress, note])], () => state.steps.map((each, number) => {
+    const { name, progress, note } = each.state, spoken = [`${number + 1}. ${each.title}`, READ[progress], note].filter(Boolean).join(", ");
+    const button = element("button", "", { "data-step": name, "data-progress": progress, title: each.title, "aria-label": spoken });
     if (name === chosen) button.setAttribute("aria-current", "step");
     button.append(element("span", MARKS[progress] ?? `${number + 1}`, { class: "mark" }), element("span", each.title, { class: "name" }));
     const more = note || NAMED[progress];
@@ -51,22 +78,36 @@ function showSteps() {
     item.append(button);
     return item;
   }));
-  if (active) $(`[data-step=${active}]`)?.focus();
+}
+
+function changed(name, value) {
+  typed[name] = value;
+  showFields();
+  showButtons();
+  showStatus();
+}
+
+function tickBox({ name, label: title, box, hint }, ticked) {
+  const label = element("label", "", { class: "check" }), text = element("span"), input = element("input", "", { type: "checkbox", name });
+  input.checked = ticked;
+  input.addEventListener("input", () => changed(name, input.checked ? box : ""));
+  text.append(element("b", box), element("small", hint));
+  label.append(input, text);
+  label.title = title;
+  return label;
 }
 
 // The server's answers must not overwrite what a person is typing.
 function showFields() {
-  const { fields } = step(), now = said();
+  const { fields } = step(), now = everything();
   const asked = fields.filter(({ only }) => !only || only[1].includes(now[only[0]]));
-  const form = JSON.stringify([chosen, asked.map((field) => [field.name, field.choices])]);
-  if (form === drawn) return;
-  drawn = form;
-  $("#fields").replaceChildren(...asked.map((field) => {
+  redraw($("#fields"), [chosen, asked.map(({ name, choices, box }) => [name, choices, box])], () => asked.map((field) => {
+    if (field.box) return tickBox(field, now[field.name] === field.box);
     const label = element("label", field.label);
     const input = element(field.choices.length ? "select" : "input", "", { name: field.name, spellcheck: "false" });
     for (const choice of field.choices) input.append(element("option", choice, { value: choice }));
     input.value = now[field.name];
-    input.addEventListener("input", () => { typed[field.name] = input.value; showFields(); showButtons(); });
+    input.addEventListener("input", () => changed(field.name, input.value));
     label.append(input);
     if (field.hint) label.append(element("span", field.hint));
     return label;
@@ -83,7 +124,8 @@ function button(text, act, kind, id, can = true) {
 function buttonsOf({ kind, button: name, state: { progress } }) {
   const now = capture(), order_ = (action) => () => post("capture", { step: chosen, action });
   const skips = chosen === "standing" && said().reference_by !== "on the plate";
-  if (kind === "form" || skips) return [button(skips ? "Use it" : name, () => post("do", { step: chosen, values: said() }), "main", "step")];
+  const copies = everything()[{ intrinsics: "intrinsics_by", reference: "reference_by" }[chosen]] === "a file";
+  if (kind === "form" || skips) return [button(skips || copies ? "Use it" : name, () => post("do", { step: chosen, values: said() }), "main", "step")];
   if (kind === "page") {
     return [button(name, async () => location.assign((await post("open", { step: chosen, values: said() })).url), "main", "step")];
   }
@@ -92,7 +134,7 @@ function buttonsOf({ kind, button: name, state: { progress } }) {
   }
   if (!now?.running || now.ended) return [button(now?.ended ? "Start again" : name, () => post("capture", { step: chosen, action: "start", values: said() }), "main", "step")];
   return [
-    now.itself ? button("Stop taking", order_("by_hand"), "ask", "by-hand") : button("Take by themselves", order_("by_itself"), "main", "by-itself"),
+    now.itself ? button("Stop taking", order_("by_hand"), "ask", "by-hand") : button("Take automatically", order_("by_itself"), "main", "by-itself"),
     button("Take this one", order_("take"), "", "take", now.shown > 0),
     ...(now.live ? [] : [button("Next image", order_("next"), "", "next")]),
     button("Stop the camera", order_("stop"), "", "stop"),
@@ -100,23 +142,27 @@ function buttonsOf({ kind, button: name, state: { progress } }) {
 }
 
 function showButtons() {
-  const later = state.steps.slice(state.steps.findIndex((each) => each.state.name === chosen) + 1);
-  const next = later.find((each) => each.state.progress !== "skipped");
+  const { state: { progress, first } } = step(), later = state.steps.slice(state.steps.findIndex((each) => each.state.name === chosen) + 1);
+  const next = ["done", "skipped"].includes(progress) && later.find((each) => each.state.progress !== "skipped");
+  const before = state.steps.find((each) => each.state.name === first);
   const nodes = buttonsOf(step());
-  if (next && ["done", "skipped"].includes(step().state.progress)) {
-    const on = element("button", `Next: ${next.title} →`, { type: "button", id: "do-on" });
-    on.addEventListener("click", () => choose(next.state.name));
-    nodes.push(on);
-  }
-  const same = (a, b) => a.id === b.id && a.textContent === b.textContent && a.className === b.className && a.disabled === b.disabled;
-  const old = [...$("#buttons").children];
-  if ($("#buttons").dataset.step === chosen && old.length === nodes.length && old.every((node, k) => same(node, nodes[k]))) return;
-  $("#buttons").dataset.step = chosen;
-  $("#buttons").replaceChildren(...nodes);
+  // The one to press next stands out: the step's own while it isn't finished.
+  const onwards = next && !taking() && !entered() && !capture()?.coverage?.wants.length;
+  if (before || onwards) nodes.forEach((node) => node.classList.remove("main"));
+  if (next) nodes.push(towards(`Next: ${next.title} →`, "on", next, onwards));
+  if (before) nodes.unshift(towards(`First: ${before.title} →`, "first", before, true));
+  const parts = nodes.map(({ id, textContent, className, disabled }) => [id, textContent, className, disabled]);
+  redraw($("#buttons"), [chosen, first, next?.title, parts], () => nodes);
+}
+
+function towards(text, id, { state: { name } }, main) {
+  const node = element("button", text, { type: "button", id: `do-${id}`, class: main ? "main" : "" });
+  node.addEventListener("click", () => goOn(name));
+  return node;
 }
 
 function status() {
-  const { state: now, error } = step(), taking = capture(), { monitor } = state;
+  const { state: now, error } = step(), camera = capture(), { monitor } = state, own = $("#do-step")?.textContent;
   const wrong = refused || error;
   if (state.busy) return state.busy === chosen ? ["working …", ""] : [`working on another step (${state.busy}) …`, ""];
   if (wrong) return [wrong, "bad"];
@@ -127,10 +173,17 @@ function status() {
     const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
     return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
   }
-  if (taking && (taking.running || taking.ended)) return [taking.ended ? taking.note : `${taking.note}; ${taking.images.length} taken`, /^(taken|ready|no more)/.test(taking.note) ? "good" : "warn"];
+  if (camera && (camera.running || camera.ended)) return [camera.ended ? camera.note : `${camera.note}; ${camera.images.length} taken`, /^(taken|ready|no more)/.test(camera.note) ? "good" : "warn"];
+  if (now.progress === "done" && own && entered()) return [`changed: press “${own}”`, ""];
   const words = { done: "done", stale: now.note, waits: now.note, skipped: `not needed: ${now.note}`, ready: "" };
   const text = words[now.progress] || "";
-  return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || "not done yet", { done: "good", stale: "warn" }[now.progress] ?? ""];
+  return [text && now.note && now.progress === "done" ? `done: ${now.note}` : text || `not done yet: press “${own}”`, { done: "good", stale: "warn" }[now.progress] ?? ""];
+}
+
+function showStatus() {
+  const [text, kind] = status();
+  if ($("#status").textContent !== text) $("#status").textContent = text;
+  $("#status").dataset.kind = kind;
 }
 
 function showCapture() {
@@ -152,8 +205,8 @@ function showCapture() {
     const wants = views.wants.map((text) => element("li", `still: ${text}`));
     $("#wants").replaceChildren(...(wants.length ? wants : [element("li", "enough to calibrate; more do no harm", { class: "enough" })]));
   }
-  $("#images").replaceChildren(...now.images.map((name) => {
-    const item = element("li", name), drop = element("button", "✕", { type: "button", title: `delete ${name}`, "aria-label": `delete ${name}` });
+  redraw($("#images"), [chosen, now.images], () => now.images.map((name) => {
+    const item = element("li", name), drop = element("button", "✕", { type: "button", name, title: `delete ${name}`, "aria-label": `delete ${name}` });
     drop.addEventListener("click", () => order(() => post("capture", { step: chosen, action: "drop", name })));
     item.append(drop);
     return item;
@@ -183,14 +236,14 @@ function showResult() {
     item.append(element("b", level), element("span", text));
     return item;
   }));
-  const output = lines.filter(({ level }) => !level).map(({ text }) => text).join("\n");
-  if ($("#output").textContent !== output) $("#output").textContent = output;
+  // Rows of a table stay in one line each, sentences are broken.
+  const output = lines.filter(({ level }) => !level).map(({ text }) => text);
+  redraw($("#output"), output, () => output.map((text) => element("span", `${text}\n`, { class: /\S {2,}\S/.test(text) ? "row" : "" })));
   $("#file").hidden = chosen !== "target" || !card.state.files.includes("target.pdf");
   const image = $("#result img");
   $("#result").hidden = !card.picture || Boolean(state.busy);
   if (card.picture && !state.busy) {
-    const source = `file/${card.picture}?${card.said.length}`;
-    if (image.getAttribute("src") !== source) image.setAttribute("src", source);
+    if (image.getAttribute("src") !== card.picture) image.setAttribute("src", card.picture);
   }
 }
 
@@ -201,12 +254,11 @@ function show() {
   $("#folder").title = state.folder;
   $("#title").textContent = card.title;
   $("#about").textContent = card.about;
-  $("#command code").textContent = card.state.command;
+  // Broken between words only: within one it would break after "--".
+  redraw($("#command code"), card.state.command, () => card.state.command.split(" ").filter(Boolean).flatMap((word) => [element("span", word), " "]).slice(0, -1));
   showFields();
   showButtons();
-  const [text, kind] = status();
-  if ($("#status").textContent !== text) $("#status").textContent = text;
-  $("#status").dataset.kind = kind;
+  showStatus();
   showCapture();
   showMonitor();
   showResult();

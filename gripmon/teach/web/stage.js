@@ -157,12 +157,17 @@ export class Stage {
       [g.dataset.u, g.dataset.v] = here.map((v) => v.toFixed(4));
       const [x, y] = this.toStage(here);
       g.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
-      // Near the right border the name is on the left.
-      const text = g.lastElementChild, before = x + 24 + 7 * name.length > this.root.clientWidth;
+      // Near the right border its name stands on the left, and below where another corner's name would lie over it.
+      const text = g.lastElementChild, width = 24 + 7 * name.length;
+      const beside = this.corners.some((other) => other.name !== name && other.at && this.#isBeside([x, y], this.toStage(other.at), width));
+      const before = x + width > this.root.clientWidth || (beside && x > width);
       text.setAttribute("x", before ? -13 : 13);
+      text.setAttribute("y", beside ? 20 : -9);
       text.setAttribute("text-anchor", before ? "end" : "start");
     }
   }
+
+  #isBeside([x, y], [a, b], width) { return a > x && a < x + width && Math.abs(b - y) < 18; }
 
   #here(event) {
     const box = this.root.getBoundingClientRect();
