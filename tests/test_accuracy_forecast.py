@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from support.grippers import gripper_from_dict
 from support.meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
 from support.sampled import INDEPENDENT, OPENING_M, NoisyMeter
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
@@ -17,7 +18,6 @@ from support.watched import reference_of, watched
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy, weakest_direction
 from gripmon.track.edges import MeasurementSettings

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 from support.box_models import cube_model
+from support.grippers import gripper_from_dict
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import frames_of, new_monitor, reference_of, replaced
 
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,

@@ -130,9 +130,9 @@ def test_visps_model_is_the_gripper():
     from benchmarks import visp
     from benchmarks.machine import ROOT
 
-    from gripmon.model.gripper import load_gripper
+    from gripmon.daemon.config import read_gripper
 
-    gripper = load_gripper(ROOT / "configs" / "grippers" / "two_box_fingers.yaml")
+    gripper = read_gripper(ROOT / "configs" / "grippers" / "two_box_fingers.yaml")
     lines = visp.model_text(gripper).splitlines()
     count = int(lines[1])
     points = np.array([line.split() for line in lines[2 : 2 + count]], float)

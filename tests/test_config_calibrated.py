@@ -13,11 +13,10 @@ import pytest
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.daemon.config import ConfigError, is_second, load_config, load_second
+from gripmon.daemon.config import ConfigError, is_second, load_config, load_second, read_gripper
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.judge.statefile import calibration_of
 from gripmon.model.geometry import to_record
-from gripmon.model.gripper import load_gripper
 from gripmon.model.provenance import provenance_of
 from gripmon.track.edges.taught import gripper_digest
 
@@ -27,7 +26,7 @@ COVARIANCE = tuple(np.diag([1e-10] * 3 + [1e-8] * 3).ravel().tolist())
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    gripper = load_gripper(BOX_FINGERS)
+    gripper = read_gripper(BOX_FINGERS)
     camera = CameraCalibration(
         camera=PAPER_LENS, parameters=("fx_px",), covariance=(0.01,), provenance=provenance_of("a")
     )

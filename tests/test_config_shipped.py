@@ -8,8 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripmon.daemon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
-from gripmon.model.gripper import load_gripper
+from gripmon.daemon.config import (
+    ConfigError,
+    builtin_config,
+    is_second,
+    load_config,
+    load_scenario,
+    load_second,
+    read_gripper,
+)
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy
 
@@ -29,7 +36,7 @@ def test_shipped_configurations_are_sound_and_every_key_says_its_unit(name: str)
 @pytest.mark.parametrize("name", ["two_box_fingers", "adaptive_arc_fingers"])
 def test_shipped_grippers_close_to_the_tcp(name: str):
     """The innermost corners of both fingers meet at opening 0, and lie symmetric about the TCP at every opening."""
-    gripper = load_gripper(GRIPPERS / f"{name}.yaml")
+    gripper = read_gripper(GRIPPERS / f"{name}.yaml")
     inner = [gripper.point_ids.index(f"{side}_in_{which}") for which in ("near", "far") for side in ("L", "R")]
     for opening_m in np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, 7):
         corners = gripper.points_grip_m(float(opening_m))[inner]
@@ -39,7 +46,7 @@ def test_shipped_grippers_close_to_the_tcp(name: str):
 
 def test_adaptive_fingertips_stay_on_their_arc():
     """Between two rows of the table too: within the sagitta of a 2.5 mm chord on a 57.3 mm radius."""
-    gripper = load_gripper(GRIPPERS / "adaptive_arc_fingers.yaml")
+    gripper = read_gripper(GRIPPERS / "adaptive_arc_fingers.yaml")
     tip = gripper.point_ids.index("R_in_near")
     places = np.array([gripper.points_grip_m(float(o))[tip] for o in np.linspace(0.0, 0.08, 161)])
     radius_m, top_x_m = 0.0573, 0.006

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 from support.box_models import cube_model
+from support.grippers import gripper_from_dict
 from support.meters import (
     FISHEYE_LENS,
     NARROW,
@@ -23,7 +24,7 @@ from support.meters import (
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import CornerFault
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import BentFinger, JawScript

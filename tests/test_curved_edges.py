@@ -13,15 +13,17 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.grippers import gripper_from_dict
 from support.meters import measure, meter
 from support.recorded import Recorded
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
 from support.watched import Watched, pose_of, reference_of, watch
 
 from gripmon.__main__ import main
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between, to_record
-from gripmon.model.gripper import Gripper, GripperError, gripper_from_dict, load_gripper
+from gripmon.model.gripper import Gripper, GripperError
 from gripmon.model.gripper.model import contents_of
 from gripmon.model.records import Cause, Frame, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
@@ -188,7 +190,7 @@ def test_a_curve_that_is_none_is_refused(via: list[list[float]], said: str):
 
 def test_digests_of_grippers_without_curves_are_as_they_were():
     """What a learnt look or a taught model remembers of a gripper file knows nothing of curves."""
-    assert all("via" not in edge for edge in contents_of(load_gripper(BOX_FINGERS).model)["edges"].values())
+    assert all("via" not in edge for edge in contents_of(read_gripper(BOX_FINGERS).model)["edges"].values())
     bent, straight = rounded(0.004)[0].model, rounded(0.004)[0].model
     edges = {name: msgspec.structs.replace(edge, via=()) for name, edge in straight.edges.items()}
     assert contents_of(bent) != contents_of(msgspec.structs.replace(straight, edges=edges))

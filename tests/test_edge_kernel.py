@@ -15,6 +15,7 @@ from support.box_models import cube_model
 from support.by_numpy import fit as by_numpy
 from support.by_numpy import prediction as by_numpy_prediction
 from support.by_numpy import profiles as by_numpy_profiles
+from support.grippers import gripper_from_dict
 from support.meters import measure, meter, moved, picture
 from support.simulated import plain_scenario
 from test_golden import measured
@@ -34,7 +35,6 @@ from test_robust_fit import (
     with_clutter,
 )
 
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.track.edges import (
     FingertipMeter,
     MeasurementSettings,

@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 from support import sample_messages
 from support.loopback import frame_record, reference_record, state_record
+from support.playback_runs import table_of
 
 from gripmon.model.records import (
     AlertEvent,
@@ -60,7 +61,7 @@ class Run:
 
     @property
     def frames(self) -> FrameTable:
-        return FrameTable.from_records(self.records)
+        return table_of(self.records)
 
     @property
     def meta(self) -> Meta:

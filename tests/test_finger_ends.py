@@ -8,11 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 from support.box_models import cube_model, two_fingers_model
+from support.grippers import gripper_from_dict
 from support.meters import NARROW, box_gripper, measure, meter, picture
 from support.simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement
@@ -177,7 +179,7 @@ def test_edges_along_the_fingers_are_those_of_the_way_that_most_of_them_go():
     np.testing.assert_array_equal(along_fingers(boxes)[1], np.abs(way[:, 2]) > 0.01)
 
 
-@pytest.mark.parametrize("cube", [load_gripper(CUBE), gripper_from_dict(cube_model())], ids=["visp_cube", "cube"])
+@pytest.mark.parametrize("cube", [read_gripper(CUBE), gripper_from_dict(cube_model())], ids=["visp_cube", "cube"])
 def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Gripper):
     direction, along = along_fingers(cube)
     assert along.all() and not direction.any()

@@ -75,7 +75,7 @@ def test_the_way_of_a_frame_gets_no_longer():
     try:
         monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
         run(
-            monitor, counted, counted, Recorder(), settings.daemon,
+            monitor, source=counted, publisher=counted, recorder=Recorder(), settings=settings.daemon,
             robot=settings.robot, camera=settings.camera_name,
         )  # fmt: skip
     finally:

@@ -9,10 +9,11 @@ import pytest
 import yaml
 from scipy.spatial import ConvexHull
 from support.box_models import Model, cube_model, two_fingers_model
+from support.grippers import gripper_from_dict
 
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
-from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.daemon.config import builtin_config, read_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.simulate.solids import finger_solids
 
 SHIPPED = sorted((Path(__file__).parent.parent / "configs" / "grippers").glob("*.yaml"))
@@ -248,7 +249,7 @@ def test_edges_at_a_corner_are_those_that_end_there():
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
 def test_shipped_files_keep_their_order_and_their_bevels(path: Path):
     written = yaml.safe_load(path.read_text())
-    gripper = load_gripper(path)
+    gripper = read_gripper(path)
     assert gripper.point_ids == tuple(written["points"])
     assert gripper.edge_ids == tuple(written["edges"])
     assert gripper.corner_ids == tuple(n for n, p in written["points"].items() if p.get("corner"))
@@ -264,5 +265,5 @@ def test_an_inferred_gripper_keeps_where_it_comes_from(tmp_path: Path):
     origin = {"gripmon": "1", "time": "AT", "command": "gripmon calibrate plane", "versions": {}, "inputs": []}
     path = tmp_path / "inferred.yaml"
     path.write_text(yaml.safe_dump(model | {"provenance": origin}).replace("AT", at))
-    provenance = load_gripper(path).model.provenance
+    provenance = read_gripper(path).model.provenance
     assert provenance is not None and provenance.time == at

@@ -11,10 +11,11 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 import gripmon
 from gripmon.cli import main
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.teach.cad import gripper_from_cad
 from tools.benchmarks.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
 
@@ -69,7 +70,7 @@ def test_both_fingers_in_one_file_are_told_apart(tmp_path: Path):
 
 @pytest.mark.skipif(not CUBE.is_file(), reason="../shared/data/visp_cube is not there")
 def test_visps_cube_is_the_one_that_was_written_by_hand():
-    by_hand = load_gripper(ARC_FINGERS.with_name("visp_cube.yaml"))
+    by_hand = read_gripper(ARC_FINGERS.with_name("visp_cube.yaml"))
     made = gripper_from_cad([CUBE], frame="cad").gripper
     np.testing.assert_allclose(ends_of(made), ends_of(by_hand), atol=1e-9)
     assert len(made.corner_ids) == 8 and len(made.faces) == 6
@@ -281,7 +282,7 @@ def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, caps
     assert from_cad(*paths, *words, "--out", out) == 0
     printed = capsys.readouterr().out
     assert "jaw: 0.0 to 60.0 mm, as drawn 34.0 mm" in printed and f"written: {out} (the gripper g)" in printed
-    gripper = load_gripper(out)
+    gripper = read_gripper(out)
     assert any("round" in line for line in out.read_text().splitlines()) and gripper.jaw_max_m == 0.06
     assert picture.stat().st_size > 10_000
     assert from_cad(*paths, *words, "--out", out) == 2
@@ -299,7 +300,7 @@ def test_the_command_says_what_the_bevels_of_sharp_edges_cost_and_who_takes_it_o
     ):
         assert from_cad(*paths, "--unit", "mm", *words, "--out", out, "--force") == 0
         assert said in capsys.readouterr().out and said.removeprefix("note: ") in out.read_text()
-        assert (load_gripper(out).edge_bevel_m == width_m).all()
+        assert (read_gripper(out).edge_bevel_m == width_m).all()
     for wrong in ("0.2", "-0.0001", "nan"):
         assert from_cad(*paths, "--unit", "mm", f"--bevel={wrong}", "--out", out, "--force") == 2
         assert capsys.readouterr().err.endswith(" m: is no width of a bevel; 0 to 0.02 m\n")
@@ -327,7 +328,7 @@ def test_a_gripper_of_two_meshes_is_not_named_after_one_of_its_fingers(tmp_path:
     paths = write_meshes(box_meshes(sharp_gripper()), tmp_path)
     for words, name in (((), "hand"), (("--name", "mine"), "mine")):
         assert from_cad(*paths, "--unit", "mm", *words, "--out", tmp_path / "hand.yaml", "--force") == 0
-        assert load_gripper(tmp_path / "hand.yaml").name == name
+        assert read_gripper(tmp_path / "hand.yaml").name == name
 
 
 def test_without_trimesh_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

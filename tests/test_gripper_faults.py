@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 from support.box_models import Model, cube_model, two_fingers_model
+from support.grippers import gripper_from_dict
 
-from gripmon.model.gripper import GripperError, gripper_from_dict, load_gripper
+from gripmon.daemon.config import ConfigError, read_gripper
+from gripmon.model.gripper import GripperError
 
 
 def _without_corners(model: Model, *kept: str) -> None:
@@ -234,19 +236,19 @@ def test_files_that_cannot_be_read_as_a_gripper_say_so(tmp_path: Path):
         ("name: [", "not YAML"),
         (yaml.safe_dump(cube_model() | {"colour": "red"}), "colour"),
         (yaml.safe_dump({k: v for k, v in cube_model().items() if k != "edges"}), "edges"),
-        ("3", "Expected `object`"),
+        ("3", "holds a single value 3"),
     ):
         file.write_text(text)
-        with pytest.raises(GripperError, match=said) as caught:
-            load_gripper(file)
+        with pytest.raises(ConfigError, match=said) as caught:
+            read_gripper(file)
         assert "\n" not in str(caught.value)
     file.write_bytes(b"name: \xff\xfe")
-    with pytest.raises(GripperError, match="not YAML"):
-        load_gripper(file)
-    with pytest.raises(FileNotFoundError):
-        load_gripper(tmp_path / "missing.yaml")
+    with pytest.raises(ConfigError, match="is not text"):
+        read_gripper(file)
+    with pytest.raises(ConfigError, match="there is no such file"):
+        read_gripper(tmp_path / "missing.yaml")
     file.write_text(yaml.safe_dump(cube_model()))
-    assert load_gripper(file).name == "cube"
+    assert read_gripper(file).name == "cube"
 
 
 def test_a_face_with_a_point_far_off_is_refused():

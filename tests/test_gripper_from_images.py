@@ -15,9 +15,10 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 import gripmon
 from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.cli import main
+from gripmon.daemon.config import read_gripper
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, ReferenceRecord
 from gripmon.monitor import Monitor
@@ -74,7 +75,7 @@ def test_fingers_are_told_apart_and_placed_in_space_by_their_perspective(box: tu
     # One length was given, so only its own error may be along the axis; here it was given exactly.
     assert np.abs(apart[:3]).max() < 4e-4
     assert np.abs(apart[3:]).max() < np.radians(0.3)
-    true = load_gripper(BOX_FINGERS).points_grip_m()
+    true = read_gripper(BOX_FINGERS).points_grip_m()
     corners = found.gripper.points_grip_m()[found.gripper.corner_points]
     nearest = np.linalg.norm(corners[:, None] - true[None], axis=2).min(axis=1)
     assert nearest.max() < 5e-4
@@ -105,7 +106,7 @@ def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> No
     _, found = box
     creep = Creep(start_s=0.5, time_s=0.8, tcp_shift_m=(0.0012, 0.0005))
     scenario = Scenario(name="x", duration_s=4.0, fps=15.0, mount=(creep,), background=Background(kind="printed"))
-    truth = load_gripper(BOX_FINGERS)
+    truth = read_gripper(BOX_FINGERS)
     simulator = Simulator(CAMERA, truth, nominal_cam_T_grip(), scenario, 77)
     shown, truths = [simulator.frame(k) for k in range(60)], [simulator.truth(k) for k in range(60)]
     standing = [Frame(f.seq, f.stamp_ns, f.image, None, f.name) for f in shown]
@@ -261,7 +262,7 @@ def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys:
     assert main([*words, "--distance", "0.115:0.002", *outputs, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["images"] == 30
-    assert load_gripper(tmp_path / "gripper.yaml").corner_ids == found.gripper.corner_ids
+    assert read_gripper(tmp_path / "gripper.yaml").corner_ids == found.gripper.corner_ids
     assert cv2.imread(str(tmp_path / "gripper.png")).shape == (1152, 1536, 3)
     (tmp_path / "config.yaml").write_text(
         "robot: r\ncamera_name: wrist\ncamera: camera.yaml\ngripper: gripper.yaml\nreference: reference.yaml\n"

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import yaml
 from support.changing_backgrounds import CAMERA, beside_truth_px, images_of, moving_robot
+from support.grippers import gripper_from_dict
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.errors import NoResultError
 from gripmon.model.geometry import from_record, invert, to_record
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor

@@ -13,8 +13,9 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import pose_of, reference_of
 
 from gripmon.cli import main
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator
@@ -26,7 +27,7 @@ NEAR = (0.0004, 0.0013, 0.115)
 
 
 def test_the_adaptive_gripper_has_its_sources_stroke_and_arc():
-    gripper = load_gripper(GRIPPERS / "adaptive_two_finger_85.yaml")
+    gripper = read_gripper(GRIPPERS / "adaptive_two_finger_85.yaml")
     tip = gripper.point_ids.index("R_in_near")
     places = np.array([gripper.points_grip_m(float(o))[tip] for o in np.linspace(0.0, 0.085, 86)])
     np.testing.assert_allclose(places[:, 0], np.linspace(0.0, 0.0425, 86), atol=1e-6)
@@ -42,7 +43,7 @@ def test_the_adaptive_gripper_has_its_sources_stroke_and_arc():
 def test_a_library_gripper_passes_check_in_a_simulated_view(name: str, tmp_path: Path):
     config = yaml.safe_load((GRIPPERS.parent / "demo.yaml").read_text())
     config["gripper"] = str(GRIPPERS / f"{name}.yaml")
-    if not load_gripper(GRIPPERS / f"{name}.yaml").has_jaw:
+    if not read_gripper(GRIPPERS / f"{name}.yaml").has_jaw:
         del config["jaw"]
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(config))
@@ -59,7 +60,7 @@ def drawn(gripper: Gripper, bevel_m: float) -> Gripper:
 @pytest.mark.parametrize("name", LIBRARY)
 def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
     """Sharp ones are where their file has them; of bevelled ones the bound knows, until they are taught."""
-    gripper = load_gripper(GRIPPERS / f"{name}.yaml")
+    gripper = read_gripper(GRIPPERS / f"{name}.yaml")
     camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip(tcp_m=NEAR)
     middle = gripper.jaw_nominal_m
     jaw = JawScript(knots=((0.0, middle), (1.0, middle + 0.004))) if gripper.has_jaw else JawScript()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.box_models import cube_model
+from support.grippers import gripper_from_dict
 
-from gripmon.model.gripper import GripperError, contents_of, gripper_from_dict
+from gripmon.model.gripper import GripperError, contents_of
 
 
 def outline_model(radius_m: float = 0.004) -> dict:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.box_models import cube_model
+from support.grippers import gripper_from_dict
 from support.simulated import PAPER_LENS, sharp_gripper
 
 from gripmon.judge.inspection import inspect
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Frame, Refusal
 

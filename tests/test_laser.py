@@ -137,12 +137,6 @@ def test_step_4_one_of_two_beams_is_the_true_one_and_brings_the_rotation():
     assert all(np.abs(c.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9 for c in chosen)
 
 
-def test_step_5_the_mean_rotation():
-    truth = Rotation.random(rng=np.random.default_rng(3))
-    around = [truth * Rotation.from_rotvec(sign * 0.1 * e) for e in np.eye(3) for sign in (1.0, -1.0)]
-    assert np.abs(closed_form.mean_rotation([r.as_matrix() for r in around]) - truth.as_matrix()).max() < 1e-9
-
-
 def test_step_6_the_beam_in_the_hand():
     data = scene()
     cam_R_base = data.truth.cam_T_base[:3, :3]

@@ -16,8 +16,8 @@ from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.laser.setup import NAMES, pose_jacobian
-from gripmon.model.geometry import invert, perturb, perturbation_between
+from gripmon.laser.setup import NAMES
+from gripmon.model.geometry import inverse_jacobian, invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
 from gripmon.simulate.laser import spot_image
 
@@ -182,7 +182,7 @@ def test_the_covariance_of_base_T_cam_is_that_of_the_inverse():
         ],
         axis=1,
     )
-    assert np.abs(pose_jacobian(data.truth.cam_T_base) - numeric).max() < 1e-7
+    assert np.abs(inverse_jacobian(data.truth.cam_T_base) - numeric).max() < 1e-7
 
 
 # ---- bad input

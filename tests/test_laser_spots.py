@@ -89,14 +89,6 @@ def test_many_wide_faint_things_don_t_crowd_the_spot_out():
     assert np.linalg.norm(found[0].uv_px - truth) < 0.3
 
 
-def test_a_saturated_core_is_reported():
-    rng = np.random.default_rng(4)
-    for height, least, most in ((150.0, 0.0, 0.0), (2000.0, 0.3, 1.0)):
-        found = find_spots(spot_image(np.array([300.0, 200.0]), rng, height=height))
-        assert not isinstance(found, NotFound)
-        assert least <= found[0].saturated <= most
-
-
 @pytest.mark.parametrize("kind", ["nothing", "black", "white", "smooth light", "one hot pixel"])
 def test_no_spot_is_said(kind):
     rng = np.random.default_rng(5)

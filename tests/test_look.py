@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from support.simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, simulator
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import LookRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import (
@@ -46,7 +47,7 @@ def filmed(cam_T_grip: np.ndarray | None = None, **settings: object) -> Simulato
 
 
 def new_look(gripper: Gripper | None = None) -> GripperLook:
-    return GripperLook(make_camera(PAPER_LENS), gripper or load_gripper(BOX_FINGERS))
+    return GripperLook(make_camera(PAPER_LENS), gripper or read_gripper(BOX_FINGERS))
 
 
 def taught(simulation: Simulator, frames: int = LEARNT, look: GripperLook | None = None) -> GripperLook:
@@ -190,7 +191,7 @@ def test_it_judges_after_the_fewest_views():
 
 
 def test_without_faces_depths_come_from_the_edges():
-    model = load_gripper(BOX_FINGERS).model
+    model = read_gripper(BOX_FINGERS).model
     # Edges that don't show from here would count as if they did.
     seen = {name: edge for name, edge in model.edges.items() if "out_far" not in (edge.start[2:9], edge.end[2:9])}
     used = {
@@ -286,12 +287,12 @@ def test_state_comes_back_through_json():
 
 def other_camera() -> GripperLook:
     return GripperLook(
-        make_camera(msgspec.structs.replace(PAPER_LENS, fx_px=PAPER_LENS.fx_px + 1.0)), load_gripper(BOX_FINGERS)
+        make_camera(msgspec.structs.replace(PAPER_LENS, fx_px=PAPER_LENS.fx_px + 1.0)), read_gripper(BOX_FINGERS)
     )
 
 
 def other_gripper() -> GripperLook:
-    model = load_gripper(BOX_FINGERS).model
+    model = read_gripper(BOX_FINGERS).model
     return new_look(Gripper(msgspec.structs.replace(model, name="another")))
 
 

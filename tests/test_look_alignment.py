@@ -10,9 +10,9 @@ import pytest
 from support.by_numpy import look as by_numpy
 from support.simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, simulator
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.gripper import load_gripper
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import FingerLook, JawScript, Light, LightStep, Shadow, Tilt
 from gripmon.track.look import LookAlignment, LookFusion, LookMotion, alignment, kernel
@@ -29,7 +29,7 @@ def filmed(**settings: object) -> Simulator:
 
 
 def learnt(simulation: Simulator, frames: int = LEARNT) -> LookAlignment:
-    alignment = LookAlignment(make_camera(PAPER_LENS), load_gripper(BOX_FINGERS))
+    alignment = LookAlignment(make_camera(PAPER_LENS), read_gripper(BOX_FINGERS))
     for i in range(frames):
         truth = simulation.truth(i)
         alignment.learn(simulation.render(i), truth.cam_T_grip, truth.jaw_opening_m)

@@ -27,9 +27,10 @@ from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import Coincidence
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturbation_between
-from gripmon.model.gripper import contents_of, load_gripper
+from gripmon.model.gripper import contents_of
 from gripmon.model.records import Image
 from gripmon.model.targets import CircleGrid, Target
 from gripmon.simulate import Simulator, make_scenario
@@ -113,7 +114,7 @@ def test_a_strong_lens_bends_edges_and_they_are_still_lines():
 
 def test_the_simulators_parked_gripper():
     """Another renderer, a bevel and texture on the fingers, no rough corners but a rough calibration."""
-    camera, true, gripper = make_camera(PAPER_LENS), nominal_cam_T_grip(), load_gripper(BOX_FINGERS)
+    camera, true, gripper = make_camera(PAPER_LENS), nominal_cam_T_grip(), read_gripper(BOX_FINGERS)
     simulator = Simulator(camera, gripper, true, make_scenario("series1"), 5)
     period_m = _TILE_PX * float(true[2, 3]) / camera.fx_px
     plate = CircleGrid(60, 60, period_m / round(period_m / 8e-3), 0.004)  # whole discs in a tile

@@ -21,6 +21,7 @@ from support.playback_runs import (
     new_recorder,
     records_of_a_run,
     state_record,
+    table_of,
     write_run,
 )
 from support.recorded import REFERENCE, frame, image, record, trace, wait_until
@@ -28,7 +29,6 @@ from support.recorded import REFERENCE, frame, image, record, trace, wait_until
 from gripmon.model.records import to_json
 from gripmon.record.read import open_recordings, recordings_below
 from gripmon.record.recordings import Recording, decode_image
-from gripmon.record.table import FrameTable
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_every_record_comes_back_byte_for_byte(run: Run, recording: Recording):
 
 
 def test_columns_are_those_of_the_records(run: Run, recording: Recording):
-    expected = FrameTable.from_records(run.records)
+    expected = table_of(run.records)
     for name, column in vars(expected).items():
         assert np.array_equal(getattr(recording.frames, name), column, equal_nan=column_is_float(column)), name
 

@@ -18,6 +18,7 @@ from support.playback_runs import (
     messages,
     new_recorder,
     records_of_a_run,
+    table_of,
     write_rrd,
     write_run,
 )
@@ -186,7 +187,7 @@ def test_gripmon_of_a_newer_version(run: Run, tmp_path: Path):
     collection = open_recordings([path])
     assert collection.faults == ()
     (found,) = collection.recordings
-    expected = FrameTable.from_records(records_of_a_run(0, 50))
+    expected = table_of(records_of_a_run(0, 50))
     assert np.array_equal(found.frames.cam_T_grip, expected.cam_T_grip, equal_nan=True)
     assert {FrameTable.STATES[code] for code in found.frames.state} == {"other"}
     assert {FrameTable.VERDICTS[code] for code in found.frames.verdict} == {"unknown"}

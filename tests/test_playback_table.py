@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.playback_runs import lines, records_of_a_run
+from support.playback_runs import lines, records_of_a_run, table_of
 from support.recorded import record
 
 from gripmon.model.geometry import from_record
@@ -23,7 +23,7 @@ def records() -> list[FrameRecord]:
 
 @pytest.fixture(scope="module")
 def table(records: list[FrameRecord]) -> FrameTable:
-    return FrameTable.from_records(records)
+    return table_of(records)
 
 
 def test_every_number_stands_in_its_column(records: list[FrameRecord], table: FrameTable):
@@ -70,7 +70,7 @@ def test_null_is_not_a_number(records: list[FrameRecord], table: FrameTable):
 def test_a_suspect_frame_was_measured_and_a_held_one_was_not():
     suspect = record(0, verdict=Verdict.SUSPECT, reason="the TCP may be 0.9 mm off")
     held = msgspec.structs.replace(suspect, source=Origin.HELD, reason="hidden")
-    assert FrameTable.from_records([suspect, held]).refused.tolist() == [False, True]
+    assert table_of([suspect, held]).refused.tolist() == [False, True]
     assert suspect.measured and not held.measured
 
 
@@ -110,14 +110,14 @@ def test_joining_keeps_each_frames_reference():
 
 
 def test_no_frames_are_an_empty_table():
-    for empty in (FrameTable.from_records([]), TableBuilder.join([])):
+    for empty in (table_of([]), TableBuilder.join([])):
         assert len(empty) == 0 and empty.covariance.shape == (0, 6, 6) and empty.matrices().shape == (0, 4, 4)
 
 
 def test_blocks_make_no_difference():
     """More rows than are gathered at once."""
     many = [record(i % 7, seq=i, reference_id=f"r{i // 3000}") for i in range(9000)]
-    table = FrameTable.from_records(iter(many))
+    table = table_of(iter(many))
     assert table.seq.tolist() == list(range(9000))
     assert [table.reference_ids[i] for i in table.reference[[0, 2999, 3000, 8999]]] == ["r0", "r0", "r1", "r2"]
 
@@ -143,6 +143,6 @@ def test_a_line_that_is_cut_off(records: list[FrameRecord], tmp_path: Path):
 
 def test_names_of_every_version_have_a_code():
     newer = record(0, state=State("dreaming"), source=Origin("oracle"), verdict=Verdict.SUSPECT)
-    table = FrameTable.from_records([newer])
+    table = table_of([newer])
     assert FrameTable.STATES[table.state[0]] == "other" == FrameTable.ORIGINS[table.source[0]]
     assert set(map(str, State)) < set(FrameTable.STATES) and set(map(str, Verdict)) == set(FrameTable.VERDICTS)

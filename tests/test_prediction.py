@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from support.box_models import cube_model
+from support.grippers import gripper_from_dict
 from support.meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, LensSettings, make_camera
-from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.track.edges.lines import CornerGeometry
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
@@ -19,7 +21,7 @@ from gripmon.track.edges.settings import CornerSettings, SamplingSettings
 LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
 LENS_NAMES = ["paper", "brown_conrady", "fisheye"]
 OPENING_M = 0.031
-ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
+ADAPTIVE = read_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
 OFFSETS_PX = profile_offsets_px(7.0)
 
 

@@ -8,15 +8,15 @@ from support.by_numpy import prediction as by_numpy
 from support.meters import FISHEYE_LENS, box_gripper, moved
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import load_gripper
 from gripmon.track.edges import prediction, prediction_kernel
 from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.settings import SamplingSettings
 
 CLOSE = 1e-9
-GRIPPERS = {"box": box_gripper(), "arc": load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")}
+GRIPPERS = {"box": box_gripper(), "arc": read_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")}
 WAYS = {
     "as expected": np.zeros(6),
     "half out of the image": np.array([0.03, 0.02, 0.0, 0.0, 0.0, 0.0]),

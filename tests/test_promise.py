@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.grippers import gripper_from_dict
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
-from gripmon.model.gripper import gripper_from_dict
 from gripmon.model.records import Protection
 from gripmon.teach.accuracy import Promise, forecast_frame, with_bevels
 from gripmon.teach.visibility import Rig

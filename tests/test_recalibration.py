@@ -10,13 +10,13 @@ import pytest
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 from support.still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
+from gripmon.daemon.config import read_gripper
 from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool
 from gripmon.judge.recalibrate.recalibrator import UNLIKELY_RESIDUALS_RISK
 from gripmon.judge.recalibrate.stills import LASTING_SHARE as LASTING_PART
 from gripmon.judge.recalibrate.stills import NEIGHBOURS, average, averaged_covariance, mean_corners
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.gripper import load_gripper
 
 SURE = RecalibrationSettings(sure_sigma_m=1e-4)
 CUBE = Path(BOX_FINGERS).parent / "visp_cube.yaml"
@@ -190,7 +190,7 @@ def test_a_moving_jaw_is_no_obstacle():
 
 def test_corners_that_are_in_no_plane():
     """A box as the gripper: seven corners of it show, its single finger needs no second one to be believed."""
-    gripper = load_gripper(CUBE)
+    gripper = read_gripper(CUBE)
     true_T = perturb(nominal_cam_T_grip(tilt_deg=40.0, tcp_m=(0.04, -0.02, 0.5)), np.array([0, 0, 0, 0.1, 0.5, 0.0]))
     scene = Scene(gripper=gripper, true_T=true_T)
     settings = RecalibrationSettings(sure_sigma_m=1e-3, largest_sigma_m=2e-3, largest_step_m=1.0, largest_step_rad=3.0)

@@ -115,11 +115,11 @@ def test_a_failing_node_stops_neither_the_loop_nor_the_other_publisher(caplog: p
     both = Publishers(first, {"ROS 2": Failing()})
     daemon = Daemon(
         monitor,
-        TickingSource(200.0),
-        both,
-        Listener(),
-        DaemonSettings(give_up_after_errors=3, state_period_s=0.01),
-        stop,
+        source=TickingSource(200.0),
+        publisher=both,
+        recorder=Listener(),
+        settings=DaemonSettings(give_up_after_errors=3, state_period_s=0.01),
+        stop=stop,
         robot="arm",
         camera="wrist",
         estimates=EstimatesFile(None),

@@ -10,15 +10,16 @@ from support.meters import FISHEYE_LENS, JAW_SIGMA_M, difference
 from support.sampled import OPENING_M, NoisyMeter
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
+from gripmon.daemon.config import read_gripper
 from gripmon.judge.recalibrate import recalibrate
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.track.differential import differential_update
 from gripmon.track.edges import Measurement
 
 SAMPLES = 200
-ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
+ADAPTIVE = read_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
 
 
 def normalised(error: np.ndarray, covariance: np.ndarray) -> float:

@@ -95,7 +95,8 @@ class Bench:
 
     def run(self, items: Iterable[object], **more: object) -> int:
         return run_second(
-            self.pulsed, ScriptedSource(items, live=self.live), self.network, self.recording, self.settings,
+            self.pulsed, source=ScriptedSource(items, live=self.live), publisher=self.network,
+            recorder=self.recording, settings=self.settings,
             robot="cell", camera="second", feed=self.pulses, **more,  # type: ignore[arg-type]
         )  # fmt: skip
 

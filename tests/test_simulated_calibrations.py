@@ -15,8 +15,8 @@ import yaml
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.cli import main
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, make_camera
-from gripmon.model.gripper import load_gripper
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid
 from gripmon.simulate import CALIBRATION_KINDS, Rig, image_count
 from gripmon.simulate.calibration_images import rough_corners
@@ -79,7 +79,7 @@ def test_two_samples_a_pixel_are_as_exact_as_many(target):
 
 
 def test_rough_corners_are_those_of_the_named_places():
-    rig = Rig(make_camera(PAPER_LENS), load_gripper(BOX_FINGERS), nominal_cam_T_grip())
+    rig = Rig(make_camera(PAPER_LENS), read_gripper(BOX_FINGERS), nominal_cam_T_grip())
     assert rig.jaw_opening_m == pytest.approx(0.05)
     true, rough = rough_corners(
         rig.camera, rig.gripper, rig.cam_T_grip, rig.jaw_opening_m, np.random.default_rng(1), off_px=4.0

@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 
+from gripmon.daemon.config import read_gripper
 from gripmon.io.sources import (
     SimulatedScene,
     SimulatedSettings,
@@ -30,7 +31,6 @@ from gripmon.io.sources.realtime import SimulatedCamera, _Schedule
 from gripmon.io.sources.simulated import SimulatedSequence
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
-from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Frame
 from gripmon.simulate import make_scenario
 
@@ -74,7 +74,7 @@ def cameras() -> Iterator[list[SimulatedCamera]]:
 def scene() -> SimulatedScene:
     lens = PaperLens(width_px=192, height_px=144, fx_px=240.5, fy_px=240.5, cx_px=95.5, cy_px=71.5, kappa_per_px2=3e-6)
     tilted = make_transform(exp_rotation(np.array([0.55, 0.0, 0.0])), np.array([0.0, 0.0, 0.12]))
-    return SimulatedScene(make_camera(lens), load_gripper(ROOT / "configs/grippers/two_box_fingers.yaml"), tilted)
+    return SimulatedScene(make_camera(lens), read_gripper(ROOT / "configs/grippers/two_box_fingers.yaml"), tilted)
 
 
 def frames_of(camera: SimulatedCamera, count: int) -> list[Frame]:

@@ -13,8 +13,8 @@ from support.meters import FISHEYE_LENS, box_gripper, difference
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 from support.watched import reference_of
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook
@@ -122,7 +122,7 @@ def scatter(mount: Mount) -> np.ndarray:
 
     Nothing but the fingers hides anything: what a gripper file doesn't describe can't be predicted.
     """
-    camera, gripper = make_camera(PAPER_LENS), load_gripper(BOX_FINGERS)
+    camera, gripper = make_camera(PAPER_LENS), read_gripper(BOX_FINGERS)
     cam_T_grip = pose(mount)
     scenario = Scenario(duration_s=20.0, fps=4.0, background=TABLE, fingers=FingerLook(carriers=False))
     simulator = Simulator(camera, gripper, cam_T_grip, scenario, 3)
@@ -139,7 +139,7 @@ def scatter(mount: Mount) -> np.ndarray:
 def test_a_swept_mount_scatters_as_predicted(name: str):
     """Another noise, and texture, than assumed: within a factor of three on every axis, the axes in their order."""
     spread = scatter(MOUNTS[name])
-    gripper = load_gripper(BOX_FINGERS)
+    gripper = read_gripper(BOX_FINGERS)
     known = Rig(make_camera(PAPER_LENS), gripper, MonitorSettings(jaw_sigma_m=0.0))
     trial = try_mount(known, MOUNTS[name], 0, pose(MOUNTS[name]), 0.034)
     expected = np.sqrt(trial.measurable.frame.covariance.diagonal())

@@ -20,12 +20,11 @@ from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 from support.taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.cli import main
-from gripmon.daemon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.config import ConfigError, builtin_config, load_config, read_gripper
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.atomic import write_atomically
 from gripmon.model.geometry import to_record
-from gripmon.model.gripper import load_gripper
 from gripmon.teach.api import to_yaml
 from gripmon.teach.drawing import Labels
 from gripmon.track.edges import TaughtModel
@@ -411,7 +410,7 @@ def _mask() -> int:
 
 
 def test_the_gripper_files_digest_is_that_of_its_content():
-    one, two = load_gripper(BOX_FINGERS), load_gripper(BOX_FINGERS)
+    one, two = read_gripper(BOX_FINGERS), read_gripper(BOX_FINGERS)
     assert gripper_digest(one) == gripper_digest(two) and len(gripper_digest(one)) == 64
     assert TaughtEdge.__struct_config__.forbid_unknown_fields
 

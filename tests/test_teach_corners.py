@@ -16,13 +16,12 @@ from support.taught_by_hand import Rig, make_rig
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.cli import main
-from gripmon.daemon.config import Settings, builtin_config, load_config
+from gripmon.daemon.config import Settings, builtin_config, load_config, read_gripper
 from gripmon.daemon.config.settings import JawSettings
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
-from gripmon.model.gripper import load_gripper
 from gripmon.model.provenance import Provenance
 from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
@@ -94,7 +93,7 @@ def test_an_opening_that_nobody_reports_may_be_far_from_the_nominal_one(rig: Rig
     for name, at in zip(rig.gripper.point_ids, rig.gripper.points_grip_m(0.058).tolist(), strict=True):
         model["points"][name]["xyz_m"] = at
     (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(model))
-    setup = Setup(rig.camera, load_gripper(tmp_path / "gripper.yaml"), MonitorSettings(), None)
+    setup = Setup(rig.camera, read_gripper(tmp_path / "gripper.yaml"), MonitorSettings(), None)
     snapped = setup.evaluate(rig.image, put(rig.rough(*INNER)), (), None).snapped
     assert snapped.refused is None and sum(corner.uv_px is not None for corner in snapped.corners) == 6
     assert snapped.jaw_opening_m == pytest.approx(OPENING_M, abs=5.0 * (snapped.jaw_sigma_m or 0.0))

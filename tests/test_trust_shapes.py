@@ -11,12 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.grippers import gripper_from_dict
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 from support.watched import Watched, pose_of, reference_of, watch
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import AlertKind, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.refits import SIGMA_INFLATION

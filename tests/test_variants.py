@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.box_models import cube_model, two_fingers_model
+from support.grippers import gripper_from_dict
 from support.simulated import BOX_FINGERS
 from support.watched import Watched, frames_of, new_monitor, watch
 
-from gripmon.daemon.config import ConfigError, builtin_config, load_config
-from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.daemon.config import ConfigError, builtin_config, load_config, read_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import AlertKind, CornerFault, FrameRecord
 from gripmon.monitor import MonitorSettings
 
@@ -28,7 +29,7 @@ def names(gripper: Gripper, count: int, without: tuple[str, ...] = ()) -> set[st
 
 @pytest.mark.parametrize("path", [BOX_FINGERS, ADAPTIVE_FINGERS], ids=lambda path: path.stem)
 def test_four_are_the_rectangle_about_the_tcp_and_the_fifth_is_an_outer_one(path: Path):
-    gripper = load_gripper(path)
+    gripper = read_gripper(path)
     inner = {"L_in_near", "L_in_far", "R_in_near", "R_in_far"}
     assert names(gripper, 4) == inner
     assert len(names(gripper, 3)) == 3 and names(gripper, 3) < inner
@@ -40,7 +41,7 @@ def test_four_are_the_rectangle_about_the_tcp_and_the_fifth_is_an_outer_one(path
 
 
 def test_three_lie_on_two_fingers_and_never_on_a_line():
-    gripper = load_gripper(BOX_FINGERS)
+    gripper = read_gripper(BOX_FINGERS)
     points = gripper.points_grip_m()[gripper.corner_points]
     for hidden in ((), ("L_in_near",), ("R_in_far",), ("L_in_far", "R_in_far"), ("L_in_near", "L_in_far")):
         taken = [gripper.corner_ids.index(name) for name in names(gripper, 3, hidden)]
@@ -49,7 +50,7 @@ def test_three_lie_on_two_fingers_and_never_on_a_line():
 
 
 def test_a_hidden_corner_is_replaced_by_the_next_one_of_its_finger():
-    gripper = load_gripper(BOX_FINGERS)
+    gripper = read_gripper(BOX_FINGERS)
     [instead] = names(gripper, 4, ("L_in_far",)) - {"L_in_near", "R_in_near", "R_in_far"}
     assert instead.startswith("L_out_")
     left = tuple(name for name in gripper.corner_ids if name.startswith("L"))

@@ -23,11 +23,10 @@ from support.teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.cli import main
-from gripmon.daemon.config import load_config
+from gripmon.daemon.config import load_config, read_gripper
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
-from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Transform
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
@@ -101,7 +100,7 @@ def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, cal
     error = perturbation_between(from_record(hand_eye.cam_T_grip), user.cam_T_grip[0])
     assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()
     assert error @ np.linalg.solve(np.reshape(hand_eye.covariance, (6, 6)), error) < CHI2_999
-    found, true_gripper = load_gripper(calibrated / "gripper.yaml"), load_gripper(BOX_FINGERS)
+    found, true_gripper = read_gripper(calibrated / "gripper.yaml"), read_gripper(BOX_FINGERS)
     corners, real = (g.points_grip_m(new_user.OPENING_M) for g in (found, true_gripper))
     for name in INNER:
         twin = f"{name[0].upper()}_{name.split('_', 1)[1].replace('inner', 'in')}"

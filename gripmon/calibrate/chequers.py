@@ -25,7 +25,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.lattice import Grey, Index, find_lattice, trimmed
+from gripmon.calibrate.lattice import Grey, Index, find_lattice, fits, trimmed
 from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)
@@ -76,7 +76,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
             lattice = trimmed(_wide(grey, candidates, lattice), columns, rows)
             found = {cell: (float(candidates[i, 0]), float(candidates[i, 1])) for cell, i in lattice.items()}
             contrast = float(np.abs(second[list(lattice.values())]).sum())
-            if fits(found, columns, rows):
+            if fits(found, columns, rows, least=2):
                 if contrast > shown:
                     best, shown = found, contrast
             elif len(found) >= 9:
@@ -86,15 +86,6 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
         if len(best) == columns * rows:
             break
     return [best or max(others, key=len)] if best or others else []
-
-
-def fits(lattice: dict[Index, tuple[float, float]], columns: int, rows: int) -> bool:
-    """Whether a lattice can be part of ``columns`` x ``rows``, in either orientation, and is large enough."""
-    if len(lattice) < 9:
-        return False
-    cells = np.array(list(lattice))
-    seen = cells.max(axis=0) - cells.min(axis=0) + 1
-    return bool(max(seen) <= max(columns, rows) and min(seen) <= min(columns, rows) and min(seen) >= 2)
 
 
 def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Index, int]:

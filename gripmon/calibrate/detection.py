@@ -18,6 +18,7 @@ from gripmon.calibrate.lattice import (
     Index,
     edge_blur_px,
     find_discs,
+    fits,
     noise_of,
     refined,
     sharpest_blur_px,
@@ -125,7 +126,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
         return NotFound(_blurred(grey) or "no chequerboard in the image; one that is evenly lit and not too small")
     cells, rough = _arrays(found[0])
     fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
-    if fewer or not chequers.fits(found[0], target.columns, target.rows):
+    if fewer or not fits(found[0], target.columns, target.rows, least=2):
         return _wrong_count(cells, target.columns, target.rows, "inner corners")
     steps = _steps(cells, rough)
     starts, ends = _across_squares(cells, rough)

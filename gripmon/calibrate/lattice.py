@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -290,7 +291,7 @@ def find_discs(grey: Grey, columns: int, rows: int, spacing_per_diameter: float)
     if max(grey.shape) > LARGE_PX:
         half: Grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         found = _search(half, columns, rows, spacing_per_diameter)
-        if found and _fits(found[0], columns, rows):
+        if found and fits(found[0], columns, rows):
             return [
                 {cell: Disc(2.0 * d.centre_px + 0.5, 4.0 * d.spread_px2, d.dark) for cell, d in one.items()}
                 for one in found
@@ -315,7 +316,7 @@ def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) ->
                 chosen = np.array(list(lattice.values()))
                 lattice = trimmed(lattice, columns, rows)
                 found = {cell: Disc(centres[i], spreads[i], dark) for cell, i in lattice.items()}
-                if _fits(found, columns, rows):
+                if fits(found, columns, rows):
                     best = max(best, found, key=len)
                 elif len(found) >= 9:
                     others.append(found)
@@ -335,12 +336,15 @@ def _united(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Ar
     return np.concatenate([first[0], second[0][new]]), np.concatenate([first[1], second[1][new]])
 
 
-def _fits(lattice: dict[Index, Disc], columns: int, rows: int) -> bool:
+def fits(lattice: Mapping[Index, object], columns: int, rows: int, least: int = 1) -> bool:
+    """Whether a lattice can be part of ``columns`` x ``rows``, in either orientation, and is large enough: nine points,
+    and ``least`` in each of its rows and columns.
+    """
     if len(lattice) < 9:
         return False
     cells = np.array(list(lattice))
     seen = cells.max(axis=0) - cells.min(axis=0) + 1
-    return bool(max(seen) <= max(columns, rows) and min(seen) <= min(columns, rows))
+    return bool(max(seen) <= max(columns, rows) and least <= min(seen) <= min(columns, rows))
 
 
 def _inverse_roots(spreads: Array) -> Array:

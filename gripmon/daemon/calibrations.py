@@ -12,11 +12,12 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
-from gripmon.daemon.config.calibrated import read_camera, read_hand_eye
-from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_settings, read_yaml
+from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_document, read_settings, read_yaml
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
@@ -94,7 +95,7 @@ def _plain(camera: LensSettings) -> dict[str, float]:
 
 
 def _hand_eye(path: Path) -> Calibrated:
-    found = read_hand_eye(path)
+    found = read_document(path, HandEyeCalibration)
     residuals = found.residuals
     return Calibrated(
         str(path),

@@ -13,10 +13,7 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import JawFeed
 from gripmon.daemon.snapshots import Newest
-from gripmon.daemon.supervised import Beside, Loop
-from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish import Publisher
-from gripmon.io.sources import Source
+from gripmon.daemon.supervised import Loop, Parts
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Command,
@@ -27,9 +24,7 @@ from gripmon.model.records import (
     unmeasured_record,
     withheld,
 )
-from gripmon.model.stopping import StopRequest
 from gripmon.monitor import Monitor
-from gripmon.record.recorder import Recorder
 
 KEEP_LAST_EVERY_S = 60.0
 """How old the stored last transform may be; references and alerts are stored when they change."""
@@ -41,18 +36,13 @@ class Daemon(Loop):
     def __init__(
         self,
         monitor: Monitor,
-        source: Source,
-        publisher: Publisher,
-        recorder: Recorder,
-        settings: DaemonSettings,
-        stop: StopRequest,
         *,
         estimates: EstimatesFile,
         jaw: JawFeed | None = None,
         keeper: StateKeeper | None = None,
-        **beside: Unpack[Beside],
+        **parts: Unpack[Parts],
     ) -> None:
-        super().__init__(source, publisher, recorder, settings, stop, **beside)
+        super().__init__(**parts)
         self._monitor = monitor
         self._estimates = estimates
         self._jaw = jaw

@@ -20,17 +20,14 @@ from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.snapshots import Snapshots
-from gripmon.daemon.supervised import Beside
+from gripmon.daemon.supervised import Parts
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.io.sources import Source
 from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import FrameRecord, Outlines
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
-from gripmon.record.recorder import Recorder
 
 _UNHURRIED_S = 10.0  # for the recording, if no stop was requested
 _SHORTEST_CLOSE_S = 0.5
@@ -39,18 +36,13 @@ _SWITCH_INTERVAL_S = 0.0005
 
 def run(
     monitor: Monitor,
-    source: Source,
-    publisher: Publisher,
-    recorder: Recorder,
-    settings: DaemonSettings,
     *,
     estimates: Path | None = None,
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     duration_s: float | None = None,
-    stop: StopRequest | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
-    **beside: Unpack[Beside],
+    **parts: Unpack[Parts],
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal arrives; then close everything that was passed in.
 
@@ -64,71 +56,58 @@ def run(
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame, the source failed, or
     internal errors persisted; 130 SIGINT.
     """
-    stop = stop or StopRequest()
-    with _closing(source, publisher, recorder, settings, estimates, stop, beside, jaw, keeper, outlines) as lines:
-        return Daemon(
-            monitor, source, publisher, recorder, settings, stop, estimates=lines, jaw=jaw, keeper=keeper, **beside
-        ).run(duration_s)
+    with _closing(parts, estimates, jaw, keeper, outlines) as lines:
+        return Daemon(monitor, estimates=lines, jaw=jaw, keeper=keeper, **parts).run(duration_s)
 
 
 def run_second(
     pulsed: PulsedWatch,
-    source: Source,
-    publisher: Publisher,
-    recorder: Recorder,
-    settings: DaemonSettings,
     *,
     lines: Path | None = None,
     table: Sequence[ReportedPulse] = (),
     feed: ZenohPulses | None = None,
     no_spot_alert_after_s: float | None = None,
     duration_s: float | None = None,
-    stop: StopRequest | None = None,
-    **beside: Unpack[Beside],
+    **parts: Unpack[Parts],
 ) -> int:
     """The same for a second camera: see :class:`SecondCamera`.  ``lines``: a file that gets one JSON line per pulse.
 
     Returns the exit code, which is also 3 if no pulse had a usable spot.
     """
-    stop = stop or StopRequest()
-    with _closing(source, publisher, recorder, settings, lines, stop, beside) as file:
+    with _closing(parts, lines) as file:
         return SecondCamera(
-            pulsed, source, publisher, recorder, settings, stop,
-            lines=file, table=table, feed=feed, no_spot_alert_after_s=no_spot_alert_after_s, **beside,
-        ).run(duration_s)  # fmt: skip
+            pulsed, lines=file, table=table, feed=feed, no_spot_alert_after_s=no_spot_alert_after_s, **parts
+        ).run(duration_s)
 
 
 @contextlib.contextmanager
 def _closing(
-    source: Source,
-    publisher: Publisher,
-    recorder: Recorder,
-    settings: DaemonSettings,
+    parts: Parts,
     lines: Path | None,
-    stop: StopRequest,
-    beside: Beside,
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
 ) -> Iterator[EstimatesFile]:
-    """Opens the file for lines, and adds the faults of all these parts and the snapshots to ``beside``.
+    """Opens the file for lines, and adds the faults of all these and the snapshots to ``parts``.
 
     Signals request a stop.  Everything is closed in any case, which a second signal can't interrupt.
     """
+    recorder, settings = parts["recorder"], parts["settings"]
+    stop = parts["stop"] = parts.get("stop") or StopRequest()
     with signals_request(stop), contextlib.ExitStack() as closing:
         # All of these run, in reverse order.
         if keeper is not None:
             closing.callback(keeper.close)
-        closing.callback(publisher.close)
+        closing.callback(parts["publisher"].close)
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
-        closing.callback(source.close)
+        closing.callback(parts["source"].close)
         file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
-        beside["snapshots"] = closing.enter_context(contextlib.closing(Snapshots(outlines)))
+        parts["snapshots"] = closing.enter_context(contextlib.closing(Snapshots(outlines)))
         faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
         faults += [lambda: recorder.failure, lambda: file.failure]
         faults += [] if keeper is None else [lambda: keeper.failure]
-        reports = beside.get("reports") or Reports()
-        beside["reports"] = replace(reports, faults=(*faults, *reports.faults))
+        reports = parts.get("reports") or Reports()
+        parts["reports"] = replace(reports, faults=(*faults, *reports.faults))
         with _steady_interpreter():
             yield file
 

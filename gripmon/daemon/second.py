@@ -12,11 +12,9 @@ import msgspec
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.snapshots import Newest
-from gripmon.daemon.supervised import Beside, Loop
-from gripmon.daemon.watch import DaemonSettings, Judged
-from gripmon.io.publish import Publisher
+from gripmon.daemon.supervised import Loop, Parts
+from gripmon.daemon.watch import Judged
 from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.matching import ReportedPulse, Shown
 from gripmon.laser.watching import Outcome, PulsedWatch
@@ -37,8 +35,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.record.recorder import Recorder
+from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
@@ -56,23 +53,18 @@ class SecondCamera(Loop):
     def __init__(
         self,
         pulsed: PulsedWatch,
-        source: Source,
-        publisher: Publisher,
-        recorder: Recorder,
-        settings: DaemonSettings,
-        stop: StopRequest,
         *,
         lines: EstimatesFile,
         table: Sequence[ReportedPulse] = (),
         feed: ZenohPulses | None = None,
         no_spot_alert_after_s: float | None = None,
-        **beside: Unpack[Beside],
+        **parts: Unpack[Parts],
     ) -> None:
         """``table``: all pulses of recorded frames; ``feed``: the source of pulses otherwise.
 
         ``no_spot_alert_after_s``: time without an accepted spot after which there is an alert; None: never.
         """
-        super().__init__(source, publisher, recorder, settings, stop, **beside)
+        super().__init__(**parts)
         self._pulsed = pulsed
         self._lines = lines
         self._table, self._feed = table, feed

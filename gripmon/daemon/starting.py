@@ -140,10 +140,10 @@ def run_monitor(
         reports = with_source(network.reports, source)
         return run(
             monitor,
-            source,
-            network.publisher,
-            recorder,
-            settings.daemon,
+            source=source,
+            publisher=network.publisher,
+            recorder=recorder,
+            settings=settings.daemon,
             robot=settings.robot,
             camera=settings.camera_name,
             estimates=None if out is None else out / "estimates.jsonl",
@@ -192,10 +192,10 @@ def _run_second(
         opened.pop_all()  # from here on the daemon closes them
         return run_second(
             pulsed,
-            source,
-            network.publisher,
-            recorder,
-            settings.daemon,
+            source=source,
+            publisher=network.publisher,
+            recorder=recorder,
+            settings=settings.daemon,
             robot=settings.robot,
             camera=settings.camera_name,
             lines=None if out is None else out / "spots.jsonl",

@@ -56,9 +56,14 @@ _RESTS_FOR = 3.0
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
-class Beside(TypedDict, total=False):
-    """Keywords of every :class:`Loop`."""
+class Parts(TypedDict, total=False):
+    """Keywords of every :class:`Loop`: what it works with and for."""
 
+    source: Required[Source]
+    publisher: Required[Publisher]
+    recorder: Required[Recorder]
+    settings: Required[DaemonSettings]
+    stop: StopRequest | None
     robot: Required[str]
     camera: Required[str]
     commands: ZenohCommands | None
@@ -75,14 +80,14 @@ class Loop(ABC):
 
     def __init__(
         self,
+        *,
         source: Source,
         publisher: Publisher,
         recorder: Recorder,
         settings: DaemonSettings,
-        stop: StopRequest,
-        *,
         robot: str,
         camera: str,
+        stop: StopRequest | None = None,
         commands: ZenohCommands | None = None,
         snapshots: Snapshots | None = None,
         reports: Reports | None = None,
@@ -104,7 +109,7 @@ class Loop(ABC):
         self._watch = Watch(settings, self._start_s)
         self._last_state: StateRecord | None = None
         self._next_state_s = self._next_command_s = self._start_s
-        self._stop = stop
+        self._stop = stop or StopRequest()
         self._service = ServiceManager()
         self._source_broke = False
         self._faults: dict[str, str] = {}  # since the previous frame: what could not be delivered, and why

@@ -309,14 +309,11 @@ _NEGLIGIBLE = math.log(1e-5)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The test's result for a pulse.  ``odds``: R over the limit for an alarm; ``alarm``: it was reached with this
-    pulse; ``back``: with this pulse everything counts as back in place.  ``candidate``: the one that the best belief
-    takes for the spot, ``believed``: whether it accepts it.
+    """The test's result for a pulse.  ``odds``: R over the limit for an alarm.  ``candidate``: the one that the best
+    belief takes for the spot, ``believed``: whether it accepts it.
     """
 
     odds: float
-    alarm: bool
-    back: bool
     candidate: int
     believed: bool
 
@@ -369,15 +366,14 @@ class MotionTest:
         self._others = _kept(others, _KEPT, _HOPELESS)
         self._prune()
         odds, back_odds = self._odds()
-        changes = odds >= 1.0 or back_odds >= 1.0
         candidate, is_believed = int(candidates[best]), bool(believed[best])
-        if changes:
+        if odds >= 1.0 or back_odds >= 1.0:
             self._others, self.reigning = self._crowned(back=back_odds > odds)
             if not self.moved:
                 self._remember(int(self.reigning.born[self.best]))
             self.moved = back_odds <= odds
             candidate, is_believed = self._chosen(pulse)
-        return Finding(max(odds, 0.0), changes and self.moved, changes and not self.moved, candidate, is_believed)
+        return Finding(max(odds, 0.0), candidate, is_believed)
 
     def _wrong(self, pulse: Pulse) -> Array:
         """(k,) density of wrong spots around the best belief's prediction; 1/px²."""

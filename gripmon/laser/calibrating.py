@@ -22,11 +22,10 @@ from gripmon.laser.setup import (
     LaserSetup,
     Plane,
     _vector,
-    pose_jacobian,
 )
 from gripmon.laser.world import LEAST_NOISE_PX
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import invert, to_record
+from gripmon.model.geometry import inverse_jacobian, invert, to_record
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 
@@ -294,7 +293,7 @@ def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
 def base_covariance(refined: Refined) -> Array:
     """Covariance (13, 13) of :data:`NAMES`."""
     change = np.eye(len(NAMES))
-    change[:6, :6] = pose_jacobian(refined.setup.cam_T_base)
+    change[:6, :6] = inverse_jacobian(refined.setup.cam_T_base)
     out: Array = change @ refined.covariance @ change.T
     return out
 

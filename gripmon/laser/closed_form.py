@@ -102,7 +102,8 @@ def usable_orientations(
         shifts = base_T_ee[members, :3, 3]
         spread = np.linalg.svd(shifts - shifts.mean(axis=0), compute_uv=False)
         if spread[2] >= FLAT * spread[0] and spread[0] > 0.0:
-            rotation = mean_rotation(list(base_T_ee[members, :3, :3]))
+            # Step 5, equations (26) to (29): SciPy's mean is the eigenvector that the paper seeks.
+            rotation = Rotation.from_matrix(base_T_ee[members, :3, :3]).mean().as_matrix()
             usable.append(Orientation(members, rotation, shifts.mean(axis=0), np.empty((3, 4))))
     if len(usable) < FEWEST_ORIENTATIONS:
         raise CalibrationError(
@@ -124,16 +125,6 @@ def _check_turns(base_R_ee: Array) -> None:
             f"{len(base_R_ee)} orientations, turned about one axis only: where the laser sits along it stays unknown; "
             "at least three orientations, turned about at least two axes"
         )
-
-
-def mean_rotation(rotations: Sequence[Array]) -> Array:
-    """Step 5, equations (26) to (29): the mean rotation, from the eigenvector with the largest eigenvalue of the summed
-    products of the quaternions (the paper seeks the smallest eigenvalue of the negative).
-    """
-    quaternions = Rotation.from_matrix(np.stack(rotations)).as_quat()
-    axes = np.linalg.eigh(quaternions.T @ quaternions)[1]
-    out: Array = Rotation.from_quat(axes[:, -1]).as_matrix()
-    return out
 
 
 def beam_in_hand(beams_cam: Sequence[Array], base_R_ee: Sequence[Array], cam_R_base: Array) -> Array:

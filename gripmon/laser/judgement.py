@@ -14,9 +14,19 @@ from msgspec import Meta
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.beliefs import KINDS, MOVED, SCALES, Beliefs, MotionTest
 from gripmon.laser.spots import Spot
-from gripmon.laser.world import CAMERA, Calibrated, Disagreement, World, predict, predict_moved
-from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity, State, Verdict
-from gripmon.model.records.values import OpenEnum
+from gripmon.laser.world import CAMERA, Calibrated, World, predict, predict_moved
+from gripmon.model.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    CauseWeight,
+    PulseFault,
+    Severity,
+    SpotGap,
+    State,
+    Verdict,
+)
 
 
 class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -80,15 +90,6 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         return np.diag(np.square([self.arm_noise_m] * 3 + [self.arm_noise_rad] * 3))
 
 
-class SpotFault(OpenEnum):
-    """Why a pulse has no usable spot, or its spot was rejected."""
-
-    NO_SPOT = "no_spot"
-    OUTLIER = "outlier"
-    NOT_FORESEEN = "not_foreseen"
-    NOT_FINITE = "not_finite"
-
-
 @dataclass(frozen=True, slots=True)
 class SpotSeen:
     """A pulse: its time (Unix ns), the reported pose of the end-effector (4, 4), and the candidates for the spot, as
@@ -120,12 +121,12 @@ class CameraMotion:
 class SpotJudgement:
     """The judgement of one pulse.
 
-    ``chosen``: index of the candidate taken for the spot, at ``uv_px`` (2,); ``predicted_px`` (2,) by the calibration;
-    ``off_px`` (2,): innovation, measured less predicted, whose ``covariance_px`` (2, 2) covers the calibration, the
-    spot and the arm; ``square``: normalised innovation squared, two degrees of freedom.  ``spots_base_m`` (3, 3): the
-    spot in the base frame by beam and plane, by ray and plane, by beam and ray; ``disagreements`` of these.  ``used``:
-    the spot was accepted; otherwise ``fault`` and ``reason`` say why not.  ``probability_moved``: that anything has
-    moved; ``causes``: what, each with its probability.  ``motion`` of the camera, if the camera moved or may have.
+    ``uv_px`` (2,): the candidate taken for the spot; ``predicted_px`` (2,) by the calibration; ``off_px`` (2,):
+    innovation, measured less predicted, whose ``covariance_px`` (2, 2) covers the calibration, the spot and the arm;
+    ``square``: normalised innovation squared, two degrees of freedom.  ``spots_base_m`` (3, 3): the spot in the base
+    frame by beam and plane, by ray and plane, by beam and ray; ``disagreements`` of these.  ``used``: the spot was
+    accepted; otherwise ``fault`` and ``reason`` say why not.  ``probability_moved``: that anything has moved;
+    ``causes``: what, each with its probability.  ``motion`` of the camera, if the camera moved or may have.
     None means unknown.
     """
 
@@ -133,15 +134,14 @@ class SpotJudgement:
     used: bool
     state: State
     verdict: Verdict
-    chosen: int | None = None
     uv_px: Array | None = None
     predicted_px: Array | None = None
     off_px: Array | None = None
     covariance_px: Array | None = None
     square: float | None = None
     spots_base_m: Array | None = None
-    disagreements: tuple[Disagreement, ...] = ()
-    fault: SpotFault | None = None
+    disagreements: tuple[SpotGap, ...] = ()
+    fault: PulseFault | None = None
     reason: str = ""
     probability_moved: float = 0.0
     causes: tuple[CauseWeight, ...] = ()
@@ -335,13 +335,13 @@ def _moved_text(
     return f"{text}: the laser pointer moved on the arm, turned by {turn:.3f} degrees, shifted by {shift:.2f} mm"
 
 
-def lost_alert(faults: Sequence[SpotFault]) -> Alert:
+def lost_alert(faults: Sequence[PulseFault]) -> Alert:
     """The alert after too many successive pulses without an accepted spot."""
     return Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, _lost(len(faults), faults))
 
 
-def _lost(pulses: int, faults: Sequence[SpotFault]) -> str:
-    seen = sum(fault is SpotFault.OUTLIER for fault in faults)
+def _lost(pulses: int, faults: Sequence[PulseFault]) -> str:
+    seen = sum(fault is PulseFault.OUTLIER for fault in faults)
     if seen == 0:
         return (
             f"no spot in the last {pulses} pulses: the laser off, the beam or the camera's view blocked, or the camera "

@@ -13,10 +13,10 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.beliefs import KINDS, LEAST_PULSES, SCALES, assumed
 from gripmon.laser.judgement import UNIT, SpotWatchSettings, on_plane
 from gripmon.laser.refinement import Refined
-from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_jacobian, spots_on_plane
+from gripmon.laser.setup import PARAMETERS, LaserSetup, spots_on_plane
 from gripmon.laser.world import CAMERA, COUNT, Calibrated, Prediction, larger, predict, spread_px, visible
 from gripmon.model.camera import make_camera
-from gripmon.model.geometry import invert, make_transform
+from gripmon.model.geometry import inverse_jacobian, invert, make_transform
 from gripmon.model.records import Array
 
 CANDIDATES = 4000
@@ -111,14 +111,14 @@ def candidates(setup: LaserSetup, refined: Refined, reach_m: float, rng: np.rand
 def _weights(setup: LaserSetup) -> Array:
     """(13, 13) weights of a covariance of :data:`PARAMETERS`: mean square error (m²) of a point at plane distance."""
     out = np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    change = pose_jacobian(setup.cam_T_base)
+    change = inverse_jacobian(setup.cam_T_base)
     size = np.diag([1.0] * 3 + [setup.distance_m**2] * 3)
     out[:6, :6] = change.T @ size @ change
     return out
 
 
 def _sigmas(setup: LaserSetup, covariance: Array) -> tuple[float, float]:
-    change = pose_jacobian(setup.cam_T_base)
+    change = inverse_jacobian(setup.cam_T_base)
     pose = change @ covariance[:6, :6] @ change.T
     return float(np.sqrt(np.trace(pose[:3, :3]))), float(np.sqrt(np.trace(pose[3:, 3:])))
 

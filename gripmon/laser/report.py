@@ -95,7 +95,7 @@ def _row(name: str, judged: SpotJudgement) -> dict[str, Any]:
         "disagreements": [
             {
                 "ways": list(d.ways),
-                "distance_m": d.distance_m,
+                "distance_m": float(np.linalg.norm(d.gap_m)),
                 "sigma_m": d.sigma_m,
                 "square": d.square,
                 "degrees_of_freedom": d.freedom,

@@ -187,15 +187,6 @@ class LaserCalibration(
     provenance: Provenance
 
 
-def pose_jacobian(cam_T_base: Array) -> Array:
-    """Jacobian (6, 6) of a perturbation of ``base_T_cam`` (base axes) by one of ``cam_T_base`` (camera axes)."""
-    turn = cam_T_base[:3, :3].T
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = -turn
-    out[:3, 3:] = -turn @ skew(cam_T_base[:3, 3])
-    return out
-
-
 def setup_of(calibration: LaserCalibration) -> LaserSetup:
     """The set-up that a file describes."""
     return LaserSetup(

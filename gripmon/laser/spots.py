@@ -19,7 +19,6 @@ SHARE_OF_PEAK = 0.15
 """Fraction of a blob's own peak above which its pixels count."""
 MOST_CANDIDATES = 5
 MOST_OF_IMAGE = 0.05
-SATURATED = 0.98
 GRAIN_PX = 5
 """Width of a fine speckle grain: gaps up to this size between grains of one spot are closed."""
 GRAINS_PX = (5, 9, 13)
@@ -34,21 +33,19 @@ _MOST_CUT = 0.35
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A candidate: ``uv_px`` (2,), ``covariance_px`` (2, 2) of its error, ``flux`` and ``peak`` above the background
-    (grey levels), ``area_px``, and the fraction of it that is ``saturated``.
+    """A candidate: ``uv_px`` (2,), ``covariance_px`` (2, 2) of its error, ``flux`` above the background (grey levels),
+    and ``area_px``.
     """
 
     uv_px: Array
     covariance_px: Array
     flux: float
-    peak: float
     area_px: int
-    saturated: float
 
 
 def plain_spot(uv_px: Array) -> Spot:
     """A spot of which only the position (2,) is known: its noise is estimated from the calibration's residuals."""
-    return Spot(np.asarray(uv_px, dtype=float), np.zeros((2, 2)), 0.0, 0.0, 0, 0.0)
+    return Spot(np.asarray(uv_px, dtype=float), np.zeros((2, 2)), 0.0, 0)
 
 
 def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | NotFound:
@@ -64,19 +61,19 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
                 f"other {image.shape[1]} x {image.shape[0]} {image.dtype}; both by the same camera"
             )
         change = _brightest_change(image, laser_off)
-        found = _candidates(change, grey, _grey(laser_off), ceiling)
+        found = _candidates(change, _grey(laser_off), ceiling)
         if not isinstance(found, NotFound):
             return found
         # A shadow that moved between the images changes a large area: compare with the local background instead.
         middle = 0.5 * (change + np.float32(ceiling))
         local = 2.0 * (middle - _background(middle, ceiling))
-        again = _candidates(local, grey, _grey(laser_off), ceiling)
+        again = _candidates(local, _grey(laser_off), ceiling)
         return found if isinstance(again, NotFound) else again
-    return _candidates(grey - _background(grey, ceiling), grey, grey, ceiling)
+    return _candidates(grey - _background(grey, ceiling), grey, ceiling)
 
 
-def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> list[Spot] | NotFound:
-    """Candidates in a signal; ``ambient``: the light without the laser, as far as known; ``grey``: the image."""
+def _candidates(signal: Array, ambient: Array, ceiling: float) -> list[Spot] | NotFound:
+    """Candidates in a signal; ``ambient``: the light without the laser, as far as known."""
     # Quantisation counts as noise, too; the median is ambient light that changed between the images.
     signal = signal - np.median(signal)
     noise = max(1.4826 * float(np.median(np.abs(signal))), ceiling / 255.0 / np.sqrt(12.0))
@@ -87,7 +84,7 @@ def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> l
     if peak < limit:
         return NotFound(f"no spot: the brightest place is {peak / limit * DETECTION:.1f} times its noise; laser on?")
     blobs, bright = _blobs(smooth, max(limit, 0.02 * peak))
-    scene = _Scene(signal, grey, ambient, bright, ceiling, noise)
+    scene = _Scene(signal, ambient, bright, noise)
     spots = [_measured(scene, blob) for blob in blobs]
     largest = MOST_OF_IMAGE * signal.size
     kept = [s for s in spots if s is not None and s.area_px <= largest]
@@ -103,10 +100,8 @@ class _Scene:
     """What all candidates of an image share; ``bright`` is the mask of all candidates."""
 
     signal: Array
-    grey: Array
     ambient: Array
     bright: NDArray[np.bool_]
-    ceiling: float
     noise: float
 
 
@@ -149,8 +144,7 @@ def _measured(scene: _Scene, blob: _Blob) -> Spot | None:
     missing = weight[border] @ offset[border] / flux
     covariance += np.outer(missing, missing)
     covariance += _surroundings(scene, np.stack([v + top, u + left], axis=1), weight, offset)
-    saturated = float(np.mean(scene.grey[window][mask] >= SATURATED * scene.ceiling))
-    return Spot(centre, covariance, flux, peak, int(mask.sum()), saturated)
+    return Spot(centre, covariance, flux, int(mask.sum()))
 
 
 def _centre_covariance(

@@ -13,7 +13,6 @@ from gripmon.laser.beliefs import MotionTest, Places, Pulse
 from gripmon.laser.judgement import (
     UNIT,
     Moved,
-    SpotFault,
     SpotJudgement,
     SpotSeen,
     SpotWatchSettings,
@@ -25,7 +24,7 @@ from gripmon.laser.judgement import (
 from gripmon.laser.setup import LaserCalibration
 from gripmon.laser.spots import Spot
 from gripmon.laser.world import Prediction, Single, alone, calibrated, larger, predict, visible
-from gripmon.model.records import Alert, State, Verdict
+from gripmon.model.records import Alert, PulseFault, State, Verdict
 
 MOTION, VIEW = "motion", "view"
 """Topics of the alerts."""
@@ -63,7 +62,7 @@ class SpotWatch:
         self._test.reset()
         self._places = Places()
         self.state, self.verdict = State.ACQUIRING, Verdict.UNKNOWN
-        self._bad: list[SpotFault] = []
+        self._bad: list[PulseFault] = []
         self._good = 0
         self._odds = 0.0
         self._moved: Moved | None = None
@@ -74,23 +73,21 @@ class SpotWatch:
         self.pulses += 1
         self._stamp_ns = max(self._stamp_ns, seen.stamp_ns)
         if not np.isfinite(seen.base_T_ee).all():
-            return self._judged(seen, SpotFault.NOT_FINITE, "the arm's pose is not finite")
+            return self._judged(seen, PulseFault.NOT_FINITE, "the arm's pose is not finite")
         predicted = predict(self._calibrated.world, self._calibrated.camera, seen.base_T_ee)
         why_not = visible(self._calibrated, predicted, self._arm)
         if why_not is not None:
-            return self._judged(seen, SpotFault.NOT_FORESEEN, why_not)
+            return self._judged(seen, PulseFault.NOT_FORESEEN, why_not)
         if isinstance(seen.candidates, NotFound):
             return self._missing(seen, predicted, seen.candidates.reason)
         spots = [
-            (k, spot)
-            for k, spot in enumerate(seen.candidates)
-            if np.isfinite(spot.uv_px).all() and np.isfinite(spot.covariance_px).all()
+            spot for spot in seen.candidates if np.isfinite(spot.uv_px).all() and np.isfinite(spot.covariance_px).all()
         ]
         if not spots:
             return self._missing(seen, predicted, "no spot was found")
         return self._seen(seen, predicted, spots)
 
-    def _seen(self, seen: SpotSeen, predicted: Prediction, spots: list[tuple[int, Spot]]) -> SpotJudgement:
+    def _seen(self, seen: SpotSeen, predicted: Prediction, spots: list[Spot]) -> SpotJudgement:
         noise = self._calibrated.sigma_px**2 * np.eye(2)
         place = self._places.find(seen.base_T_ee)
         if place is None:
@@ -99,20 +96,19 @@ class SpotWatch:
         pulse = Pulse(
             seen.base_T_ee,
             place,
-            np.stack([spot.uv_px for _, spot in spots]),
-            np.stack([larger(spot.covariance_px, noise) for _, spot in spots]),
+            np.stack([spot.uv_px for spot in spots]),
+            np.stack([larger(spot.covariance_px, noise) for spot in spots]),
             predicted.uv_px,
             predicted.rows,
         )
         found = self._test.add(pulse)
         self._odds = found.odds
-        chosen, spot = spots[found.candidate]
-        single = alone(self._calibrated, predicted, seen.base_T_ee, spot, self._arm)
+        single = alone(self._calibrated, predicted, seen.base_T_ee, spots[found.candidate], self._arm)
         self._moved = how(self._test, self._calibrated, self._places.poses) if self._test.moved else None
         if found.believed:
-            return self._judged(seen, None, "", predicted, single, chosen)
+            return self._judged(seen, None, "", predicted, single)
         reason = outlier_text(single.off_px, single.square)
-        return self._judged(seen, SpotFault.OUTLIER, reason, predicted, single, chosen)
+        return self._judged(seen, PulseFault.OUTLIER, reason, predicted, single)
 
     def _missing(self, seen: SpotSeen, predicted: Prediction, reason: str) -> SpotJudgement:
         """No spot was found: that counts as a fault only where one should be visible."""
@@ -122,21 +118,20 @@ class SpotWatch:
         if (predicted.uv_px < margin).any() or (predicted.uv_px > size - 1.0 - margin).any():
             u, v = predicted.uv_px
             where = f"the spot should be at ({u:.0f}, {v:.0f}) px, not safely within the image, and was not seen"
-            return self._judged(seen, SpotFault.NOT_FORESEEN, where, predicted)
-        return self._judged(seen, SpotFault.NO_SPOT, reason, predicted)
+            return self._judged(seen, PulseFault.NOT_FORESEEN, where, predicted)
+        return self._judged(seen, PulseFault.NO_SPOT, reason, predicted)
 
     def _judged(
         self,
         seen: SpotSeen,
-        fault: SpotFault | None,
+        fault: PulseFault | None,
         reason: str,
         predicted: Prediction | None = None,
         single: Single | None = None,
-        chosen: int | None = None,
     ) -> SpotJudgement:
         if fault is None:
             self._bad, self._good = [], self._good + 1
-        elif fault in (SpotFault.NO_SPOT, SpotFault.OUTLIER):
+        elif fault in (PulseFault.NO_SPOT, PulseFault.OUTLIER):
             self._bad, self._good = [*self._bad, fault][-1000:], 0
         self.state, self.verdict = self._state(), Verdict.UNKNOWN
         self.verdict = self._verdict()
@@ -154,11 +149,11 @@ class SpotWatch:
             motion=None if moved is None else moved.motion,
             alerts=self._alerts(),
         )
-        return out if single is None else replace(out, chosen=chosen, **single._asdict())
+        return out if single is None else replace(out, **single._asdict())
 
     def _state(self) -> State:
         # Wrong spots may be the start of a motion, which the motion test explains better: they count half.
-        astray = sum(fault is SpotFault.OUTLIER for fault in self._bad)
+        astray = sum(fault is PulseFault.OUTLIER for fault in self._bad)
         if len(self._bad) - 0.5 * astray >= self.settings.pulses_until_lost:
             return State.LOST
         if self._test.moved:
@@ -214,10 +209,6 @@ class SpotWatch:
     @property
     def _now_s(self) -> float:
         return self._stamp_ns * 1e-9
-
-    def acknowledge(self, alert_id: str = "") -> tuple[Alert, ...]:
-        """Acknowledge an alert, or all; empty if there is none that isn't acknowledged."""
-        return self.book.acknowledge(alert_id)
 
     def reset(self) -> tuple[Alert, ...]:
         """Start again, as after a repair: the calibration is trusted again, alerts are cleared."""

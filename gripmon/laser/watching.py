@@ -12,7 +12,7 @@ import numpy as np
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.judge.policy import AlertBook
-from gripmon.laser.judgement import SpotFault, SpotJudgement, SpotSeen, SpotWatchSettings
+from gripmon.laser.judgement import SpotJudgement, SpotSeen, SpotWatchSettings
 from gripmon.laser.matching import Matcher, PulseSettings, ReportedPulse, Shown, mean_image
 from gripmon.laser.setup import LaserCalibration, setup_of
 from gripmon.laser.spots import SHARE_OF_PEAK, Spot, find_spots
@@ -32,7 +32,6 @@ from gripmon.model.records import (
     OpenAlert,
     PulseFault,
     Severity,
-    SpotGap,
     SpotRecord,
     State,
     Verdict,
@@ -69,14 +68,10 @@ class Displacement(NamedTuple):
 class PulsedWatch:
     """A pure function of the frames and pulses so far; it has no clock.  The ``matcher`` takes the pulses."""
 
-    def __init__(
-        self, calibration: LaserCalibration, watch: SpotWatchSettings, pulses: PulseSettings, *, name: str = ""
-    ) -> None:
-        """``name`` is the calibration's name in messages, by default derived from its contents.  Raises
-        CalibrationError for a calibration whose numbers make no set-up.
-        """
+    def __init__(self, calibration: LaserCalibration, watch: SpotWatchSettings, pulses: PulseSettings) -> None:
+        """Raises CalibrationError for a calibration whose numbers make no set-up."""
         camera = make_camera(calibration.camera)
-        self.reference_id = name or f"laser-{hashlib.sha256(to_json(calibration)).hexdigest()[:8]}"
+        self.reference_id = f"laser-{hashlib.sha256(to_json(calibration)).hexdigest()[:8]}"
         self.displacement: Displacement | None = None
         self.usable = 0
         self._watch = SpotWatch(calibration, watch)
@@ -104,7 +99,7 @@ class PulsedWatch:
 
     def acknowledge(self, alert_id: str = "") -> tuple[Alert, ...]:
         """Acknowledge an alert, or all; empty if there is none that isn't acknowledged."""
-        return (*self._watch.acknowledge(alert_id), *self._book.acknowledge(alert_id))
+        return (*self._watch.book.acknowledge(alert_id), *self._book.acknowledge(alert_id))
 
     def reset(self) -> tuple[Alert, ...]:
         """Trust the calibration again, as after a repair."""
@@ -136,7 +131,7 @@ class PulsedWatch:
         if not isinstance(found, NotFound) and (moving := self._moving(shown, found[0])):
             return replace(self.unjudged(shown, PulseFault.MOVING, moving), image=image)
         judged = self._watch.judge(SpotSeen(shown.pulse.stamp_ns, shown.pulse.base_T_ee, found))
-        if shown.dark is None and judged.fault in (SpotFault.NO_SPOT, SpotFault.OUTLIER):
+        if shown.dark is None and judged.fault in (PulseFault.NO_SPOT, PulseFault.OUTLIER):
             judged = replace(judged, reason=judged.reason + _NO_BACKGROUND)
         self.usable += judged.used
         if judged.motion is not None:
@@ -157,12 +152,10 @@ class PulsedWatch:
 
     def unjudged(self, shown: Shown, fault: PulseFault, reason: str) -> Outcome:
         """The result for a pulse that can't be judged."""
-        nothing = SpotJudgement(shown.pulse.stamp_ns, False, self.state, self.verdict, reason=reason)
-        return Outcome(self._record(shown, nothing, 0, fault))
+        nothing = SpotJudgement(shown.pulse.stamp_ns, False, self.state, self.verdict, fault=fault, reason=reason)
+        return Outcome(self._record(shown, nothing, 0))
 
-    def _record(
-        self, shown: Shown, judged: SpotJudgement, candidates: int, fault: PulseFault | None = None
-    ) -> SpotRecord:
+    def _record(self, shown: Shown, judged: SpotJudgement, candidates: int) -> SpotRecord:
         pulse, motion = shown.pulse, judged.motion
         return SpotRecord(
             pulse=pulse.number,
@@ -172,7 +165,7 @@ class PulsedWatch:
             verdict=judged.verdict,
             state=judged.state,
             used=judged.used,
-            fault=fault if judged.fault is None else PulseFault(judged.fault.value),
+            fault=judged.fault,
             reason=judged.reason or None,
             base_T_ee=_pose(pulse.base_T_ee),
             frames=len(shown.lit),
@@ -183,10 +176,7 @@ class PulsedWatch:
             off_px=_numbers(judged.off_px),
             off_covariance_px2=_numbers(judged.covariance_px),
             square=judged.square,
-            gaps=tuple(
-                SpotGap(gap.ways, _numbers(gap.gap_m), gap.sigma_m, gap.square, gap.freedom)
-                for gap in judged.disagreements
-            ),
+            gaps=judged.disagreements,
             probability_moved=judged.probability_moved,
             shift=None
             if motion is None

@@ -21,7 +21,7 @@ from gripmon.laser.setup import NAMES, LaserCalibration, LaserSetup, basis, orig
 from gripmon.laser.spots import Spot
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record, left_jacobians, perturb, skew
-from gripmon.model.records import Array
+from gripmon.model.records import Array, SpotGap
 
 PARAMETERS = (
     "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",
@@ -174,23 +174,6 @@ def larger(a: Array, b: Array) -> Array:
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class Disagreement:
-    """Two of the three ways to a spot: the gap between their results (m), the standard deviation of that distance along
-    the gap (m), and its normalised square with ``freedom`` degrees of freedom.
-    """
-
-    ways: tuple[str, str]
-    gap_m: Array
-    sigma_m: float
-    square: float
-    freedom: int
-
-    @property
-    def distance_m(self) -> float:
-        return float(np.linalg.norm(self.gap_m))
-
-
 BEAM_PLANE, RAY_PLANE, BEAM_RAY = "beam and plane", "ray and plane", "beam and ray"
 BEAM, RAY = "beam", "ray"
 INPUTS = COUNT + 2 + 6
@@ -232,7 +215,7 @@ def triangulate(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) ->
     )
 
 
-def disagreements(found: Triangulation, covariance: Array) -> tuple[Disagreement, ...]:
+def disagreements(found: Triangulation, covariance: Array) -> tuple[SpotGap, ...]:
     """Disagreements of the ways that are defined; ``covariance`` (21, 21) of the inputs."""
     spots, slopes = found.spots_base_m, found.slopes
     names = (BEAM_PLANE, RAY_PLANE, BEAM_RAY)
@@ -248,14 +231,16 @@ def disagreements(found: Triangulation, covariance: Array) -> tuple[Disagreement
     )
 
 
-def _disagreement(names: tuple[str, str], gap: Array, covariance: Array, freedom: int) -> Disagreement:
+def _disagreement(names: tuple[str, str], gap: Array, covariance: Array, freedom: int) -> SpotGap:
     """A gap lies in a plane or on a line: its ``freedom`` directions are those with the largest variance."""
     values, axes = np.linalg.eigh(covariance)
     along = axes.T @ gap
     square = float((along[-freedom:] ** 2 / values[-freedom:]).sum())
     size = float(np.linalg.norm(gap))
     direction = gap / size if size > 0.0 else axes[:, -1]
-    return Disagreement(names, gap, float(np.sqrt(max(direction @ covariance @ direction, 0.0))), square, freedom)
+    sigma_m = float(np.sqrt(max(direction @ covariance @ direction, 0.0)))
+    x, y, z = gap.tolist()
+    return SpotGap(names, (x, y, z), sigma_m, square, freedom)
 
 
 def _beam(world: World, base_T_ee: Array) -> _Line:
@@ -335,7 +320,7 @@ class Single(NamedTuple):
     covariance_px: Array
     square: float
     spots_base_m: Array
-    disagreements: tuple[Disagreement, ...]
+    disagreements: tuple[SpotGap, ...]
 
 
 def visible(calibrated: Calibrated, predicted: Prediction, arm: Array) -> str | None:

@@ -118,6 +118,19 @@ def invert(a_T_b: Array) -> Array:
     return make_transform(b_R_a, -b_R_a @ a_T_b[:3, 3])
 
 
+def inverse_jacobian(a_T_b: Array) -> Array:
+    """Jacobian (6, 6) of the error ``(rho', omega')`` of ``b_T_a`` by that of ``a_T_b``, each in its own axes.
+
+    From ``t_true = t + rho`` and ``R_true = exp(omega) R`` follows to first order, for the inverse, ``rho' = -R^T rho -
+    R^T [t]x omega`` and ``omega' = -R^T omega``.
+    """
+    turn = a_T_b[:3, :3].T
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = -turn
+    out[:3, 3:] = -turn @ skew(a_T_b[:3, 3])
+    return out
+
+
 def perturb(a_T_b: Array, xi: Array) -> Array:
     """Apply ``xi = (rho, omega)`` (6,): translation plus rho, rotation exp(omega) from the left, re-orthonormalised."""
     rotation = exp_rotation(xi[3:]) @ a_T_b[:3, :3]

@@ -36,13 +36,12 @@ _DETERMINED = 1e13
 
 @dataclass(frozen=True, slots=True)
 class Minimum(Generic[S]):
-    """Result of a minimisation: the best ``state`` with its ``cost``; ``converged`` is False if ``iterations`` ran out
-    before the cost settled.
+    """Result of a minimisation: the best ``state`` with its ``cost``; ``converged`` is False if the iterations
+    ran out before the cost settled.
     """
 
     state: S
     cost: float
-    iterations: int
     converged: bool
 
 
@@ -72,7 +71,7 @@ def minimise(
     Gauss-Newton.  Directions that the equations don't determine are left alone.
     """
     state, current = start, cost(start)
-    for iteration in range(1, iterations + 1):
+    for _ in range(iterations):
         normal, side = equations(state)
         size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
         scaled, wanted = normal / np.outer(size, size), side / size
@@ -83,13 +82,13 @@ def minimise(
             if new < current:
                 break
             if damping >= _MOST_DAMPING or step @ (wanted + damping * step) <= tolerance * current:
-                return Minimum(state, current, iteration, converged=True)
+                return Minimum(state, current, converged=True)
             damping *= 10.0
         gain = current - new
         state, current, damping = trial, new, max(0.1 * damping, _LEAST_DAMPING)
         if gain <= tolerance * current:
-            return Minimum(state, current, iteration, converged=True)
-    return Minimum(state, current, iterations, converged=False)
+            return Minimum(state, current, converged=True)
+    return Minimum(state, current, converged=False)
 
 
 def fit(

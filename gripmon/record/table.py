@@ -6,7 +6,7 @@ Needs only NumPy and msgspec; of JSON lines only the fields of the columns are d
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -108,14 +108,6 @@ class FrameTable:
 
     def __len__(self) -> int:
         return len(self.seq)
-
-    @staticmethod
-    def from_records(records: Iterable[FrameRecord | Line]) -> FrameTable:
-        """One row per record, in order."""
-        builder = TableBuilder()
-        for record in records:
-            builder.add(record)
-        return TableBuilder.join([builder])
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameTable:
         """Some rows: indexes, a mask or a slice."""

@@ -222,7 +222,7 @@ class TeachSession:
             self._reader.join(10.0)
 
     def state(self) -> State:
-        setup, gripper, labels = self._setup, self._setup.gripper, self._labels
+        setup, gripper = self._setup, self._setup.gripper
         opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
         finger = gripper.point_finger[gripper.corner_points].tolist()
         return State(
@@ -233,17 +233,11 @@ class TeachSession:
             fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
             places={name: _place(at) for name, at in setup.first_places(opening_m).items()},
             pictures=self._infos(),
-            live=labels.live,
             has_jaw=gripper.has_jaw,
             jaw_m=(gripper.jaw_min_m, gripper.jaw_nominal_m, gripper.jaw_max_m),
             gripper=gripper.name,
-            reference=labels.reference,
             needed=0 if setup.reference is not None else FEWEST_PUT,
-            robot=labels.robot,
-            camera_name=labels.camera_name,
-            fixed_names=labels.fixed_names,
-            folder=labels.folder,
-            files=labels.files,
+            **vars(self._labels),
         )
 
     def look(self, put: Put) -> Reply:

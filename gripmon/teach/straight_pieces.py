@@ -56,7 +56,6 @@ class Chain:
     closed: bool
     corner: NDArray[np.bool_]
     rms_px: Array
-    cut: tuple[bool, bool]
 
     @property
     def pieces(self) -> list[tuple[int, int]]:
@@ -394,7 +393,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     stacked = np.stack(vertices, axis=1)  # (1 + f, v, 2)
     uv = from_ideal_px(camera, stacked.reshape(-1, 2)).reshape(stacked.shape)
     rms = np.array([line.rms_px for line in lines])
-    return Chain(uv[0], uv[1:], closed, np.array(corner), rms, (not closed, not closed))
+    return Chain(uv[0], uv[1:], closed, np.array(corner), rms)
 
 
 def _turn(a: Array, b: Array) -> float:

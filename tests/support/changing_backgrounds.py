@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Light, Sensor
@@ -41,7 +42,7 @@ def moving_robot(
         jaw=JawScript(knots=() if opening_m is None else ((0.0, opening_m),)),
     )
     pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
-    return Simulator(CAMERA, gripper or load_gripper(BOX_FINGERS), pose, scenario, seed)
+    return Simulator(CAMERA, gripper or read_gripper(BOX_FINGERS), pose, scenario, seed)
 
 
 def images_of(simulator: Simulator, count: int = 30) -> list[NDArray[np.uint8]]:

@@ -28,7 +28,7 @@ class Bench:
 
     def run(self, **more: object) -> int:
         return run(
-            self.monitor, self.source, self.network, self.recording, self.settings,
+            self.monitor, source=self.source, publisher=self.network, recorder=self.recording, settings=self.settings,
             robot="arm", camera="wrist", **more,  # type: ignore[arg-type]
         )  # fmt: skip
 

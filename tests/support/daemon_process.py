@@ -40,10 +40,10 @@ if __name__ == "__main__":
         sys.exit(
             run(
                 ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
-                SilentSource(FRAMES_PER_S) if kind == "silent" else TickingSource(FRAMES_PER_S),
-                publisher,
-                Listener(),
-                DaemonSettings(no_camera_alert_after_s=0.5),
+                source=SilentSource(FRAMES_PER_S) if kind == "silent" else TickingSource(FRAMES_PER_S),
+                publisher=publisher,
+                recorder=Listener(),
+                settings=DaemonSettings(no_camera_alert_after_s=0.5),
                 robot="arm",
                 camera="wrist",
                 estimates=Path(rest[0]) if rest else None,

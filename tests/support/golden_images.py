@@ -15,10 +15,11 @@ import numpy as np
 import yaml
 
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, Defocus, FingerLook, JawScript, Light, Sensor
+from support.grippers import gripper_from_dict
 from support.meters import moved
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 

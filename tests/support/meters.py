@@ -7,8 +7,9 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, FisheyeLens, LensSettings, make_camera
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.simulate import Scenario, Simulator
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
@@ -47,7 +48,7 @@ def difference(from_T: np.ndarray, to_T: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def box_gripper(sharp: bool = True) -> Gripper:
-    return sharp_gripper() if sharp else load_gripper(BOX_FINGERS)
+    return sharp_gripper() if sharp else read_gripper(BOX_FINGERS)
 
 
 def meter(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.record.table import FrameTable, TableBuilder
 from gripmon.record.write import ProcessRecorder, open_recorder
 from support.recorded import (
     CAMERA,
@@ -65,6 +66,14 @@ OWN_ALERT = AlertRecord(
 )
 SECOND = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2, origin="recalibration", parent="first")
 COMMAND = RecordedCommand(START_NS + 5, 100, CommandName.UNDO, "", done=True, text="back to first")
+
+
+def table_of(records: Iterable[FrameRecord]) -> FrameTable:
+    """One row per record, in order."""
+    builder = TableBuilder()
+    for each in records:
+        builder.add(each)
+    return TableBuilder.join([builder])
 
 
 @dataclass(frozen=True)

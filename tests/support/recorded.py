@@ -12,9 +12,9 @@ import cv2
 import msgspec
 import numpy as np
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, to_record
-from gripmon.model.gripper import load_gripper
 from gripmon.model.records import (
     Alert,
     CornerFault,
@@ -42,7 +42,7 @@ CAMERA = make_camera(
         width_px=WIDTH_PX, height_px=HEIGHT_PX, fx_px=400.0, fy_px=400.0, cx_px=159.5, cy_px=119.5, kappa_per_px2=0.0
     )
 )
-GRIPPER = load_gripper(Path(__file__).resolve().parents[2] / "configs" / "grippers" / "two_box_fingers.yaml")
+GRIPPER = read_gripper(Path(__file__).resolve().parents[2] / "configs" / "grippers" / "two_box_fingers.yaml")
 COVARIANCE = tuple(np.diag([1e-10, 4e-10, 9e-10, 1e-8, 1e-8, 1e-8]).ravel().tolist())
 REFERENCE = ReferenceRecord(
     reference_id="first",

@@ -84,10 +84,10 @@ def _main() -> int:
         print("open", flush=True)
         return run(
             ScriptedMonitor(lambda _: answer),
-            TickingSource(told["fps"]),
-            publisher,
-            Listener(),
-            DaemonSettings(),
+            source=TickingSource(told["fps"]),
+            publisher=publisher,
+            recorder=Listener(),
+            settings=DaemonSettings(),
             robot=told["robot"],
             camera=told["camera"],
         )

@@ -31,6 +31,7 @@ from gripmon.model.records import (
 from gripmon.record.recordings import Picture
 from gripmon.record.table import FrameTable
 from support import recorded
+from support.playback_runs import table_of
 
 FPS = 50
 PERIOD_NS = 1_000_000_000 // FPS
@@ -61,7 +62,7 @@ class Run:
 
     @property
     def frames(self) -> FrameTable:
-        return FrameTable.from_records(self.records)
+        return table_of(self.records)
 
     @property
     def alerts(self) -> tuple[AlertRecord, ...]:

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 import yaml
 
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
-from gripmon.model.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, Sensor
 
@@ -66,7 +67,7 @@ def simulator(
     sharp: bool = True,
     cam_T_grip: np.ndarray | None = None,
 ) -> Simulator:
-    gripper = sharp_gripper() if sharp else load_gripper(BOX_FINGERS)
+    gripper = sharp_gripper() if sharp else read_gripper(BOX_FINGERS)
     return Simulator(
         make_camera(lens), gripper, nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip, scenario, seed
     )

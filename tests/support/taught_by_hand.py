@@ -11,11 +11,11 @@ import numpy as np
 import yaml
 
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
+from gripmon.daemon.config import builtin_config, read_gripper
 from gripmon.io.sources.files import read_image
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import to_record
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 
@@ -82,4 +82,4 @@ def make_rig(folder: Path) -> Rig:
     assert main(["simulate", str(folder / "table.yaml"), *made_with]) == 0
     truth = json.loads((folder / "sim" / "truth.jsonl").read_text().splitlines()[0])
     camera = make_camera(msgspec.convert(values["camera"], LensSettings))
-    return Rig(folder, camera, load_gripper(folder / "gripper.yaml"), truth)
+    return Rig(folder, camera, read_gripper(folder / "gripper.yaml"), truth)

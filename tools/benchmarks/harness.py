@@ -164,10 +164,10 @@ def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder:
     warm_up()
     run(
         Monitor(config.camera, config.gripper, settings.monitor, config.reference),
-        source,
-        _TimedPublisher(publisher, source),
-        Recorder() if recorder is None else recorder,
-        settings.daemon,
+        source=source,
+        publisher=_TimedPublisher(publisher, source),
+        recorder=Recorder() if recorder is None else recorder,
+        settings=settings.daemon,
         robot=settings.robot,
         camera=settings.camera_name,
     )

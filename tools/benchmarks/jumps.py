@@ -19,9 +19,10 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from benchmarks.machine import ROOT
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import perturb
-from gripmon.model.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Frame
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.disturbance import full_motion
@@ -123,8 +124,8 @@ def rigs() -> dict[str, Rig]:
         coefficients=(0.03, -0.02, 0.004, 0.0),
     )
     return {
-        "boxes": Rig(paper, load_gripper(folder / "two_box_fingers.yaml"), 0.118, 32.0, (0.016, 0.044)),
-        "tapered": Rig(brown, load_gripper(folder / "adaptive_arc_fingers.yaml"), 0.125, 36.0, (0.02, 0.055)),
+        "boxes": Rig(paper, read_gripper(folder / "two_box_fingers.yaml"), 0.118, 32.0, (0.016, 0.044)),
+        "tapered": Rig(brown, read_gripper(folder / "adaptive_arc_fingers.yaml"), 0.125, 36.0, (0.02, 0.055)),
         "wedges": Rig(fisheye, wedge_fingers(), 0.095, 38.0, (0.012, 0.044)),
     }
 

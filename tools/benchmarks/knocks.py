@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from benchmarks import jumps
 from benchmarks.machine import ROOT
 from benchmarks.scenes import tapered_gripper
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.model.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import (
@@ -227,8 +228,8 @@ def _grippers() -> dict[str, Gripper]:
     folder = ROOT / "configs" / "grippers"
     box = yaml.safe_load((folder / "two_box_fingers.yaml").read_text(encoding="utf-8"))
     return {
-        "boxes": load_gripper(folder / "two_box_fingers.yaml"),
-        "arcs": load_gripper(folder / "adaptive_arc_fingers.yaml"),
+        "boxes": read_gripper(folder / "two_box_fingers.yaml"),
+        "arcs": read_gripper(folder / "adaptive_arc_fingers.yaml"),
         "wedges": jumps.wedge_fingers(),
         "tapered": Gripper(msgspec.convert(tapered_gripper(box), GripperModel)),
     }

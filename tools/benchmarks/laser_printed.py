@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import (
@@ -24,7 +25,6 @@ from gripmon.laser.closed_form import (
     _shifts_of,
     beam_in_hand,
     check_spots,
-    mean_rotation,
     positions,
     usable_orientations,
 )
@@ -48,7 +48,7 @@ def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None
     ]
     normal = plane_normal([o.matrix for o in usable])
     chosen = consistent_beams([beam_candidates(o.matrix, normal) for o in usable])
-    cam_R_base = mean_rotation([c.cam_R_base for c in chosen])
+    cam_R_base = Rotation.from_matrix([c.cam_R_base for c in chosen]).mean().as_matrix()
     direction = beam_in_hand([c.beam_cam for c in chosen], [o.base_R_ee for o in usable], cam_R_base)
     point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction)
     distance = plane_distance(usable, scales, normal, base_T_ee)
@@ -136,7 +136,7 @@ def consistent_beams(candidates: Sequence[tuple[BeamCandidate, BeamCandidate]]) 
     for pair in candidates:
         for start in pair:
             chosen = [min(p, key=lambda c: -float(np.trace(c.cam_R_base.T @ start.cam_R_base))) for p in candidates]
-            mean = mean_rotation([c.cam_R_base for c in chosen])
+            mean = Rotation.from_matrix([c.cam_R_base for c in chosen]).mean().as_matrix()
             apart = sum(3.0 - float(np.trace(c.cam_R_base.T @ mean)) for c in chosen)
             if apart < least:
                 best, least = chosen, apart

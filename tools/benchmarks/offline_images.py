@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.model.targets import Chequerboard, CircleGrid
 from gripmon.simulate import Scenario, Simulator
@@ -32,7 +33,7 @@ _GRIPPER = ROOT / "configs" / "grippers" / "two_box_fingers.yaml"
 
 @functools.lru_cache(maxsize=1)
 def gripper() -> Gripper:
-    return load_gripper(_GRIPPER)
+    return read_gripper(_GRIPPER)
 
 
 @dataclass(frozen=True)

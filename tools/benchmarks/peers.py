@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from benchmarks.machine import ROOT
 from benchmarks.scenes import Sequence
 from benchmarks.tags import FingerTags, TagTracker, apriltags_installed, pose_of
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 
 Grey = NDArray[np.uint8]
@@ -205,7 +206,7 @@ def _with_faces(gripper: Gripper) -> Gripper:
     """The gripper itself, or, if its file tells no faces, the box gripper if its corners are the same."""
     if gripper.faces:
         return gripper
-    box = load_gripper(_BOX_GRIPPER)
+    box = read_gripper(_BOX_GRIPPER)
     own = dict(zip(gripper.corner_ids, gripper.points_grip_m(None)[gripper.corner_points], strict=True))
     of_box = dict(zip(box.corner_ids, box.points_grip_m(None)[box.corner_points], strict=True))
     if any(name not in of_box or not np.allclose(of_box[name], xyz, atol=1e-6) for name, xyz in own.items()):

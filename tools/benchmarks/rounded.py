@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper, GripperModel
 
 Array = NDArray[np.float64]
 
@@ -136,4 +137,5 @@ def _outwards(points: dict[str, Any], finger: str, names: list[str]) -> dict[str
 
 def _gripper(points: dict[str, Any], edges: dict[str, Any], faces: list[dict[str, Any]]) -> Gripper:
     parts = {"points": points, "edges": edges, "faces": faces}
-    return gripper_from_dict({"name": "rounded_fingers", "jaw": JAW, "fingers": MOTION, **parts})
+    value = {"name": "rounded_fingers", "jaw": JAW, "fingers": MOTION, **parts}
+    return Gripper(msgspec.convert(value, GripperModel))

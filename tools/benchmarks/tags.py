@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
+from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import make_transform
-from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 
 _CELLS = 8  # across a 36h11 tag, its black border included
@@ -274,4 +275,4 @@ def _dictionary() -> Any:
 
 @cache
 def _box_tags() -> FingerTags:
-    return FingerTags(load_gripper(ROOT / "configs" / "grippers" / "two_box_fingers.yaml"))
+    return FingerTags(read_gripper(ROOT / "configs" / "grippers" / "two_box_fingers.yaml"))

@@ -37,7 +37,7 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
         values["camera"] = _as_read(read_camera(paths["camera"]).camera)
     if isinstance(values.get("reference"), str):
         paths["reference"] = _file(path, "reference", values["reference"])
-        hand_eye = read_hand_eye(paths["reference"])
+        hand_eye = read_document(paths["reference"], HandEyeCalibration)
         values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
     return values, CalibrationFiles(paths, hand_eye)
 
@@ -50,11 +50,6 @@ def read_camera(path: Path) -> CameraCalibration:
         wrong = f"has {len(calibration.covariance)} values for {count} parameters"
         raise ConfigError(path, "covariance", wrong, f"{count * count} values, row by row")
     return calibration
-
-
-def read_hand_eye(path: Path) -> HandEyeCalibration:
-    """A hand/eye calibration.  Raises :class:`ConfigError`."""
-    return read_document(path, HandEyeCalibration)
 
 
 def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Gripper) -> Fault | None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import msgspec
 
 from gripmon import __version__
-from gripmon.daemon.config.calibrated import read_hand_eye
+from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.daemon.config.checks import reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import as_yaml, read_document, read_yaml
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.records import Array, Transform
@@ -33,7 +33,7 @@ def reference_text(path: Path) -> tuple[bytes, str]:
         raise InputError(f"{path}: there is no such file; {_RIGHT}")
     values = read_yaml(path)
     if "schema" in values:
-        read_hand_eye(path)
+        read_document(path, HandEyeCalibration)
         return path.read_bytes(), "a file of gripmon calibrate plane"
     if all(name in values for name in _FLANGE):
         flange_T_cam, flange_T_tcp = (_transform(path, values.pop(name), name) for name in _FLANGE)

@@ -16,13 +16,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.daemon.calibrations import read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
-from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
+from gripmon.daemon.config.calibrated import mismatch
 from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
-from gripmon.daemon.config.yaml_file import read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -211,7 +212,7 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
 
 def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
     """A file of ``gripmon calibrate plane``, which must be made with this camera (if given) and this gripper."""
-    made = read_hand_eye(path)
+    made = read_document(path, HandEyeCalibration)
     fault = mismatch(made, lens or made.camera, gripper)
     if fault is not None:
         wrong = fault.wrong.replace("the configuration's camera", "the one given")

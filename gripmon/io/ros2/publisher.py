@@ -14,7 +14,7 @@ from gripmon.io.publish import Publisher
 from gripmon.io.ros2.names import Layout, Qos, Ros2Settings
 from gripmon.io.ros2.node import DIAGNOSTICS, POSE, TF, Node, TopicPublisher, prepare, typestore
 from gripmon.io.wire import Link
-from gripmon.model.geometry import from_record, invert, skew, to_record
+from gripmon.model.geometry import from_record, inverse_jacobian, invert, to_record
 from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
@@ -45,15 +45,9 @@ _OF_SEVERITY = {Severity.INFO: OK, Severity.WARNING: WARN, Severity.ERROR: ERROR
 def inverse(cam_T_grip: Transform, covariance: Iterable[float]) -> tuple[Transform, Array]:
     """``grip_T_cam`` and its covariance (36,), of the camera's position in gripper axes (m²), then of the rotation
     error vector in gripper axes (rad²).
-
-    From ``t_true = t + rho`` and ``R_true = exp(omega) R`` follows to first order, for the inverse, ``rho' = -R^T rho -
-    R^T [t]x omega`` and ``omega' = -R^T omega``.
     """
     transform = from_record(cam_T_grip)
-    rotation = transform[:3, :3].T
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = -rotation
-    jacobian[:3, 3:] = -rotation @ skew(transform[:3, 3])
+    jacobian = inverse_jacobian(transform)
     matrix = np.fromiter(covariance, float, 36).reshape(6, 6)
     return to_record(invert(transform)), (jacobian @ matrix @ jacobian.T).ravel()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from gripmon.model.gripper.core import LARGEST_EXTENT_M, EdgeView, Gripper, on_a_line
 from gripmon.model.gripper.faces import FaceLoop
-from gripmon.model.gripper.file import gripper_from_dict, load_gripper
 from gripmon.model.gripper.model import (
     UNTOLD_BEVEL_M,
     WIDEST_BEVEL_M,
@@ -44,7 +43,5 @@ __all__ = [
     "RoundModel",
     "TableMotion",
     "contents_of",
-    "gripper_from_dict",
-    "load_gripper",
     "on_a_line",
 ]

@@ -15,11 +15,10 @@ _JOINT_BGR = (200, 200, 200)
 _WIDTH_PX = 1200
 
 
-def draw_gripper(camera: Camera, gripper: Gripper, cam_T_grip: Array, image: Image | None = None) -> Image:
-    """Draw outlines orange, creases green, corners by name, other points grey; over ``image`` if there is one."""
-    if image is None:
-        image = np.full((camera.height_px, camera.width_px), _PAPER, np.uint8)
-    canvas = Canvas(image, max(1, -(-_WIDTH_PX // camera.width_px)))
+def draw_gripper(camera: Camera, gripper: Gripper, cam_T_grip: Array) -> Image:
+    """Draw outlines orange, creases green, corners by name, other points grey."""
+    paper = np.full((camera.height_px, camera.width_px), _PAPER, np.uint8)
+    canvas = Canvas(paper, max(1, -(-_WIDTH_PX // camera.width_px)))
     eye_grip_m = invert(cam_T_grip)[:3, 3]
     points_m = gripper.points_grip_m(None, eye_grip_m)
     view = gripper.edge_view(points_m, eye_grip_m)

@@ -55,10 +55,6 @@ class Surface:
         a, b, c = np.moveaxis(self.points_m[self.triangles], 1, 0)
         return bool(np.einsum("ti,ti->", a, np.cross(b, c)) > 0.0)
 
-    def shifted(self, offset_m: Array) -> Surface:
-        """The surface shifted by ``offset_m`` (3,)."""
-        return replace(self, points_m=self.points_m + offset_m)
-
     def flat(self) -> bool:
         """Whether every patch is flat."""
         return all(self.off_plane_m(k) <= FLAT_M for k in range(int(self.patch.max(initial=-1)) + 1))
