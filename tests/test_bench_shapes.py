@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,15 @@ def test_the_border_leaves_as_much_of_the_fingers_as_is_said():
     pose = shapes._pose(camera, cut=True)
     tip = pose[:3, :3] @ np.array([0.022, -0.008, 0.0]) + pose[:3, 3]
     assert camera.project(tip[None])[0, 1] == pytest.approx(575.0 - shapes.SHOWN_PX, abs=0.1)
+
+
+def test_fingers_of_which_forty_pixels_show_are_valid_while_the_camera_stands(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Every pixel up to the border counts for the rotation."""
+    from benchmarks import shapes
+
+    monkeypatch.setattr(shapes, "SHOWN_PX", 40.0)
+    (cut,) = (shape for shape in shapes.shapes() if shape.name == "sharp box, cut by the border")
+    seen = shapes.track(cut, 0.0, 0.0, 20, 1, tmp_path)
+    assert seen.valid >= 0.8 * seen.frames and not seen.misleading and not seen.beyond

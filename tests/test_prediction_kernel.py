@@ -60,14 +60,14 @@ def test_the_longest_run_inside_the_image_is_sampled():
     """Edges that leave the image and come back, that lie outside, that aren't wanted or are too short."""
     rng = np.random.default_rng(3)
     uv_px = np.cumsum(rng.uniform(0.0, 3.0, (60, 65, 2)), axis=1)
-    inside = np.cumsum(rng.uniform(size=(60, 65)) < 0.06, axis=1) % 2 == 0
-    inside[0], inside[1] = False, True
-    uv_px[2, 30:34] = np.nan  # the lens maps it nowhere
-    inside[2, 30:34] = False
+    outside = np.cumsum(rng.uniform(size=(60, 65)) < 0.06, axis=1) % 2 == 1
+    outside[0], outside[1] = True, False
+    inside_px = np.where(outside, -1.0, 1.0) * rng.uniform(0.1, 3.0, (60, 65))
+    uv_px[2, 30:34] = inside_px[2, 30:34] = np.nan  # the lens maps it nowhere
     uv_px[3, 20:40] = uv_px[3, 20]  # seen end on
     wanted = rng.uniform(size=60) < 0.8
     wanted[:4] = True
-    one, other = (by.sampled_ranges(uv_px, inside, wanted, 4.0, 8.0) for by in (prediction_kernel, by_numpy))
+    one, other = (by.sampled_ranges(uv_px, inside_px, wanted, 4.0, 8.0) for by in (prediction_kernel, by_numpy))
     np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-7)
     assert not one[0].any() and one[1, 2] > 100.0 and not one[~wanted].any()
     assert 20 < np.count_nonzero(one[:, 2]) < 60

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
-from support.meters import measure, meter
+from support.meters import box_gripper, measure, meter
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 from support.watched import pose_of, reference_of, watch
 
@@ -17,7 +18,7 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import prediction_kernel
-from gripmon.track.edges.prediction import ROWS, SHORTEST_PX, independent_part, lay_out
+from gripmon.track.edges.prediction import BORDER_PX, ROWS, SHORTEST_PX, independent_part, lay_out
 from gripmon.track.edges.profiles import find_candidates, profile_offsets_px, read_profiles
 from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
@@ -69,6 +70,39 @@ def test_edges_of_eight_pixels_and_more_have_the_profiles_that_they_need_to_be_s
     assert np.count_nonzero(short & (length_px > 8.0)) >= 14
     assert (counts[short & (length_px > 8.0)] >= 5).all() and not counts[length_px < 7.9].any()
     assert (counts[short] <= length_px[short] - MARGIN_PX + 1.0).all(), "no closer than a pixel"
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.5])
+def test_an_edge_that_the_border_cuts_is_sampled_up_to_it(turn_rad: float):
+    """As far as whole search lines lie in the image, by a dense walk along the edge; no margin is left at the cut."""
+    camera, model, settings = make_camera(PAPER_LENS), box_gripper(), SamplingSettings()
+    pose = nominal_cam_T_grip()
+    pose[:3, :3] = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix() @ pose[:3, :3]
+    tips_px = camera.project(model.points_grip_m()[model.corner_points] @ pose[:3, :3].T + pose[:3, 3])
+    pose[1, 3] += (camera.height_px - 40.0 - tips_px[:, 1].max()) * pose[2, 3] / camera.fy_px
+    layout = lay_out(camera, model, pose, model.jaw_nominal_m, settings)
+    last_px, cut = np.array([camera.width_px - 1.0, camera.height_px - 1.0]), 0
+    for edge in layout.edges.tolist():
+        ends_m = model.points_grip_m()[model.edge_points[edge]] @ pose[:3, :3].T + pose[:3, 3]
+        dense = np.linspace(0.0, 1.0, 4001)
+        uv_px = camera.project(ends_m[0] + dense[:, None] * (ends_m[1] - ends_m[0]))
+        way = np.gradient(uv_px, axis=0)
+        to_px = settings.reach_px * way[:, ::-1] * (-1.0, 1.0) / np.linalg.norm(way, axis=1)[:, None]
+        whole = np.all(
+            [
+                ((uv + 1e-9 >= BORDER_PX) & (uv <= last_px - BORDER_PX)).all(axis=1)
+                for uv in (uv_px - to_px, uv_px + to_px)
+            ],
+            axis=0,
+        )
+        at = layout.fraction[layout.edge == edge]
+        for end, sampled in ((0, at.min()), (-1, at.max())):
+            if not whole[end]:
+                border = dense[whole][end]
+                left_px = abs(sampled - border) * np.linalg.norm(np.diff(uv_px, axis=0), axis=1).sum()
+                assert left_px < 0.1
+                cut += 1
+    assert cut >= 3
 
 
 @pytest.mark.parametrize(("length_px", "count"), [(4.0, 5), (8.0, 9), (8.0, 4), (16.0, 6)])

@@ -29,7 +29,7 @@ from gripmon.teach.visibility import (
     over_jaw,
     see,
 )
-from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
+from gripmon.track.edges.prediction import BORDER_PX, lay_out
 
 NEAR = nominal_cam_T_grip(tcp_m=(0.008, -0.003, 0.046))  # so near that open jaws leave the image
 
@@ -72,7 +72,7 @@ def enough_by_brute_force(lens: LensSettings, gripper: Gripper, cam_T_grip: np.n
     cam_m = corners_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     uv_px = pixels_by_opencv(lens, cam_m)
     last_px = np.array([lens.width_px - 1, lens.height_px - 1])
-    inside = ((uv_px >= CORNER_MARGIN_PX) & (uv_px <= last_px - CORNER_MARGIN_PX)).all(axis=1) & (cam_m[:, 2] > 0.0)
+    inside = ((uv_px >= BORDER_PX) & (uv_px <= last_px - BORDER_PX)).all(axis=1) & (cam_m[:, 2] > 0.0)
     eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
     soup = [corners for _, corners in triangles(gripper, points_m)]
     seen = 0

@@ -38,8 +38,8 @@ FEWEST_SAMPLES = 4
 it.
 """
 
-CORNER_MARGIN_PX = 2.0
-"""A corner closer than this to the image's border counts as outside."""
+BORDER_PX = 2.0
+"""What is closer than this to the image's border counts as outside: a search line reads the rows beside it, too."""
 
 SHORTEST_PX = float(FEWEST_AGREEING - 1)
 """A shorter edge isn't sampled: the least number of inliers would be closer than a pixel."""
@@ -208,9 +208,9 @@ def lay_out(
     uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
     margin_px = settings.end_margin_px
     shortest_px = max(margin_px, SHORTEST_PX)  # the margin is zoomed, and so is what has to be left
-    ranges = prediction_kernel.sampled_ranges(
-        uv, _inside(camera, uv, settings.reach_px), wanted, margin_px, shortest_px
-    )
+    ways = np.gradient(uv, axis=1)
+    inside_px = _lines_inside_px(camera, uv, _unit(ways[..., ::-1] * (-1.0, 1.0)), settings.reach_px) - BORDER_PX
+    ranges = prediction_kernel.sampled_ranges(uv, inside_px, wanted, margin_px, shortest_px)
     lengths = ranges[:, 2]
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
@@ -232,10 +232,16 @@ def lay_out(
     )
 
 
-def _inside(camera: Camera, uv_px: Array, margin_px: float) -> NDArray[np.bool_]:
-    limit = np.array([camera.width_px - 1.0, camera.height_px - 1.0]) - margin_px
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1))
+def _inside_px(camera: Camera, uv_px: Array) -> Array:
+    """(...,) how far places (..., 2) lie inside the image's border, px; outside if negative, NaN where they are."""
+    size = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    return np.asarray(np.minimum(uv_px, size - uv_px).min(axis=-1))
+
+
+def _lines_inside_px(camera: Camera, uv_px: Array, normal: Array, reach_px: float) -> Array:
+    """(...,) the same of the nearer end of search lines that reach so far to either side along the ``normal``."""
+    to_px = reach_px * normal
+    return np.minimum(_inside_px(camera, uv_px - to_px), _inside_px(camera, uv_px + to_px))
 
 
 def predict(
@@ -274,7 +280,7 @@ def predict(
         uv = uv + (layout.as_taught[edge] * shift_px)[:, None] * normal
         spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
         edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
-    ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0)
+    ok = _lines_inside_px(camera, uv, normal, float(np.abs(offsets_px[[0, -1]]).max())) >= 1.0
     xy, way_xy, along, origin, direction = prediction_kernel.ideal_lines(
         points_cam_m, edge, layout.edges, layout.first, len(gripper.edge_ids)
     )
@@ -333,7 +339,8 @@ def _predict_corners(
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
     cam_m = points_grip_m[gripper.corner_points] @ rotation.T + translation
     uv_px, d_uv = camera.project_with_jacobian(cam_m)
-    inside = _inside(camera, uv_px, CORNER_MARGIN_PX)
+    with np.errstate(invalid="ignore"):
+        inside = _inside_px(camera, uv_px) >= BORDER_PX
     return PredictedCorners(
         cam_m=cam_m,
         jaw_rate=rate[gripper.corner_points],
@@ -346,5 +353,6 @@ def _predict_corners(
 
 
 def _unit(ways: Array) -> Array:
-    """(n, 2) of length 1."""
-    return np.asarray(ways / np.sqrt(np.einsum("ni,ni->n", ways, ways))[:, None])
+    """(..., 2) of length 1; NaN where there is no way."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(ways / np.sqrt(np.einsum("...i,...i->...", ways, ways))[..., None])

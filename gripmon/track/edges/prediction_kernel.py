@@ -16,15 +16,16 @@ from gripmon.model.compiled import compiled
 
 
 @compiled
-def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
-    """First and last fraction and length in px (e, 3) of the longest run of each edge that is ``inside`` the image
-    (e, c), less the margin; zeros if nothing is left, or the edge isn't ``wanted`` (e,).  Of edges ``uv_px`` (e, c, 2)
-    c places, evenly spaced; the lens maps those that are NaN nowhere.
+def sampled_ranges(uv_px: Any, inside_px: Any, wanted: Any, margin_px: float, shortest_px: float) -> Any:
+    """First and last fraction and length in px (e, 3) of the longest run of each edge inside the image, less the margin
+    at the edge's own ends: none where the image's border cuts it.  Zeros if nothing is left, or the edge isn't
+    ``wanted`` (e,).  Of edges ``uv_px`` (e, c, 2) c places, evenly spaced, which lie ``inside_px`` (e, c) inside the
+    border, outside if negative; the lens maps those that are NaN nowhere.
 
     Of a short edge the margin leaves twice ``shortest_px``, if half of it suffices for that, or else what half of it
     leaves.
     """
-    edges, places = inside.shape
+    edges, places = inside_px.shape
     out, travelled = np.zeros((edges, 3)), np.empty(places)
     for e in range(edges):
         if not wanted[e]:
@@ -34,19 +35,32 @@ def sampled_ranges(uv_px: Any, inside: Any, wanted: Any, margin_px: float, short
             dx, dy = uv_px[e, k, 0] - uv_px[e, k - 1, 0], uv_px[e, k, 1] - uv_px[e, k - 1, 1]
             step_px = math.sqrt(dx * dx + dy * dy)
             travelled[k] = travelled[k - 1] + (step_px if step_px == step_px else 0.0)
-        first, last, longest, begin = 0, -1, -1.0, 0
+        first, last, longest, low, ends = 0.0, 0.0, -1.0, 0.0, 0
         for k in range(places):
-            if not inside[e, k]:
-                begin = k + 1
-            elif (k + 1 == places or not inside[e, k + 1]) and travelled[k] - travelled[begin] > longest:
-                first, last, longest = begin, k, travelled[k] - travelled[begin]
-        if last < first:
+            if not inside_px[e, k] >= 0.0:
+                continue
+            if k == 0 or not inside_px[e, k - 1] >= 0.0:
+                low, own = travelled[k] - _beyond(travelled, inside_px[e], k, k - 1), int(k == 0)
+            if k + 1 == places or not inside_px[e, k + 1] >= 0.0:
+                high = travelled[k] + _beyond(travelled, inside_px[e], k, k + 1)
+                if high - low > longest:
+                    first, last, longest, ends = low, high, high - low, own + 2 * int(k + 1 == places)
+        if longest < 0.0:
             continue
-        off_px = min(margin_px, max(0.5 * margin_px, 0.5 * longest - shortest_px))
-        low, high = travelled[first] + off_px, travelled[last] - off_px
+        count = ends % 2 + ends // 2
+        off_px = min(margin_px, max(0.5 * margin_px, (longest - 2.0 * shortest_px) / max(count, 1)))
+        low, high = first + off_px * (ends % 2), last - off_px * (ends // 2)
         if high - low >= shortest_px:
             out[e, 0], out[e, 1], out[e, 2] = _fraction(travelled, low), _fraction(travelled, high), high - low
     return out
+
+
+@compiled
+def _beyond(travelled: Any, inside_px: Any, k: int, other: int) -> float:
+    """How far (px) an edge goes on from its place ``k`` to the border, before an ``other`` place that lies outside."""
+    if other < 0 or other >= len(travelled) or not inside_px[other] < 0.0:
+        return 0.0
+    return abs(travelled[other] - travelled[k]) * inside_px[k] / (inside_px[k] - inside_px[other])
 
 
 @compiled

@@ -57,7 +57,7 @@ def _predict(prediction: Prediction) -> None:
     """The geometry behind such a prediction."""
     by, layout, ends, d_uv = prediction_kernel, prediction.layout, np.ones((4, 3)), np.ones((4, 2, 3))
     translation, places = prediction.cam_T_grip[:3, 3], np.zeros((1, 2, 2))
-    by.sampled_ranges(places, np.ones((1, 2), dtype=bool), np.ones(1, dtype=bool), 0.0, 1.0)
+    by.sampled_ranges(places, np.ones((1, 2)), np.ones(1, dtype=bool), 0.0, 1.0)
     lever, points_cam_m = by.levers(ends, ends, layout.fraction, translation)
     by.across_edges(d_uv, ends, ends, lever, layout.edge, np.zeros((1, 3)), True)
     by.maps(prediction.uv_px, prediction.normal, *np.zeros((2, 3), dtype=np.float32))

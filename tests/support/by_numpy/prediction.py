@@ -14,26 +14,36 @@ def largest_motion(jacobian: Array, xi: Array) -> float:
 
 
 def sampled_ranges(
-    uv_px: Array, inside: NDArray[np.bool_], wanted: NDArray[np.bool_], margin_px: float, shortest_px: float
+    uv_px: Array, inside_px: Array, wanted: NDArray[np.bool_], margin_px: float, shortest_px: float
 ) -> Array:
-    """First and last fraction and length in px (e, 3) of the longest run of each edge inside the image, less the
-    margin; zeros if nothing is left, or the edge isn't ``wanted`` (e,).  Of edges (e, c, 2) c places, evenly spaced.
+    """First and last fraction and length in px (e, 3) of the longest run of each edge inside the image, less the margin
+    at the edge's own ends: none where the image's border cuts it.  Zeros if nothing is left, or the edge isn't
+    ``wanted`` (e,).  Of edges (e, c, 2) c places, evenly spaced, which lie ``inside_px`` (e, c) inside the border.
 
     Of a short edge the margin leaves twice ``shortest_px``, if half of it suffices for that, or else what half of it
     leaves.
     """
-    out = np.zeros((len(uv_px), 3))
+    out, places = np.zeros((len(uv_px), 3)), uv_px.shape[1]
     step_px = np.linalg.norm(np.diff(uv_px, axis=1), axis=2)
+    with np.errstate(invalid="ignore"):
+        inside = inside_px >= 0.0
     for e in np.flatnonzero(wanted & inside.any(axis=1)).tolist():
         change = np.flatnonzero(np.diff(np.concatenate([[0], inside[e].astype(np.int8), [0]])))
-        starts, stops = change[::2], change[1::2] - 1
         travelled = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step_px[e]))])
-        run = int(np.argmax(travelled[stops] - travelled[starts]))
-        begin, end = travelled[starts[run]], travelled[stops[run]]
-        off_px = min(margin_px, max(0.5 * margin_px, 0.5 * (end - begin) - shortest_px))
-        low, high = begin + off_px, end - off_px
+        runs = []
+        for start, stop in zip(change[::2].tolist(), (change[1::2] - 1).tolist(), strict=True):
+            ends = [travelled[start], travelled[stop]]
+            for i, (own, other) in enumerate(((start, start - 1), (stop, stop + 1))):
+                if 0 <= other < places and inside_px[e, other] < 0.0:
+                    falls = [inside_px[e, other], inside_px[e, own]]
+                    ends[i] = float(np.interp(0.0, falls, [travelled[other], travelled[own]]))
+            runs.append((*ends, start == 0, stop == places - 1))
+        begin, end, *own_ends = runs[int(np.argmax([run[1] - run[0] for run in runs]))]
+        each_px = (end - begin - 2.0 * shortest_px) / max(sum(own_ends), 1)
+        off_px = min(margin_px, max(0.5 * margin_px, each_px))
+        low, high = begin + off_px * own_ends[0], end - off_px * own_ends[1]
         if high - low >= shortest_px:
-            fractions = np.interp([low, high], travelled, np.linspace(0.0, 1.0, inside.shape[1]))
+            fractions = np.interp([low, high], travelled, np.linspace(0.0, 1.0, places))
             out[e] = fractions[0], fractions[1], high - low
     return out
 
