@@ -471,6 +471,23 @@ def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():
     assert slid.protection.position_m > 2.0 * proven.protection.position_m
 
 
+@pytest.mark.parametrize("seen_along", [False, True])
+def test_three_corners_prove_a_pose_elsewhere_where_the_fingers_are_seen_along_themselves(
+    seen_along: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """As many as where it is expected; else four are needed, two of each finger."""
+    monkeypatch.setattr(Integrity, "_knocked", lambda *_: False)
+    monitor = new_monitor()
+    for frame in frames_of(scene(BEGINS + 3, mount=(along_fingers(3e-3, BEGINS_S),)))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    for corners, proven in (([2, 1], seen_along), ([2, 2], True), ([1, 1], False)):
+        ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
+        trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along)
+        assert trust.displaced and trust.proven == proven
+
+
 def test_a_pose_that_stays_slid_after_it_was_measured_again_is_not_followed(monkeypatch: pytest.MonkeyPatch):
     slid = StripsSeen(np.array([0.0, 0.0, 1e-4]))
     assert not knock_followed(monkeypatch, _along=lambda *_, **__: slid)

@@ -165,7 +165,8 @@ class Integrity:
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
         if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
-            trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+            ends = self._tracker.ends(frame, measurement)
+            trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
             self._ends_seen = trust.proven
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
         measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
@@ -173,7 +174,7 @@ class Integrity:
             return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
-            strictly = weigh(measurement, cam_T_grip, ends, now_s)
+            strictly = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
@@ -251,7 +252,7 @@ class Integrity:
         measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
         ends, along = self._tracker.ends(frame, measurement), self._along(frame, measurement, cam_T_grip)
-        trust = self._weigher.weigh(measurement, cam_T_grip, ends, now_s)
+        trust = self._weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
         return _Candidate(measurement, cam_T_grip, covariance, along, trust)
 
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:

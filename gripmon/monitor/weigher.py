@@ -127,12 +127,14 @@ class Weigher:
         explained: int | None = None,
         look_seen: bool = False,
         slid: bool = False,
+        seen_along: bool = False,
     ) -> Trust:
         """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
-        strips are seen elsewhere, so that something else was taken for their ends.
+        strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
+        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -145,8 +147,8 @@ class Weigher:
         displaced = not holds[0] and explained is None
         # The proof: fingers' ends that can't be something else.
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
-        proven = not slid and _proven(ends, displaced, again)
-        may_have_slid = self._lone and self._may_have_slid(measurement, cam_T_grip, displaced)
+        proven = not slid and _proven(ends, displaced and not seen_along, again)
+        may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
         # The priors: only that of the ends depends on the frame.  Then the probability that only the frame shows where
@@ -347,13 +349,13 @@ class Weigher:
         return self._kept[key]
 
 
-def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
-    """Whether the fingers' ends are seen as ends.  Where the gripper is expected, fewer corners suffice; where its
+def _proven(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
+    """Whether the fingers' ends are seen as ends.  Not ``elsewhere`` than expected fewer corners suffice; where the
     innovation is within noise (``again``), one of each finger.
     """
     if ends is None:
         return False
-    expected = not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
+    expected = not elsewhere and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
     return ends.sure or expected or (again and ends.at_each)
 
 
