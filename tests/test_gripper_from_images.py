@@ -16,11 +16,12 @@ import gripmon
 from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.cli import main
 from gripmon.daemon.config import read_gripper
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, ReferenceRecord
+from gripmon.model.records import Array, Frame, ReferenceRecord, Verdict
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
@@ -28,7 +29,7 @@ from gripmon.simulate.scenario import Background, Creep, FingerLook, FingerMark,
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
 
 DEPTH_M = 0.115
-DISTANCE = (DEPTH_M, 0.002)
+DISTANCE = (DEPTH_M, 5e-5)
 
 
 def chains_of(found: GripperFromImages) -> list:
@@ -117,6 +118,28 @@ def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> No
     across, along = (np.sqrt(np.square(e[2][:, :2]).sum(axis=1).mean()) for e in (exact, made))
     assert along <= max(2.0 * across, 3e-5)
     assert np.quantile(np.abs(made[2][:, 2]), 0.95) <= max(2.0 * np.quantile(np.abs(exact[2][:, 2]), 0.95), 1e-4)
+
+
+def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
+    """Told a distance that is a standard deviation too long: nothing in an image can show that."""
+    images, exact = box
+    sigma_m = 0.002
+    found = gripper_from_images(images, PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
+    assert found.gripper.model.scale_sigma == pytest.approx(sigma_m / (DEPTH_M + sigma_m), rel=0.05)
+    scenario = Scenario(name="x", duration_s=2.0, fps=15.0, background=Background(kind="printed"))
+    simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
+    reference = reference_of(found.cam_T_grip, found.covariance)
+    for limit_m, verdict in ((1e-3, Verdict.SUSPECT), (2e-2, Verdict.VALID)):
+        settings = MonitorSettings(policy=PolicySettings(alert_limit_m=limit_m))
+        monitor, verdicts = Monitor(CAMERA, found.gripper, settings, reference), set()
+        for k in range(2, 30):
+            shown = simulator.frame(k)
+            record = monitor.process(Frame(shown.seq, shown.stamp_ns, shown.image, None, shown.name))
+            assert record.cam_T_grip is not None and record.protection is not None
+            off_m = np.linalg.norm(from_record(record.cam_T_grip)[:3, 3] - exact.cam_T_grip[:3, 3])
+            assert 0.8 * sigma_m < off_m < record.protection.position_m < 6.0 * sigma_m
+            verdicts |= {record.verdict} if k > 2 else set()
+        assert verdicts == {verdict}
 
 
 def _curve_ends(gripper: Gripper, true_T_grip: Array) -> Array:

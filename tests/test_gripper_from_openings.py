@@ -22,7 +22,7 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
 from gripmon.teach.matte import grey_levels, image_sets
 
-DISTANCE = (0.115, 0.002)
+DISTANCE = (0.115, 5e-5)
 GAP_M, LENGTH_M = 0.034, 0.06
 POSE = nominal_cam_T_grip()
 

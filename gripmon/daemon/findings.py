@@ -241,16 +241,17 @@ def _promise(report: Forecast) -> Finding | None:
     if share > 1.0:
         text = f"no transform can be valid: good to {good}, beyond {limit}; valid needs {report.needed}"
         return Finding("WARN", "promise", text)
-    if _USUAL_SPREAD * share > 1.0:
-        often = "one frame in twenty is twice as uncertain: some will be suspect"
-        return Finding("WARN", "promise", f"good to {good}, close to {limit}; {often}")
-    text, untold = f"a transform is good to {good}, within {limit}", report.protection_if_bevelled
-    if untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad):
+    close = _USUAL_SPREAD * share > 1.0
+    text = f"good to {good}, close to {limit}" if close else f"a transform is good to {good}, within {limit}"
+    untold = report.protection_if_bevelled
+    bevelled = untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad)
+    if untold is not None and bevelled:
         may = f"{_millimetres(untold.position_m)} and {_degrees(untold.rotation_rad)}"
         text += f", if all edges are as sharp as the gripper file says; to {may} with bevels of "
         text += f"{_millimetres(UNTOLD_BEVEL_M)}: teach them (gripmon teach), or state them (bevel_m)"
-        return Finding("WARN", "promise", text)
-    return Finding("OK", "promise", text)
+    if close:
+        text += "; one frame in twenty is twice as uncertain: some will be suspect"
+    return Finding("WARN" if close or bevelled else "OK", "promise", text)
 
 
 def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:

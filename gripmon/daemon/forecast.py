@@ -47,6 +47,7 @@ from gripmon.teach.accuracy import (
     Promise,
     UnknownOpening,
     accuracy_over_jaw,
+    as_if_measured,
     as_if_taught,
     forecast_accuracy,
     forecast_frame,
@@ -133,8 +134,12 @@ def promise_of(config: Config) -> Promise | None:
     found = Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, policy)
     if found.reachable:
         return found
-    once_taught = Promise.of(forecast_frame(rig_once_taught(config), cam_T_grip, opening_m).protection, policy)
-    return replace(found, teaching_helps=once_taught.reachable)
+    measured = rig._replace(gripper=as_if_measured(rig.gripper))
+    once_taught, once_measured = (
+        Promise.of(forecast_frame(each, cam_T_grip, opening_m).protection, policy)
+        for each in (rig_once_taught(config), measured)
+    )
+    return replace(found, teaching_helps=once_taught.reachable, size_helps=once_measured.reachable)
 
 
 def limits_warning(config: Config) -> str | None:

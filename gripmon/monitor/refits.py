@@ -70,13 +70,23 @@ class Known(NamedTuple):
 
 class ModelError(NamedTuple):
     """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
-    (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to.
+    (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to; ``scale_sigma``: standard deviation of a
+    factor on all its lengths.
     """
 
     sigma_m: float
     axis_grip: Array
     finger: NDArray[np.intp]
     fingers: int
+    scale_sigma: float
+
+    def scaled(self, fits: Separation, cam_T_grip: Array) -> Separation:
+        """The fits near a pose (4, 4) with one more part: a larger gripper farther away gives the same image."""
+        if not self.scale_sigma:
+            return fits
+        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
+        farther = np.broadcast_to(farther, (len(fits.of_model), 1, 6))
+        return fits._replace(of_model=np.concatenate([fits.of_model, farther], axis=1))
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
@@ -97,7 +107,7 @@ class Refits:
         known: Known | None = None,
     ):
         """``floor`` (6, 6): covariance of the error that no averaging removes."""
-        self.hypotheses, self._floor = hypotheses, floor
+        self.hypotheses, self.model, self._floor = hypotheses, model, floor
         normal = self._normal = measurement.normal
         xi = measurement.consensus.xi
         self._fit_T = perturb(measurement.prediction.cam_T_grip, xi[:6])
@@ -140,7 +150,7 @@ class Refits:
         """
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
-        fits = Separation(away, fits.covariance + self._floor, fits.of_model)
+        fits = self.model.scaled(Separation(away, fits.covariance + self._floor, fits.of_model), cam_T_grip)
         return Doubts.of(self.hypotheses.name, prior, fits, SIGMA_INFLATION)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
@@ -259,6 +269,7 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
+        told = fits.model.scaled(told, cam_T_grip)
         return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
 
 

@@ -376,7 +376,8 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
-    return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids))
+    fingers = gripper.edge_finger, len(gripper.finger_ids)
+    return ModelError(tracker.model_sigma_m, tracker.finger_axis, *fingers, gripper.model.scale_sigma)
 
 
 def foresee_protection(

@@ -152,6 +152,11 @@ def as_if_taught(gripper: Gripper) -> Gripper:
     return Gripper(structs.replace(model, edges=edges))
 
 
+def as_if_measured(gripper: Gripper) -> Gripper:
+    """The same gripper with its size known."""
+    return Gripper(structs.replace(gripper.model, scale_sigma=0.0))
+
+
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
     """One standard deviation (6,) along the least certain direction of a covariance (6, 6), a radian counting as
     ``lever_m``.
@@ -206,13 +211,14 @@ class ForecastMeter(FingertipMeter):
 class Promise:
     """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
     whether transforms of a view can be valid, before there is any image.  ``teaching_helps``: they can't, but could
-    once the bevels that the gripper file states were taught.
+    once the bevels that the gripper file states were taught; ``size_helps``: if its ``scale_sigma`` were 0.
     """
 
     protection: Protection
     alert_limit_m: float
     alert_limit_rad: float
     teaching_helps: bool = False
+    size_helps: bool = False
 
     @classmethod
     def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
@@ -241,7 +247,8 @@ class Promise:
         if bound.rotation_rad > self.alert_limit_rad:
             needed_rad = _rounded_up(bound.rotation_rad)
             parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
-        return "its bevels taught (gripmon teach), or " * self.teaching_helps + " and ".join(parts)
+        size = "its size known better (scale_sigma in the gripper file: a length or a plate), or " * self.size_helps
+        return "its bevels taught (gripmon teach), or " * self.teaching_helps + size + " and ".join(parts)
 
     def text(self) -> str:
         """One line for a person."""

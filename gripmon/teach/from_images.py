@@ -174,7 +174,7 @@ def gripper_from_images(
             f"openings: the gap between the fingertips, as the images show it, {1e3 * min(opening_m, *moved):.2f} to "
             f"{1e3 * max(opening_m, *moved):.2f} mm; the jaws may report another number"
         )
-    described = Seen(made, seen, outlines, placed, moved, scale[0], opening_m)
+    described = Seen(made, seen, outlines, placed, moved, *scale, opening_m)
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
     except GripperError as error:
@@ -360,7 +360,8 @@ def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mappi
         depth, sigma = scale
         notes.append(
             f"lengths are known to {100.0 * sigma / depth:.1f} %: the fingertips are {1e3 * depth:.1f} +- "
-            f"{1e3 * sigma:.1f} mm from the camera, which is in the reference's covariance"
+            f"{1e3 * sigma:.2g} mm from the camera, which is in the reference's covariance and in every protection "
+            "level (scale_sigma)"
         )
     if placed.flat:
         notes.append(

@@ -35,7 +35,9 @@ LONGEST_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Seen:
-    """What images show of a gripper.  ``depth_m`` of the TCP; ``moved``: by opening, each finger's motion."""
+    """What images show of a gripper.  ``depth_m`` of the TCP, with the standard deviation ``depth_sigma_m``; ``moved``:
+    by opening, each finger's motion.
+    """
 
     camera: Camera
     opening: OpeningSeen
@@ -43,6 +45,7 @@ class Seen:
     placed: Placed
     moved: Mapping[float, Sequence[FingerMoved]]
     depth_m: float
+    depth_sigma_m: float
     opening_m: float | None
 
 
@@ -143,7 +146,10 @@ def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: lis
             f"{inner_dropped} inner edges aren't used: they don't start from a corner, so their depth isn't known"
         )
     fingers, jaw = _jaw(seen)
-    return GripperModel(name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, provenance=provenance)
+    scale_sigma = float(f"{seen.depth_sigma_m / seen.depth_m:.2g}")
+    return GripperModel(
+        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=scale_sigma, provenance=provenance
+    )
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:

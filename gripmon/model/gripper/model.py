@@ -94,12 +94,22 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     edges: dict[str, EdgeModel]
     jaw: JawModel | None = None
     faces: tuple[FaceModel, ...] = ()
+    scale_sigma: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="standard deviation of a factor on all lengths, for the protection level; 0: the unit is exact",
+        ),
+    ] = 0.0
     provenance: Provenance | None = None
 
 
 def contents_of(model: GripperModel) -> dict[str, Any]:
     """The contents of a gripper file that describe the gripper, for digests: all but its provenance."""
     contents = {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
+    if not contents["scale_sigma"]:  # as digests from before it
+        del contents["scale_sigma"]
     for edge in contents["edges"].values():
         if not edge["via"]:  # digests of grippers without curves date from before curves
             del edge["via"]
