@@ -126,3 +126,28 @@ def test_the_columns_stand_however_long_the_names_are(tmp_path: Path, capsys: py
     rows = [line for line in out if " px  " in line and ")" in line and "mm" in line and line.startswith(" " * 11)]
     corners = [row for row in rows if row.lstrip().startswith(("L_", "R_", "the_"))]
     assert len(corners) == 8 and len({row.index(" px  ") for row in corners}) == 1
+
+
+@pytest.mark.parametrize(("fy_px", "level"), [(965.0, "OK"), (505.0, "WARN"), (1190.0, "WARN")])
+def test_pixels_that_are_not_square_are_a_warning(
+    fy_px: float, level: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """As where a focal length was mixed up with another number, or an image was squeezed."""
+    _, found = checked(written(tmp_path, camera={"fy_px": fy_px}), capsys)
+    assert found["camera"][0] == level and ("fy 505 px make pixels" in found["camera"][1]) == (fy_px == 505.0)
+
+
+@pytest.mark.parametrize(("left", "right", "said"), [(-0.5, 0.5, None), (0.5, 0.5, "0 mm"), (-1.0, 1.0, "2 mm")])
+def test_fingers_that_do_not_open_by_what_the_jaw_reports_are_a_warning(
+    left: float, right: float, said: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    model = yaml.safe_load((DEMO.parent / "grippers" / "two_box_fingers.yaml").read_text())
+    for name, share in zip(model["fingers"], (left, right), strict=True):
+        model["fingers"][name]["motion"]["axis"] = [share, 0.0, 0.0]
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(model))
+    path = written(tmp_path)
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "gripper": "gripper.yaml"}))
+    _, found = checked(path, capsys)
+    assert ("jaw" in found) == (said is not None)
+    if said is not None:
+        assert found["jaw"][0] == "WARN" and f"apart by {said} for each millimetre of opening" in found["jaw"][1]

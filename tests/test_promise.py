@@ -17,6 +17,7 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
+from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import Protection
 from gripmon.teach.accuracy import Promise, forecast_frame, with_bevels
 from gripmon.teach.visibility import Rig
@@ -92,8 +93,13 @@ def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
 
 @pytest.mark.parametrize(
     ("setting", "doubts"),
-    [("policy: {}", True), ("policy: {alert_limit_m: 0.005}", False), ("model_sigma_m: 0", False)],
-    ids=["as shipped", "the task bears more", "the file is exact"],
+    [
+        ("policy: {}", True),
+        ("policy: {alert_limit_m: 0.0005}", True),
+        ("policy: {alert_limit_m: 0.005}", False),
+        ("model_sigma_m: 0", False),
+    ],
+    ids=["as shipped", "close to the limit", "the task bears more", "the file is exact"],
 )
 def test_check_says_what_bevels_would_do_that_no_one_has_stated(
     setting: str, doubts: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -123,6 +129,20 @@ def test_edges_that_images_have_shown_are_as_they_show(
     path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
     assert main(["check", str(path)]) == 0
     assert ("bevels of 0.2 mm" in capsys.readouterr().out) == doubts
+
+
+def test_a_size_that_is_known_less_well_promises_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A larger gripper farther away gives the same image: normal errors of the distance, at the stated risk."""
+    usual, cam_T_grip = rig()
+    model = msgspec.structs.replace(usual.gripper.model, scale_sigma=0.01)
+    foreseen = forecast_frame(usual._replace(gripper=Gripper(model)), cam_T_grip, None).protection
+    assert foreseen.position_m == pytest.approx(4.42 * 0.01 * np.linalg.norm(cam_T_grip[:3, 3]), rel=0.1)
+    file = DEMO.parent / "grippers" / "two_box_fingers.yaml"
+    (tmp_path / "gripper.yaml").write_text(f"{file.read_text()}\nscale_sigma: 0.01\n")
+    path = tmp_path / "config.yaml"
+    path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
+    assert main(["check", str(path)]) == 0
+    assert "valid needs its size known better (scale_sigma in the gripper file" in capsys.readouterr().out
 
 
 def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():

@@ -38,6 +38,8 @@ Level = Literal["OK", "WARN", "FAIL"]
 
 _USUAL_SPREAD = 2.0
 """Ratio of the bound of one frame in twenty to the predicted one (no unit; docs/integrity.md)."""
+_NOT_SQUARE = 0.02
+"""Ratio of two focal lengths beside 1 that no calibration of a sensor with square pixels is off by (no unit)."""
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
 _CONNECT_S = 2.0
 
@@ -160,6 +162,7 @@ def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
 def _of_wrist(forecast: Forecast) -> list[Finding | None]:
     return [
         _camera(forecast.camera),
+        _jaw_motion(forecast.gripper),
         _mount(forecast.reference),
         _view(forecast.in_view, forecast.gripper),
         _promise(forecast),
@@ -192,7 +195,21 @@ def _source(source: SourceReport) -> Finding:
 def _camera(camera: CameraValues) -> Finding:
     across, down = (math.degrees(angle) for angle in camera.field_of_view_rad)
     size = f"{camera.width_px} x {camera.height_px} px"
-    return Finding("OK", "camera", f"{size}, {camera.model} lens, sees about {across:.0f}° x {down:.0f}°")
+    text = f"{size}, {camera.model} lens, sees about {across:.0f}° x {down:.0f}°"
+    if abs(camera.fx_px / camera.fy_px - 1.0) > _NOT_SQUARE:
+        lengths = f"fx {camera.fx_px:g} px and fy {camera.fy_px:g} px"
+        odd = f"{lengths} make pixels that aren't square, as those of nearly all sensors are: is one of them wrong?"
+        return Finding("WARN", "camera", f"{text}; {odd}")
+    return Finding("OK", "camera", text)
+
+
+def _jaw_motion(gripper: GripperValues) -> Finding | None:
+    """The opening is the distance between the fingers, up to a constant."""
+    rate = gripper.apart_rate
+    if rate is None or 0.5 < rate < 1.5:
+        return None
+    text = f"two fingers move apart by {rate:.2g} mm for each millimetre of opening, where 1 is expected"
+    return Finding("WARN", "jaw", f"{text}: check the signs and lengths of `axis` (fingers in {gripper.file})")
 
 
 def _mount(reference: ReferenceValues) -> Finding:

@@ -37,7 +37,7 @@ from gripmon.daemon.forecast_values import (
 from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
-from gripmon.model.gripper import UNTOLD_BEVEL_M
+from gripmon.model.gripper import UNTOLD_BEVEL_M, Gripper
 from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.records import Protection
 from gripmon.monitor import CORNER_COUNTS
@@ -96,6 +96,7 @@ def forecast(config: Config) -> Forecast:
             faces=len(gripper.faces),
             notes=tuple(gripper.notes),
             jaw_m=(gripper.jaw_min_m, gripper.jaw_max_m) if gripper.has_jaw else None,
+            apart_rate=_apart_rate(gripper),
         ),
         reference=_reference(config),
         taught=_taught(config),
@@ -112,6 +113,16 @@ def forecast(config: Config) -> Forecast:
         promise="nothing: too little is in view" if found is None else found.text(),
         in_view=_in_view(config),
     )
+
+
+def _apart_rate(gripper: Gripper) -> float | None:
+    if not gripper.has_jaw or len(gripper.finger_ids) != 2:
+        return None
+    places_m, moves = gripper.points_grip_m(), gripper.point_motion(gripper.jaw_nominal_m)
+    (one_m, one), (other_m, other) = (
+        (places_m[own].mean(axis=0), moves[own][0]) for own in (gripper.point_finger == k for k in range(2))
+    )
+    return float((other - one) @ (other_m - one_m) / np.linalg.norm(other_m - one_m))
 
 
 def rig_of(config: Config) -> Rig:

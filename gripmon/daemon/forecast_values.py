@@ -38,7 +38,9 @@ class CameraValues(msgspec.Struct, frozen=True):
 
 
 class GripperValues(msgspec.Struct, frozen=True):
-    """The gripper file and its counts; ``jaw_m``: the jaw's travel, None without a jaw."""
+    """The gripper file and its counts; ``jaw_m``: the jaw's travel, None without a jaw; ``apart_rate``: by how much two
+    fingers move apart for each metre of opening, None for other numbers of fingers.
+    """
 
     file: str
     name: str
@@ -47,6 +49,7 @@ class GripperValues(msgspec.Struct, frozen=True):
     faces: int
     notes: tuple[str, ...]
     jaw_m: tuple[float, float] | None
+    apart_rate: float | None = None
 
 
 class ReferenceValues(msgspec.Struct, frozen=True):
