@@ -145,12 +145,9 @@ def promise_of(config: Config) -> Promise | None:
     found = Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, policy)
     if found.reachable:
         return found
-    measured = rig._replace(gripper=as_if_measured(rig.gripper))
-    once_taught, once_measured = (
-        Promise.of(forecast_frame(each, cam_T_grip, opening_m).protection, policy)
-        for each in (rig_once_taught(config), measured)
-    )
-    return replace(found, teaching_helps=once_taught.reachable, size_helps=once_measured.reachable)
+    known = as_if_measured(rig).items()
+    could = (Promise.of(forecast_frame(each, cam_T_grip, opening_m).protection, policy).reachable for _, each in known)
+    return replace(found, remedies=tuple(words for (words, _), it_could in zip(known, could, strict=True) if it_could))
 
 
 def limits_warning(config: Config) -> str | None:

@@ -69,9 +69,10 @@ class Known(NamedTuple):
 
 
 class ModelError(NamedTuple):
-    """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
-    (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to; ``scale_sigma``: standard deviation of a
-    factor on all its lengths.
+    """What all frames are off by, because the gripper file is: each finger longer or shorter by a standard deviation
+    ``sigma_m``, along ``axis_grip`` (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to;
+    ``scale_sigma``: standard deviation of a factor on all its lengths.  ``taught`` (k, 6): errors of the reference, by
+    one standard deviation along each of k directions, which taught edges have in them.
     """
 
     sigma_m: float
@@ -79,14 +80,19 @@ class ModelError(NamedTuple):
     finger: NDArray[np.intp]
     fingers: int
     scale_sigma: float
+    taught: Array
 
-    def scaled(self, fits: Separation, cam_T_grip: Array) -> Separation:
-        """The fits near a pose (4, 4) with one more part: a larger gripper farther away gives the same image."""
-        if not self.scale_sigma:
+    def shared(self, fits: Separation, cam_T_grip: Array) -> Separation:
+        """The fits near a pose (4, 4) with what none of them tells: a larger gripper farther away gives the same image,
+        and taught edges are where the reference had them.
+        """
+        parts = self.taught
+        if self.scale_sigma:
+            parts = np.vstack([parts, [[*(self.scale_sigma * cam_T_grip[:3, 3]), 0.0, 0.0, 0.0]]])
+        if not len(parts):
             return fits
-        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
-        farther = np.broadcast_to(farther, (len(fits.of_model), 1, 6))
-        return fits._replace(of_model=np.concatenate([fits.of_model, farther], axis=1))
+        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
+        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
@@ -150,7 +156,7 @@ class Refits:
         """
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
-        fits = self.model.scaled(Separation(away, fits.covariance + self._floor, fits.of_model), cam_T_grip)
+        fits = self.model.shared(Separation(away, fits.covariance + self._floor, fits.of_model), cam_T_grip)
         return Doubts.of(self.hypotheses.name, prior, fits, SIGMA_INFLATION)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
@@ -269,7 +275,7 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
-        told = fits.model.scaled(told, cam_T_grip)
+        told = fits.model.shared(told, cam_T_grip)
         return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
 
 

@@ -123,6 +123,8 @@ class Tracker:
         """(6, 6) covariance of the systematic error that no averaging removes."""
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
         """Standard deviation of each finger's length in the model, m; 0 with taught edges, which include it."""
+        self.taught_error: Array = np.zeros((0, 6)) if taught is None else taught.reference_error
+        """(k, 6) error of the reference that taught edges have in them, by a standard deviation along k directions."""
         self.taught_digest = "" if taught is None else taught.digest
         """Digest of the taught edges; empty without any."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # as measured last

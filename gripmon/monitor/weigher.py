@@ -377,7 +377,8 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
     fingers = gripper.edge_finger, len(gripper.finger_ids)
-    return ModelError(tracker.model_sigma_m, tracker.finger_axis, *fingers, gripper.model.scale_sigma)
+    scale = gripper.model.scale_sigma
+    return ModelError(tracker.model_sigma_m, tracker.finger_axis, *fingers, scale, tracker.taught_error)
 
 
 def foresee_protection(

@@ -152,9 +152,19 @@ def as_if_taught(gripper: Gripper) -> Gripper:
     return Gripper(structs.replace(model, edges=edges))
 
 
-def as_if_measured(gripper: Gripper) -> Gripper:
-    """The same gripper with its size known."""
-    return Gripper(structs.replace(gripper.model, scale_sigma=0.0))
+def as_if_measured(rig: Rig) -> dict[str, Rig]:
+    """The same, with each of the things known that a person can measure, by words for it."""
+    model, taught = rig.gripper.model, rig.taught
+    known = {}
+    if taught is None:
+        known["its bevels taught (gripmon teach)"] = rig._replace(gripper=as_if_taught(rig.gripper))
+    elif len(taught.reference_error):
+        exact = replace(taught, reference_error=np.zeros((0, 6)))
+        known["a reference known better (reference.covariance: gripmon calibrate plane)"] = rig._replace(taught=exact)
+    if model.scale_sigma:
+        exact_size = Gripper(structs.replace(model, scale_sigma=0.0))
+        known["its size known better (scale_sigma in the gripper file)"] = rig._replace(gripper=exact_size)
+    return known
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
@@ -210,15 +220,14 @@ class ForecastMeter(FingertipMeter):
 @dataclass(frozen=True, slots=True)
 class Promise:
     """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
-    whether transforms of a view can be valid, before there is any image.  ``teaching_helps``: they can't, but could
-    once the bevels that the gripper file states were taught; ``size_helps``: if its ``scale_sigma`` were 0.
+    whether transforms of a view can be valid, before there is any image.  ``remedies``: where they can't, each thing
+    after which they could.
     """
 
     protection: Protection
     alert_limit_m: float
     alert_limit_rad: float
-    teaching_helps: bool = False
-    size_helps: bool = False
+    remedies: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
@@ -237,7 +246,7 @@ class Promise:
 
     @property
     def needed(self) -> str:
-        """The alert limits that this view can keep, or teaching, where the present ones are too tight; else empty."""
+        """Remedies, or the alert limits that this view can keep, where the present ones are too tight; else empty."""
         bound, parts = self.protection, []
         if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
             return "more of the fingers in view: no limit would do"
@@ -247,8 +256,7 @@ class Promise:
         if bound.rotation_rad > self.alert_limit_rad:
             needed_rad = _rounded_up(bound.rotation_rad)
             parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
-        size = "its size known better (scale_sigma in the gripper file: a length or a plate), or " * self.size_helps
-        return "its bevels taught (gripmon teach), or " * self.teaching_helps + size + " and ".join(parts)
+        return ", or ".join([*self.remedies, " and ".join(parts)])
 
     def text(self) -> str:
         """One line for a person."""

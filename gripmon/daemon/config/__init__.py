@@ -76,7 +76,9 @@ class Config:
     @property
     def taught_edges(self) -> TaughtEdges | None:
         """The taught edges for the monitor; None without a taught model."""
-        return None if self.taught is None else TaughtEdges.of_model(self.taught, self.gripper)
+        return (
+            None if self.taught is None else TaughtEdges.of_model(self.taught, self.gripper, self.reference.covariance)
+        )
 
     @property
     def taught_path(self) -> Path | None:

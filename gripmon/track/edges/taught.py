@@ -16,7 +16,7 @@ a wide standard deviation, and has the more effect the more the line of sight ha
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -196,7 +196,8 @@ class TaughtEdges:
     ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
     taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
     gripper (1: brighter to the right).  An edge that isn't known has no shift.  ``usual_m``: root mean square offset of
-    the taught edges, which others may have, too.
+    the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
+    at, which their offsets have in them: one standard deviation along each of k directions, m and rad.
     """
 
     known: NDArray[np.bool_]
@@ -208,12 +209,20 @@ class TaughtEdges:
     depth_sigma_m: Array
     polarity: NDArray[np.int8]
     usual_m: float
+    reference_error: Array
 
     @classmethod
     def of(
-        cls, edges: Mapping[str, TaughtEdge], gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None
+        cls,
+        edges: Mapping[str, TaughtEdge],
+        gripper: Gripper,
+        cam_T_grip: Array,
+        jaw_opening_m: float | None,
+        covariance: Sequence[float] | None = None,
     ) -> TaughtEdges:
-        """Arrays of edges taught at a pose and a jaw opening."""
+        """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
+        it is exact, or only differences from it count.
+        """
         listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
         across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
         share = np.array([e.share for e in listed])
@@ -231,13 +240,17 @@ class TaughtEdges:
             np.array([e.depth_sigma_m for e in listed]),
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
+            np.zeros((0, 6)) if covariance is None else np.linalg.cholesky(np.reshape(covariance, (6, 6))).T,
         )
 
     @classmethod
-    def of_model(cls, model: TaughtModel, gripper: Gripper) -> TaughtEdges:
-        """Arrays of a file without a :func:`mismatch`, at the mean of its images' jaw openings."""
+    def of_model(cls, model: TaughtModel, gripper: Gripper, covariance: Sequence[float] | None = None) -> TaughtEdges:
+        """Arrays of a file without a :func:`mismatch`, at the mean of its images' jaw openings; ``covariance`` as
+        above, of the reference.
+        """
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
-        return cls.of(model.edges, gripper, taught_pose(model), float(np.mean(openings)) if openings else None)
+        opening_m = float(np.mean(openings)) if openings else None
+        return cls.of(model.edges, gripper, taught_pose(model), opening_m, covariance)
 
     @property
     def digest(self) -> str:
