@@ -17,7 +17,7 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
-from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Protection
 from gripmon.teach.accuracy import Promise, forecast_frame, with_bevels
 from gripmon.teach.visibility import Rig

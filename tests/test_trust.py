@@ -532,6 +532,8 @@ def test_what_first_frames_differ_by_is_in_the_bound_until_accepted():
     assert not valid(seen).any()
     protection = seen.records[-1].protection
     assert protection is not None and protection.hypothesis.startswith("the mount was knocked before the start, or")
+    again = watch(frames, truths, restarted(monitor.state()))
+    assert (bounds_m(again) > 2e-3).all() and not valid(again).any(), "nor does a restart"
     monitor._trust.rebase(reference_of(nominal_cam_T_grip()))
     assert watch(frames, truths, monitor).records[-1].protection.position_m < 1e-3, "a new reference explains it"
 

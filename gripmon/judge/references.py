@@ -239,9 +239,12 @@ def state_fault(state: MonitorState) -> str:
         return fault
     if state.cam_T_grip is not None and not _is_pose(state.cam_T_grip):
         return "the last transform is not a pose"
-    error = state.reference_error
-    if error is not None and not (len(error) == 6 and np.isfinite(error).all()):
-        return "the error of the configured reference is not six finite numbers"
+    for numbers, what in (
+        (state.reference_error, "the error of the configured reference"),
+        (state.unexplained, "what the first frames differed by"),
+    ):
+        if numbers is not None and not (len(numbers) == 6 and np.isfinite(numbers).all()):
+            return f"{what} is not six finite numbers"
     if len({alert.topic for alert in state.alerts}) != len(state.alerts):
         return "two open alerts on one topic"
     if state.alerts_raised < len(state.alerts):

@@ -136,12 +136,12 @@ class Monitor:
     @property
     def state_revision(self) -> int:
         """Grows with each change of :meth:`state`, except of the last transform and the look."""
-        known = self._analysis.of_configured.error is not None
-        return self._renewal.book.changes + self._policy.alerts.changes + int(known)
+        known = int(self._analysis.of_configured.error is not None) + int(self._trust.unexplained is not None)
+        return self._renewal.book.changes + self._policy.alerts.changes + known
 
     def state(self) -> MonitorState:
         """What has to survive a restart."""
-        error = self._analysis.of_configured.error
+        error, unexplained = self._analysis.of_configured.error, self._trust.unexplained
         return MonitorState(
             self._renewal.book.history,
             self._renewal.book.proposal,
@@ -149,6 +149,7 @@ class Monitor:
             alerts_raised=self._policy.alerts.raised,
             cam_T_grip=to_record(self._trust.last_known(self._cam_T_grip)) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
+            unexplained=None if unexplained is None else tuple(unexplained.tolist()),
             look=self._trust.look_state(self.reference),
         )
 

@@ -82,6 +82,11 @@ class Integrity:
         return msgspec.structs.replace(record, strips=strips or msgspec.UNSET, finer=finer or msgspec.UNSET)
 
     @property
+    def unexplained(self) -> Array | None:
+        """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't."""
+        return self._weigher.unexplained
+
+    @property
     def swing(self) -> Array:
         """(6,) variance of the vibration between proven poses, m² and rad²; of refined poses if the newest is one."""
         return self._weigher.swing if self._finer_swing is None else self._finer_swing
@@ -98,6 +103,9 @@ class Integrity:
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
         """Continue after a restart: from the last known pose (4, 4), with the kept look."""
         self._weigher.rebase(reference, last_T)
+        if state is not None and state.unexplained is not None:
+            # What an earlier run couldn't explain, a restart doesn't either.
+            self._weigher.unexplained = np.array(state.unexplained)
         if state is not None and state.look is not None:
             try:
                 self._look.restore(state.look, reference.reference_id)

@@ -105,7 +105,8 @@ class Weigher:
         """
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
-        self._unexplained: Array | None = None
+        self.unexplained: Array | None = None
+        """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't."""
         self._reference_T = from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
 
@@ -172,6 +173,8 @@ class Weigher:
             if displaced:
                 away = perturbation_between(self._expected[0], cam_T_grip)
                 protection = larger(protection, self._not_as_expected(away))
+            if self.unexplained is not None:
+                protection = larger(protection, self._not_as_expected(self.unexplained))
             return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
         # Hypotheses since the anchor, and the most probable one.
         possible = holds * prior
@@ -179,8 +182,8 @@ class Weigher:
         most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
         protection = protection_of(all_along + since, risk)
-        if self._unexplained is not None:
-            protection = larger(protection, self._not_as_expected(self._unexplained))
+        if self.unexplained is not None:
+            protection = larger(protection, self._not_as_expected(self.unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
@@ -222,7 +225,7 @@ class Weigher:
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
-            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
+            self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
         else:

@@ -68,6 +68,13 @@ class MonitorState(msgspec.Struct, frozen=True):
             "start; null if that isn't known"
         ),
     ] = None
+    unexplained: Annotated[
+        tuple[float, ...] | None,
+        Meta(
+            description="6 numbers, m and rad: by how much the first proven transform differed from where the gripper "
+            "was expected; every bound includes it until there is a new reference; null if it didn't"
+        ),
+    ] = None
     look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
         None
     )
