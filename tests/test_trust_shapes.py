@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -24,7 +24,7 @@ from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.refits import SIGMA_INFLATION
 from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
 from gripmon.simulate import Scenario, Simulator
-from gripmon.simulate.scenario import Background, BentFinger, Bump
+from gripmon.simulate.scenario import Background, BentFinger, Bump, FingerLook, Sensor
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
 from gripmon.track.edges.roles import along_fingers
 
@@ -209,6 +209,37 @@ def test_bevels_that_the_file_states_are_within_the_bound():
     bounds = [record.protection for record in seen.records]
     assert all(each is not None and error <= each.position_m for error, each in zip(error_m, bounds, strict=True))
     assert error_m.max() > 1e-3 and Verdict.VALID not in seen.verdicts()
+
+
+@pytest.mark.parametrize("response", ["linear", "srgb"])
+def test_grey_levels_of_a_colour_camera_are_read_as_light(response: Literal["linear", "srgb"]):
+    """The lens blurs light, sRGB encodes it afterwards (IEC 61966-2-1): read as light itself, edges of dark fingers lie
+    too far inside, all alike, as if the gripper were farther away.
+    """
+    camera, pose, gripper = make_camera(PAPER_LENS), nominal_cam_T_grip(), gripper_from_dict(box_fingers(bevel_m=0.0))
+    look, background = FingerLook(level_dn=30.0), Background(kind="blobs", level_dn=190.0, contrast=0.3)
+    scenario = Scenario(
+        name="srgb", fps=FPS, duration_s=0.8, fingers=look, background=background, sensor=Sensor(psf_sigma_px=1.0)
+    )
+    simulator = Simulator(camera, gripper, pose, scenario, 1)
+    edges = MonitorSettings().corners.edges
+    corners = msgspec.structs.replace(
+        MonitorSettings().corners, edges=msgspec.structs.replace(edges, response=response)
+    )
+    monitor = Monitor(camera, gripper, MonitorSettings(corners=corners), reference_of(pose))
+    light = np.arange(256) / 255.0
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    errors_m = []
+    for k in range(simulator.frame_count):
+        frame = simulator.frame(k)
+        image = np.rint(255.0 * encoded).astype(np.uint8)[frame.image]
+        record = monitor.process(replace(frame, image=image))
+        assert record.cam_T_grip is not None
+        away_m = pose_of(record.cam_T_grip)[:3, 3] - simulator.truth(k).cam_T_grip[:3, 3]
+        errors_m.append(float(np.linalg.norm(away_m)))
+        if response == "srgb":
+            assert record.protection is not None and errors_m[-1] < record.protection.position_m
+    assert np.median(errors_m) < 5e-5 if response == "srgb" else np.median(errors_m) > 3e-4
 
 
 @pytest.mark.usefixtures("tools_importable")

@@ -208,7 +208,7 @@ def lay_out(
     uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
     margin_px = settings.end_margin_px
     shortest_px = max(margin_px, SHORTEST_PX)  # the margin is zoomed, and so is what has to be left
-    ways = np.gradient(uv, axis=1)
+    ways = np.asarray(np.gradient(uv, axis=1))
     inside_px = _lines_inside_px(camera, uv, _unit(ways[..., ::-1] * (-1.0, 1.0)), settings.reach_px) - BORDER_PX
     ranges = prediction_kernel.sampled_ranges(uv, inside_px, wanted, margin_px, shortest_px)
     lengths = ranges[:, 2]

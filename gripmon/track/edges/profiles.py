@@ -85,6 +85,16 @@ def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.fl
     return profiles
 
 
+def in_linear_light(profiles: Array, most: float, settings: EdgeSettings) -> Array:
+    """Search lines (n, s) of grey levels up to ``most`` in proportion to the light, which the lens blurs: an edge lies
+    in the middle of that.  sRGB by IEC 61966-2-1.
+    """
+    if settings.response == "linear":
+        return profiles
+    encoded = np.maximum(profiles / most, 0.0)
+    return np.asarray(most * np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4))
+
+
 def _pixels(image: Image) -> Image:
     """The image as (h, w, channels), with one of three types and without leave to write: each other combination would
     be compiled again.
