@@ -151,3 +151,23 @@ def test_fingers_that_do_not_open_by_what_the_jaw_reports_are_a_warning(
     assert ("jaw" in found) == (said is not None)
     if said is not None:
         assert found["jaw"][0] == "WARN" and f"apart by {said} for each millimetre of opening" in found["jaw"][1]
+
+
+def test_images_of_a_colour_camera_are_a_warning_until_their_response_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["simulate", "creep", "--out", str(tmp_path / "s"), "--seconds", "0.3", "--fps", "10"]) == 0
+    config, (first, *_) = tmp_path / "s" / "config.yaml", sorted((tmp_path / "s").glob("*.png"))
+    grey = cv2.imread(str(first), cv2.IMREAD_GRAYSCALE)
+    for image, response, level in (
+        (np.dstack([grey] * 3), "linear", "OK"),
+        (np.dstack([grey // 2, grey, grey]), "linear", "WARN"),
+        (np.dstack([grey // 2, grey, grey]), "srgb", "OK"),
+    ):
+        cv2.imwrite(str(first), image)
+        values = yaml.safe_load(config.read_text())
+        values["monitor"] = {"corners": {"edges": {"response": response}}}
+        config.write_text(yaml.safe_dump(values))
+        capsys.readouterr()
+        _, found = checked(config, capsys)
+        assert found["source"][0] == level and ("response: srgb" in found["source"][1]) == (level == "WARN")

@@ -9,6 +9,8 @@ import dataclasses
 from collections.abc import Sized
 from pathlib import Path
 
+import numpy as np
+
 from gripmon import monitor
 from gripmon.daemon.config import Config, ConfigError, SecondConfig
 from gripmon.io.sources import (
@@ -26,7 +28,7 @@ from gripmon.io.sources import open_source as start
 from gripmon.io.wire import Keys, Link
 from gripmon.judge.references import Keep
 from gripmon.model.errors import NoResultError
-from gripmon.model.records import Frame, FrameRecord, MonitorState
+from gripmon.model.records import Frame, FrameRecord, Image, MonitorState
 
 
 class Monitor(monitor.Monitor):
@@ -87,6 +89,10 @@ def open_configured(config: Config | SecondConfig, link: Link | None = None) -> 
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 
 
+COLOURED_LEVELS = 1.0
+"""Mean range of an 8-bit image's channels from which it is of a colour camera: a codec adds less to grey."""
+
+
 def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
     """A description of the first recorded frame, and what is odd about it (None: nothing); None for a source that isn't
     recorded.
@@ -109,11 +115,19 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
         raise ConfigError(config.path, key, wrong, "the calibration that belongs to these images")
     count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
     detail = f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
-    if not unreadable:
-        return detail, None
-    first, *more = unreadable
-    others = f", nor can the next {len(more)}" if more else ""
-    return detail, f"its first frame can't be read ({first}){others}"
+    if unreadable:
+        first, *more = unreadable
+        others = f", nor can the next {len(more)}" if more else ""
+        return detail, f"its first frame can't be read ({first}){others}"
+    return detail, None if isinstance(config, SecondConfig) else _unlike_light(config, frame.image)
+
+
+def _unlike_light(config: Config, image: Image) -> str | None:
+    told = config.settings.monitor.corners.edges.response != "linear"
+    if told or image.ndim < 3 or image.dtype != np.uint8 or float(np.ptp(image, axis=2).mean()) < COLOURED_LEVELS:
+        return None
+    known = "monitor.corners.edges.response: srgb, unless its gamma is 1"
+    return f"grey levels of a colour camera mostly aren't in proportion to the light: {known}"
 
 
 def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:
