@@ -161,6 +161,8 @@ class Monitor:
         self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
+        if isinstance(frame.jaw_opening_m, np.generic):
+            frame = replace(frame, jaw_opening_m=frame.jaw_opening_m.item())  # as NumPy has it, no file can
         self._tick(frame)
         faults = self._analysis.begin_frame(frame, self._now_s)
         self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)
