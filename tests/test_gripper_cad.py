@@ -17,7 +17,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.teach.cad import gripper_from_cad
-from tools.benchmarks.meshes import curved_fingers, finger_mesh, rounded_fingers, write_meshes
+from tools.benchmarks.meshes import box_fingers, curved_fingers, finger_mesh, rounded_fingers, write_meshes
 
 MICROMETRE = 1e-6
 CUBE = Path(__file__).resolve().parents[2] / "shared" / "data" / "visp_cube" / "cube.cao"
@@ -268,6 +268,20 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(
     assert from_cad(path, "--unit", "mm", "--out", tmp_path / "g.yaml") == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1 and "Traceback" not in error
+
+
+def test_a_mesh_that_is_cut_off_and_a_length_in_millimetres_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (whole,) = write_meshes(box_fingers()[:1], tmp_path)
+    (tmp_path / "half.stl").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    for words, said in (
+        ((tmp_path / "half.stl",), "half.stl: can't be read as a mesh (it is damaged or cut off)"),
+        ((whole, "--length", "40"), "--length: 40 m: is no length of a finger; metres, as 0.04"),
+    ):
+        assert from_cad(*words, "--unit", "mm", "--out", tmp_path / "g.yaml") == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1
 
 
 def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

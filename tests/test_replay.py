@@ -124,7 +124,17 @@ def test_no_usable_frame_ends_with_3(copied: Path, tmp_path: Path, capsys: pytes
         path.write_bytes(b"nothing")
     lines = replayed(copied, tmp_path / "out.jsonl", code=3)
     assert len(lines) == 20 and {line["verdict"] for line in lines} == {"unknown"}
-    assert "no frame could be used (not_an_image" in capsys.readouterr().err
+    assert "no frame could be used (not_an_image: " in capsys.readouterr().err
+
+
+def test_frames_of_another_size_are_told_with_both_sizes(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for path in copied.glob("*.png"):
+        cv2.imwrite(str(path), np.zeros((100, 120), np.uint8))
+    replayed(copied, tmp_path / "out.jsonl", code=3)
+    text = capsys.readouterr().err
+    assert "no frame could be used (wrong_size: " in text and "120" in text and "768" in text
 
 
 def test_names_are_counted_as_people_count(copied: Path, tmp_path: Path):

@@ -179,6 +179,8 @@ def _check(frame: str, approach: str | None, unit: str | None, length_m: float |
         raise InputError(
             f"{length_m:g}: is measured from the tips backwards, along z; not with the CAD's own frame", "length"
         )
+    if length_m is not None and not 0.0 < length_m <= LONGEST_M:
+        raise InputError(f"{length_m:g} m: is no length of a finger; metres, as 0.04", "length")
     if unit is not None and unit not in UNITS_M:
         raise InputError(f"'{unit}' is not a unit; one of {', '.join(UNITS_M)}", "unit")
     if not 0.0 <= bevel_m <= WIDEST_BEVEL_M:

@@ -64,9 +64,10 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.intp)
     except Exception as error:  # noqa: BLE001  trimesh raises anything for a damaged file
-        raise InputError(
-            f"{path}: can't be read as a mesh ({one_line(error):.120}); STL, OBJ or PLY with triangles"
-        ) from None
+        # A binary STL that is cut off is tried as text, for which trimesh wants one more library.
+        cut_off = isinstance(error, ModuleNotFoundError)
+        why = "it is damaged or cut off" if cut_off else f"{one_line(error):.120}"
+        raise InputError(f"{path}: can't be read as a mesh ({why}); STL, OBJ or PLY with triangles") from None
     if not len(triangles):
         raise InputError(f"{path}: has no triangles; a mesh of the fingers' surface")
     if len(triangles) > LARGEST_TRIANGLES:
