@@ -9,7 +9,8 @@ from gripmon.cli.common import REQUIRED, Arguments, Command, positive_number, pr
 _OPTIONS = """
 IMAGE...                image file, or folder with images
 --camera FILE.yaml      file of gripmon calibrate intrinsics
---distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m)
+--distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m),
+                        which is in every protection level
 | --finger-width M:SIGMA
                         width of a fingertip across the jaws, with its standard deviation (m)
 | --reference FILE.yaml

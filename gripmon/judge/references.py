@@ -243,7 +243,7 @@ def state_fault(state: MonitorState) -> str:
         (state.reference_error, "the error of the configured reference"),
         (state.unexplained, "what the first frames differed by"),
     ):
-        if numbers is not None and not (len(numbers) == 6 and np.isfinite(numbers).all()):
+        if isinstance(numbers, tuple) and not (len(numbers) == 6 and np.isfinite(numbers).all()):
             return f"{what} is not six finite numbers"
     if len({alert.topic for alert in state.alerts}) != len(state.alerts):
         return "two open alerts on one topic"

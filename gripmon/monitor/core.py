@@ -149,7 +149,7 @@ class Monitor:
             alerts_raised=self._policy.alerts.raised,
             cam_T_grip=to_record(self._trust.last_known(self._cam_T_grip)) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
-            unexplained=None if unexplained is None else tuple(unexplained.tolist()),
+            unexplained=msgspec.UNSET if unexplained is None else tuple(unexplained.tolist()),
             look=self._trust.look_state(self.reference),
         )
 
@@ -161,8 +161,9 @@ class Monitor:
         self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
-        if isinstance(frame.jaw_opening_m, np.generic):
-            frame = replace(frame, jaw_opening_m=frame.jaw_opening_m.item())  # as NumPy has it, no file can
+        opening: object = frame.jaw_opening_m
+        if isinstance(opening, np.generic):
+            frame = replace(frame, jaw_opening_m=opening.item())  # NumPy's own numbers can't be written to files
         self._tick(frame)
         faults = self._analysis.begin_frame(frame, self._now_s)
         self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)

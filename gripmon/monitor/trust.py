@@ -103,7 +103,7 @@ class Integrity:
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
         """Continue after a restart: from the last known pose (4, 4), with the kept look."""
         self._weigher.rebase(reference, last_T)
-        if state is not None and state.unexplained is not None:
+        if state is not None and state.unexplained is not msgspec.UNSET:
             # What an earlier run couldn't explain, a restart doesn't either.
             self._weigher.unexplained = np.array(state.unexplained)
         if state is not None and state.look is not None:

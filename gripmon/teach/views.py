@@ -23,7 +23,6 @@ from gripmon.track.edges.profiles import (
     estimate_noise,
     find_candidates,
     full_scale,
-    in_linear_light,
     profile_offsets_px,
     quantum,
     read_profiles,
@@ -177,10 +176,10 @@ class Viewer:
         there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
         if there.layout is not here.layout:
             here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
-        most, edges = full_scale(grey), rig.settings.corners.edges
-        profiles = in_linear_light(read_profiles(grey, there.map_x, there.map_y), most, edges)
+        edges = rig.settings.corners.edges
+        profiles = read_profiles(grey, there.map_x, there.map_y, edges.response)
         noise = estimate_noise(profiles, quantum(grey))
-        candidates = find_candidates(profiles, there.ok, noise, most, edges, zoom)
+        candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), edges, zoom)
         per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
         # Edges are straight: a sample's motion along its edge doesn't matter.
         expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)

@@ -247,7 +247,8 @@ STEPS = (
                   "background; teaching: take thirty in the step Gripper at work first", (),
                   ("gripper", (FROM_IMAGES,))),
             Field("distance", "distance (m)", "", "of the fingertips from the camera, with its standard deviation, "
-                  "e.g. 0.12:0.003; empty: from images at several jaw openings", (), ("gripper", (FROM_IMAGES,))),
+                  "which is in every bound, e.g. 0.12:0.0001; empty: from images at several jaw openings", (),
+                  ("gripper", (FROM_IMAGES,))),
             Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
                   ("gripper", (INFERRED, FROM_CAD))),
             Field("options", "more options", "", "added to the command below, written as there", (),

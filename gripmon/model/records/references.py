@@ -69,12 +69,12 @@ class MonitorState(msgspec.Struct, frozen=True):
         ),
     ] = None
     unexplained: Annotated[
-        tuple[float, ...] | None,
+        tuple[float, ...] | msgspec.UnsetType,
         Meta(
             description="6 numbers, m and rad: by how much the first proven transform differed from where the gripper "
-            "was expected; every bound includes it until there is a new reference; null if it didn't"
+            "was expected; every bound includes it until there is a new reference; absent if it didn't"
         ),
-    ] = None
+    ] = msgspec.UNSET
     look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
         None
     )

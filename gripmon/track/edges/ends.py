@@ -17,7 +17,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profiles import find_candidates, in_linear_light, read_profiles
+from gripmon.track.edges.profiles import find_candidates, read_profiles
 from gripmon.track.edges.roles import PARALLEL_COSINE, along_fingers
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settings import EdgeSettings
@@ -202,8 +202,8 @@ class FingerEnds:
         # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
         shift_px = np.repeat(offset_px[:, None] * prediction.normal[probes.sample], PROBES, axis=0).astype(np.float32)
-        profiles = read_profiles(image, probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:])
-        profiles = in_linear_light(profiles, candidates.full_scale, self._settings)
+        maps = probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:]
+        profiles = read_profiles(image, *maps, self._settings.response)
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
         step = _own_step(measurement)[prediction.layout.edge[probes.sample]]
         of = found.sample // PROBES

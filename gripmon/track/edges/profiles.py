@@ -69,11 +69,14 @@ def profile_offsets_px(reach_px: float) -> Array:
     return np.arange(-half, half + 1) * STEP_PX
 
 
-def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> Array:
+def read_profiles(
+    image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32], response: str = "linear"
+) -> Array:
     """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: grey levels (n, s), which no step of
     it rounds.  Colour (blue first) is reduced to grey here, so that cost grows with edges.
 
-    OpenCV's bicubic kernel; beyond the image everything is as at its border.
+    OpenCV's bicubic kernel; beyond the image everything is as at its border.  With the ``response`` srgb grey levels in
+    proportion to the light, which the lens blurs: an edge lies in the middle of that (IEC 61966-2-1).
     """
     if map_x.size == 0:
         return np.zeros(map_x.shape[-2:])
@@ -82,17 +85,11 @@ def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.fl
     profiles: Array = profile_kernel.read_profiles(
         _pixels(image), np.ascontiguousarray(map_x, np.float32), np.ascontiguousarray(map_y, np.float32)
     )
-    return profiles
-
-
-def in_linear_light(profiles: Array, most: float, settings: EdgeSettings) -> Array:
-    """Search lines (n, s) of grey levels up to ``most`` in proportion to the light, which the lens blurs: an edge lies
-    in the middle of that.  sRGB by IEC 61966-2-1.
-    """
-    if settings.response == "linear":
+    if response == "linear":
         return profiles
-    encoded = np.maximum(profiles / most, 0.0)
-    return np.asarray(most * np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4))
+    encoded = np.maximum(profiles / full_scale(image), 0.0)
+    light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return np.asarray(full_scale(image) * light)
 
 
 def _pixels(image: Image) -> Image:

@@ -24,7 +24,6 @@ from gripmon.track.edges.profiles import (
     estimate_noise,
     find_candidates,
     full_scale,
-    in_linear_light,
     profile_offsets_px,
     quantum,
     read_profiles,
@@ -305,10 +304,9 @@ class Settler:
 
     def _look(self, image: Image, prediction: Prediction) -> Edgels:
         settings = self._settings
-        most = full_scale(image)
-        profiles = in_linear_light(read_profiles(image, prediction.map_x, prediction.map_y), most, settings.edges)
+        profiles = read_profiles(image, prediction.map_x, prediction.map_y, settings.edges.response)
         noise = estimate_noise(profiles, quantum(image))
-        candidates = find_candidates(profiles, prediction.ok, noise, most, settings.edges, self._zoom)
+        candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges, self._zoom)
         return weigh(candidates, prediction, self._polarity, settings.consensus)
 
     def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
