@@ -68,31 +68,33 @@ class Known(NamedTuple):
     of_model: Array
 
 
+class CommonError(NamedTuple):
+    """What no frame tells, since all are off by it alike: ``scale_sigma``, the standard deviation of a factor on all
+    lengths of the gripper file (a larger gripper farther away gives the same image); ``taught`` (k, 6), the error of
+    the reference at which edges were taught, by one standard deviation along each of k directions.
+    """
+
+    scale_sigma: float
+    taught: Array
+
+    def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
+        """The fits near a pose (4, 4) with it."""
+        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
+        parts = np.vstack([self.taught, farther])
+        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
+        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
+
+
 class ModelError(NamedTuple):
-    """What all frames are off by, because the gripper file is: each finger longer or shorter by a standard deviation
-    ``sigma_m``, along ``axis_grip`` (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to;
-    ``scale_sigma``: standard deviation of a factor on all its lengths.  ``taught`` (k, 6): errors of the reference, by
-    one standard deviation along each of k directions, which taught edges have in them.
+    """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
+    (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to; ``common``: None where there is no such error.
     """
 
     sigma_m: float
     axis_grip: Array
     finger: NDArray[np.intp]
     fingers: int
-    scale_sigma: float
-    taught: Array
-
-    def shared(self, fits: Separation, cam_T_grip: Array) -> Separation:
-        """The fits near a pose (4, 4) with what none of them tells: a larger gripper farther away gives the same image,
-        and taught edges are where the reference had them.
-        """
-        parts = self.taught
-        if self.scale_sigma:
-            parts = np.vstack([parts, [[*(self.scale_sigma * cam_T_grip[:3, 3]), 0.0, 0.0, 0.0]]])
-        if not len(parts):
-            return fits
-        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
-        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
+    common: CommonError | None
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
@@ -156,7 +158,9 @@ class Refits:
         """
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
-        fits = self.model.shared(Separation(away, fits.covariance + self._floor, fits.of_model), cam_T_grip)
+        fits = Separation(away, fits.covariance + self._floor, fits.of_model)
+        if self.model.common is not None:
+            fits = self.model.common.on(fits, cam_T_grip)
         return Doubts.of(self.hypotheses.name, prior, fits, SIGMA_INFLATION)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
@@ -275,7 +279,8 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
-        told = fits.model.shared(told, cam_T_grip)
+        if fits.model.common is not None:
+            told = fits.model.common.on(told, cam_T_grip)
         return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
 
 

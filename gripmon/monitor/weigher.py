@@ -22,6 +22,7 @@ from gripmon.monitor.refits import (
     UNBOUNDED_RAD,
     Anchor,
     Anchored,
+    CommonError,
     Known,
     Lasting,
     ModelError,
@@ -379,9 +380,9 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
-    fingers = gripper.edge_finger, len(gripper.finger_ids)
-    scale = gripper.model.scale_sigma
-    return ModelError(tracker.model_sigma_m, tracker.finger_axis, *fingers, scale, tracker.taught_error)
+    scale_sigma, taught = gripper.model.scale_sigma, tracker.taught_error
+    common = CommonError(scale_sigma, taught) if scale_sigma or len(taught) else None
+    return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids), common)
 
 
 def foresee_protection(
