@@ -85,7 +85,8 @@ def _at_work(folder: Path, drawn: Sequence[Any], real: Sequence[Any]) -> Array:
         name: {"translation_m": list(pose.translation_m), "rotation_xyzw": list(pose.rotation_xyzw)}
         for name, pose in values.items()
     }
-    (folder / "robot.yaml").write_text(yaml.safe_dump(written))
+    exact = {"position_sigma_m": 5e-5, "rotation_sigma_rad": 2e-4}
+    (folder / "robot.yaml").write_text(yaml.safe_dump({**written, **exact}))
     truth = []
     for k in range(FRAMES):
         pose = wandering(nominal, k / FRAMES, 5e-5, 2e-4)
