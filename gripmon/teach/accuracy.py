@@ -160,7 +160,7 @@ def as_if_measured(rig: Rig) -> dict[str, Rig]:
         known["its bevels taught (gripmon teach)"] = rig._replace(gripper=as_if_taught(rig.gripper))
     elif len(taught.reference_error):
         exact = replace(taught, reference_error=np.zeros((0, 6)))
-        known["a reference known better (its covariance or sigmas: gripmon calibrate plane)"] = rig._replace(taught=exact)
+        known["a reference known better (its sigmas: gripmon calibrate plane)"] = rig._replace(taught=exact)
     if model.scale_sigma:
         exact_size = Gripper(structs.replace(model, scale_sigma=0.0))
         known["its size known better (scale_sigma in the gripper file)"] = rig._replace(gripper=exact_size)
