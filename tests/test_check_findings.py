@@ -171,3 +171,12 @@ def test_images_of_a_colour_camera_are_a_warning_until_their_response_is_said(
         capsys.readouterr()
         _, found = checked(config, capsys)
         assert found["source"][0] == level and ("response: srgb" in found["source"][1]) == (level == "WARN")
+
+
+def test_corners_of_which_none_can_be_measured_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As the four of a chamfered tip's front face, whose edges are a few pixels long: here it is their angle."""
+    for angle_rad, level in ((0.2, "OK"), (1.5, "WARN")):
+        angles = {"corners": {"corners": {"smallest_angle_rad": angle_rad}}}
+        _, found = checked(written(tmp_path, monitor=angles), capsys)
+        assert found["view"][0] == level
+    assert "can be measured, but none of the 6 corners in view: the edges at each are too short" in found["view"][1]

@@ -164,7 +164,7 @@ def _of_wrist(forecast: Forecast) -> list[Finding | None]:
         _camera(forecast.camera),
         _jaw_motion(forecast.gripper),
         _mount(forecast.reference),
-        _view(forecast.in_view, forecast.gripper),
+        _view(forecast.in_view, forecast.gripper, forecast.accuracy.corners),
         _promise(forecast),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
@@ -226,12 +226,18 @@ def _mount(reference: ReferenceValues) -> Finding:
     return Finding("WARN", "mount", f"{text}; a camera on the wrist is behind them (reference.cam_T_grip)")
 
 
-def _view(in_view: InView, gripper: GripperValues) -> Finding:
+def _view(in_view: InView, gripper: GripperValues, measured: int) -> Finding:
+    """``measured``: how many of the corners in view can be."""
     if not in_view.enough:
         return Finding("FAIL", "view", f"nothing can be measured: {in_view.reason}")
     few = gripper.corners < in_view.corners_needed  # then ends of curves or edges are used instead
     corners = f"{in_view.corners} points" if few else f"{in_view.corners} of {gripper.corners} corners"
-    seen = f"{corners} and {in_view.edges} edges can be measured"
+    edges = f"{in_view.edges} edges"
+    seen = f"{corners} and {edges} can be measured"
+    if in_view.corners and not few and not measured:
+        why = "the edges at each are too short in the image, or parallel, so that nothing shows where the fingers end"
+        text = f"{edges} can be measured, but none of the {in_view.corners} corners in view: {why}"
+        return Finding("WARN", "view", f"{text}; mark others (corner: true)")
     spans = {} if in_view.camera_may_move is None else in_view.camera_may_move.shift_m
     shifts = [amount for span in spans.values() for amount in span if amount is not None]
     if not shifts:

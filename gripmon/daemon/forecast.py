@@ -245,6 +245,7 @@ def _accuracy(config: Config) -> Accuracy:
         measurement=settings.measurement,
         edges=expected.edges,
         edges_needed=FEWEST_EDGES,
+        corners=int(np.count_nonzero(expected.corners)),
         edge_point_sigma_px=EDGE_POINT_SIGMA_PX,
         recalibration=_recalibration(config, expected),
         expected=PoseValues.of(expected.sigma) if enough else None,

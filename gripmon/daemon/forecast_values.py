@@ -159,6 +159,7 @@ class Accuracy(msgspec.Struct, frozen=True):
     measurement: str
     edges: int
     edges_needed: int
+    corners: Annotated[int, Meta(description="those in view with two edges that are long enough and not parallel")]
     edge_point_sigma_px: float
     recalibration: RecalibrationForecast
     expected: Annotated[PoseValues | None, Meta(description="standard deviations")]
