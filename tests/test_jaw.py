@@ -38,7 +38,9 @@ def run(
     for true, reported in zip(true_m, reported_m, strict=True):
         error, opening_m, covariance = estimate(rng, true, reported)
         out.append(knowledge.fuse(reported, opening_m, covariance))
-        knowledge.learn()
+        seen = out[-1].seen
+        if seen is not None:
+            knowledge.learn(seen)
         errors.append(error + out[-1].xi)
     return np.array(errors), out, np.array([f.jaw_opening_m for f in out]) - np.array(true_m)
 
@@ -102,3 +104,19 @@ def test_an_exact_report_leaves_everything_as_it_is():
     np.testing.assert_array_equal(out.covariance, covariance[:6, :6])
     assert JawKnowledge(0.0, OFFSET_SIGMA_M).report_sigma_m == 0.0
     assert SYSTEMATIC_M > 0.0
+
+
+def test_only_the_estimate_that_is_believed_is_learnt():
+    """Of two places at which a frame was measured, the other one was looked at last."""
+    rng, both = np.random.default_rng(4), [JawKnowledge(SIGMA_M, OFFSET_SIGMA_M) for _ in range(2)]
+    for number in range(30):
+        _, opening_m, covariance = estimate(rng, 0.034, 0.0341)
+        believed = [knowledge.fuse(0.0341, opening_m, covariance) for knowledge in both]
+        if number == 29:
+            assert abs(both[0].fuse(0.0341, opening_m + 5e-4, covariance).innovation) > 5.0
+        for knowledge, fused in zip(both, believed, strict=True):
+            assert fused.seen is not None
+            knowledge.learn(fused.seen)
+    _, opening_m, covariance = estimate(rng, 0.034, 0.0341)
+    one, other = (knowledge.fuse(0.0341, opening_m, covariance) for knowledge in both)
+    assert one.jaw_opening_m == other.jaw_opening_m and one.sigma_m == other.sigma_m

@@ -173,8 +173,8 @@ class Tracker:
         """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
-        if opening and not self._jaw.exact:
-            self._jaw.learn()
+        if opening and measurement.jaw_seen is not None:
+            self._jaw.learn(measurement.jaw_seen)
 
     def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as ends; takes a quarter of a measurement's time."""
@@ -209,6 +209,7 @@ class Tracker:
             covariance=covariance,
             jaw_known_m=fused.known_m,
             jaw_known_sigma_m=fused.known_sigma_m,
+            jaw_seen=fused.seen,
             jaw_innovation=max(measurement.jaw_innovation, fused.innovation, key=abs),
         )
 

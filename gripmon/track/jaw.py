@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,11 +27,21 @@ PATIENCE, CORRELATED = 10.0, 0.8
 """Images, or backgrounds, over which it is learnt how alike edges err from one to the next; and before that."""
 
 
+class OpeningSeen(NamedTuple):
+    """What one image alone tells of the report's error: ``error_m`` with its ``variance``, and whether it
+    ``contradicted`` what was known.
+    """
+
+    error_m: float
+    variance: float
+    contradicted: bool
+
+
 @dataclass(frozen=True, slots=True)
 class Fused:
     """``xi`` (6,) what has to be added to the pose's perturbation, ``covariance`` (6, 6) of the pose then, the opening
-    with its standard deviation, by how many standard deviations the image contradicted what was known, and what was
-    known before it: an opening with its standard deviation.
+    with its standard deviation, by how many standard deviations the image contradicted what was known, what was known
+    before it: an opening with its standard deviation; and what was ``seen``, None where the image tells nothing.
     """
 
     xi: Array
@@ -40,6 +51,7 @@ class Fused:
     innovation: float
     known_m: float
     known_sigma_m: float
+    seen: OpeningSeen | None
 
 
 class JawKnowledge:
@@ -56,7 +68,6 @@ class JawKnowledge:
         self._reported_m: float | None = None
         self._correlation = CORRELATED
         self._seen: tuple[float, float] | None = None
-        self._pending: tuple[float, float, bool] | None = None
         self._forget()
 
     @property
@@ -65,12 +76,11 @@ class JawKnowledge:
         return math.hypot(self._sigma_m, self._offset_sigma_m)
 
     def fuse(self, reported_m: float, jaw_opening_m: float, covariance: Array) -> Fused:
-        """Replace the report's prior in an estimate by what is known about its error; :meth:`learn` from it if the
-        estimate is believed.
+        """Replace the report's prior in an estimate by what is known about its error; :meth:`learn` what was ``seen``
+        if the estimate is believed.
 
         ``covariance`` (7, 7) of pose and opening, from a fit with a prior of :attr:`report_sigma_m` about the report.
         """
-        self._pending = None
         prior = self.report_sigma_m**2
         variance = float(covariance[6, 6])
         image = 0.0 if self.exact else 1.0 / variance - 1.0 / prior
@@ -83,6 +93,7 @@ class JawKnowledge:
                 0.0,
                 reported_m,
                 self.report_sigma_m,
+                None,
             )
         seen_variance = 1.0 / image
         error_m = seen_variance * (jaw_opening_m - reported_m) / variance  # of the report, by this image alone
@@ -96,7 +107,6 @@ class JawKnowledge:
         opening_m = reported_m + fused * (image * error_m + known_m / known)
         gain = covariance[:6, 6] / variance
         conditioned = covariance[:6, :6] + np.outer(gain, gain) * (fused - variance)
-        self._pending = error_m, seen_variance, contradicted
         xi = gain * (opening_m - jaw_opening_m)
         return Fused(
             xi,
@@ -106,6 +116,7 @@ class JawKnowledge:
             innovation,
             reported_m + known_m,
             math.sqrt(known),
+            OpeningSeen(error_m, seen_variance, contradicted),
         )
 
     @property
@@ -125,16 +136,13 @@ class JawKnowledge:
             self._covariance[1, 1] += (1.0 - kept**2) * self._sigma_m**2
         self._reported_m = reported_m
 
-    def learn(self) -> None:
-        """Believe what the newest estimate showed of the report's error: a Kalman update.
+    def learn(self, seen: OpeningSeen) -> None:
+        """Believe what an estimate showed of the report's error: a Kalman update.
 
         Images err alike while the background stands still: how much less than independent ones their errors differ from
         one to the next tells how many of them count as one.
         """
-        if self._pending is None:
-            return
-        error_m, variance, contradicted = self._pending
-        self._pending = None
+        error_m, variance, contradicted = seen
         if contradicted:
             self._forget()
         if self._seen is not None:

@@ -44,6 +44,7 @@ from gripmon.track.edges.robust_fit import (
 )
 from gripmon.track.edges.settings import MeasurementSettings
 from gripmon.track.edges.taught import TaughtEdges
+from gripmon.track.jaw import OpeningSeen
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen again, px."""
@@ -74,7 +75,7 @@ class Measurement:
     reported one (``jaw_reported_m``), in standard deviations of the latter.
 
     ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far
-    as it is known without the image.
+    as it is known without the image; ``jaw_seen``: what the image tells of the report's error, None for nothing.
 
     ``blur_px``: standard deviation across the edges that agreed, None with few of them.
 
@@ -98,6 +99,7 @@ class Measurement:
     blur_px: float | None
     trusted: bool = False
     looked_far: bool = False
+    jaw_seen: OpeningSeen | None = None
 
     def corners_at(self, jaw_opening_m: float) -> Array:
         """Corners (c, 3) in the camera frame at the prediction's pose, but with another jaw opening."""
