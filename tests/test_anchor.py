@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.refits import CONFIRMING_FRAMES, Anchor, Lasting
+from gripmon.monitor.refits import CONFIRMING_FRAMES, Anchor, Lasting, ModelError
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -17,6 +17,7 @@ ALONG = np.array([True, True, False, False, True, True, False, False])
 INNER = np.array(["_in" in name for name in NAMES])
 EVERY = hypotheses_of(NAMES, FINGER, ("a", "b"), ALONG, INNER, True)
 LASTING = Lasting.of(EVERY)
+NOTHING_COMMON = ModelError(0.0, np.zeros(3), np.zeros(0, dtype=np.intp), 2, common=None)
 ROWS = np.arange(len(LASTING.name))
 BASE_T = perturb(np.eye(4), np.array([0.01, -0.02, 0.2, 0.1, 0.2, -0.1]))
 STILL = np.zeros(6)
@@ -34,6 +35,7 @@ class Frame:
     away: np.ndarray
     covariance: np.ndarray
     longer: float = 0.0
+    model: ModelError = NOTHING_COMMON
 
     @property
     def cam_T_grip(self) -> np.ndarray:

@@ -74,7 +74,7 @@ def test_the_joint_fits_covariance_is_that_of_its_errors(
 @pytest.mark.parametrize("gross", [0.0, 0.01], ids=["normal", "1 % gross"])
 def test_the_corners_joint_covariance_is_that_of_their_errors(gross: float):
     """Also between corners at two ends of an edge.  Weights about the joint fit, not about each line by itself, leave
-    the lines a little nearer to it than they claim: up to a quarter of the variance.
+    the lines a little nearer to it than they claim: a quarter of the variance, and what the mean of so few scatters by.
     """
     meter = NoisyMeter(JAW_SIGMA_M, gross=gross)
     true_xy, errors, nees = None, [], []
@@ -89,7 +89,7 @@ def test_the_corners_joint_covariance_is_that_of_their_errors(gross: float):
         np.testing.assert_allclose(
             joint.reshape(6, 2, 6, 2)[range(6), :, range(6)], found.corners.covariance_xy[usable], rtol=1e-12
         )
-    assert 0.75 * 12.0 < np.mean(nees) < 1.1 * 12.0
+    assert 0.7 * 12.0 < np.mean(nees) < 1.1 * 12.0
     scale = np.sqrt(joint.diagonal())
     claimed = joint / np.outer(scale, scale)
     assert np.abs(claimed - np.eye(12)).max() > 0.4, "corners do err together"

@@ -21,7 +21,9 @@ from gripmon.track.edges.profiles import BESIDE_SAMPLES, Candidates, Edgels, _ke
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 
-def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> Array:
+def read_profiles(
+    image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32], response: str = "linear"
+) -> Array:
     pixels = _pixels(image).astype(float)
     grey = pixels @ [BLUE, GREEN, RED] if pixels.shape[2] == 3 else pixels[:, :, 0]
     (column, across), (row, down) = _cubic(map_x, grey.shape[1]), _cubic(map_y, grey.shape[0])
