@@ -265,16 +265,17 @@ def _promise(report: Forecast) -> Finding | None:
         text = f"no transform can be valid: good to {good}, beyond {limit}; valid needs {report.needed}"
         return Finding("WARN", "promise", text)
     close = _USUAL_SPREAD * share > 1.0
+    level: Level = "WARN" if close else "OK"
     text = f"good to {good}, close to {limit}" if close else f"a transform is good to {good}, within {limit}"
     untold = report.protection_if_bevelled
-    bevelled = untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad)
-    if untold is not None and bevelled:
+    if untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad):
+        level = "WARN"
         may = f"{_millimetres(untold.position_m)} and {_degrees(untold.rotation_rad)}"
         text += f", if all edges are as sharp as the gripper file says; to {may} with bevels of "
         text += f"{_millimetres(UNTOLD_BEVEL_M)}: teach them (gripmon teach), or state them (bevel_m)"
     if close:
         text += "; one frame in twenty is twice as uncertain: some will be suspect"
-    return Finding("WARN" if close or bevelled else "OK", "promise", text)
+    return Finding(level, "promise", text)
 
 
 def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:

@@ -145,9 +145,12 @@ def promise_of(config: Config) -> Promise | None:
     found = Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, policy)
     if found.reachable:
         return found
-    known = as_if_measured(rig).items()
-    could = (Promise.of(forecast_frame(each, cam_T_grip, opening_m).protection, policy).reachable for _, each in known)
-    return replace(found, remedies=tuple(words for (words, _), it_could in zip(known, could, strict=True) if it_could))
+    remedies = [
+        words
+        for words, known in as_if_measured(rig).items()
+        if Promise.of(forecast_frame(known, cam_T_grip, opening_m).protection, policy).reachable
+    ]
+    return replace(found, remedies=tuple(remedies))
 
 
 def limits_warning(config: Config) -> str | None:

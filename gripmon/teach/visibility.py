@@ -23,7 +23,7 @@ from gripmon.model.records import Array
 from gripmon.monitor import MonitorSettings
 from gripmon.track.edges import TaughtEdges
 from gripmon.track.edges.kernel import FEWEST_EDGES
-from gripmon.track.edges.prediction import BORDER_PX, FEWEST_SAMPLES, EdgeLayout, lay_out
+from gripmon.track.edges.prediction import BORDER_PX, FEWEST_SAMPLES, EdgeLayout, inside_px, lay_out
 
 FEWEST_CORNERS = 3
 """Fewest visible corners; a configuration with fewer is refused."""
@@ -93,10 +93,8 @@ def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
     eye_grip_m = invert(cam_T_grip)[:3, 3]
     corners_grip_m = points_grip_m[gripper.landmarks]
     uv_px = camera.project(corners_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
-    last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     with np.errstate(invalid="ignore"):
-        within = (uv_px >= BORDER_PX) & (uv_px <= last_px - BORDER_PX)
-    outside = np.asarray(~within.all(axis=1))
+        outside = np.asarray(~(inside_px(camera, uv_px) >= BORDER_PX))
     self_hidden = ~outside & ~gripper.points_visible(points_grip_m, eye_grip_m, gripper.landmarks)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     layout = lay_out(camera, gripper, cam_T_grip, opening_m, rig.settings.corners.sampling, rig.taught)

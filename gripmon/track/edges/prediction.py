@@ -232,7 +232,7 @@ def lay_out(
     )
 
 
-def _inside_px(camera: Camera, uv_px: Array) -> Array:
+def inside_px(camera: Camera, uv_px: Array) -> Array:
     """(...,) how far places (..., 2) lie inside the image's border, px; outside if negative, NaN where they are."""
     size = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     return np.asarray(np.minimum(uv_px, size - uv_px).min(axis=-1))
@@ -241,7 +241,7 @@ def _inside_px(camera: Camera, uv_px: Array) -> Array:
 def _lines_inside_px(camera: Camera, uv_px: Array, normal: Array, reach_px: float) -> Array:
     """(...,) the same of the nearer end of search lines that reach so far to either side along the ``normal``."""
     to_px = reach_px * normal
-    return np.minimum(_inside_px(camera, uv_px - to_px), _inside_px(camera, uv_px + to_px))
+    return np.minimum(inside_px(camera, uv_px - to_px), inside_px(camera, uv_px + to_px))
 
 
 def predict(
@@ -340,7 +340,7 @@ def _predict_corners(
     cam_m = points_grip_m[gripper.corner_points] @ rotation.T + translation
     uv_px, d_uv = camera.project_with_jacobian(cam_m)
     with np.errstate(invalid="ignore"):
-        inside = _inside_px(camera, uv_px) >= BORDER_PX
+        inside = inside_px(camera, uv_px) >= BORDER_PX
     return PredictedCorners(
         cam_m=cam_m,
         jaw_rate=rate[gripper.corner_points],

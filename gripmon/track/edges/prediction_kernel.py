@@ -35,21 +35,22 @@ def sampled_ranges(uv_px: Any, inside_px: Any, wanted: Any, margin_px: float, sh
             dx, dy = uv_px[e, k, 0] - uv_px[e, k - 1, 0], uv_px[e, k, 1] - uv_px[e, k - 1, 1]
             step_px = math.sqrt(dx * dx + dy * dy)
             travelled[k] = travelled[k - 1] + (step_px if step_px == step_px else 0.0)
-        first, last, longest, low, ends = 0.0, 0.0, -1.0, 0.0, 0
+        first, last, longest, low = 0.0, 0.0, -1.0, 0.0
+        starts, ends = 0, 0  # whether the run goes to the edge's own ends
         for k in range(places):
             if not inside_px[e, k] >= 0.0:
                 continue
             if k == 0 or not inside_px[e, k - 1] >= 0.0:
-                low, own = travelled[k] - _beyond(travelled, inside_px[e], k, k - 1), int(k == 0)
+                low, begins = travelled[k] - _beyond(travelled, inside_px[e], k, k - 1), int(k == 0)
             if k + 1 == places or not inside_px[e, k + 1] >= 0.0:
                 high = travelled[k] + _beyond(travelled, inside_px[e], k, k + 1)
                 if high - low > longest:
-                    first, last, longest, ends = low, high, high - low, own + 2 * int(k + 1 == places)
+                    first, last, longest = low, high, high - low
+                    starts, ends = begins, int(k + 1 == places)
         if longest < 0.0:
             continue
-        count = ends % 2 + ends // 2
-        off_px = min(margin_px, max(0.5 * margin_px, (longest - 2.0 * shortest_px) / max(count, 1)))
-        low, high = first + off_px * (ends % 2), last - off_px * (ends // 2)
+        off_px = min(margin_px, max(0.5 * margin_px, (longest - 2.0 * shortest_px) / max(starts + ends, 1)))
+        low, high = first + off_px * starts, last - off_px * ends
         if high - low >= shortest_px:
             out[e, 0], out[e, 1], out[e, 2] = _fraction(travelled, low), _fraction(travelled, high), high - low
     return out
