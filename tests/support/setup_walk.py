@@ -272,7 +272,7 @@ def main() -> None:
         (folder / "round").mkdir()
         rounded_tips(folder / "round")
         work, camera = Path("../round/work"), Path("../arm1/camera.yaml")
-        answers = {"gripper": "from images", "free_images": "../round/free", "distance": "0.115:0.002"}
+        answers = {"gripper": "from images", "free_images": "../round/free", "distance": "0.115:0.0001"}
 
         def go(visitor: Walker, at: At) -> None:
             walk_with_a_model(visitor, work, camera, answers, {}, at)
