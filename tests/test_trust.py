@@ -546,3 +546,19 @@ def test_the_same_frames_give_the_same_records_to_the_byte():
     scenario = scene(40, props=(hidden,), mount=(along_fingers(-2e-3, 34.4 / FPS),))
     one, other = watched(scenario), watched(scenario)
     assert [to_json(r) for r in one.records] == [to_json(r) for r in other.records]
+
+
+# --- light ---
+
+
+@pytest.mark.parametrize("gain", [1.0, 3.0])
+def test_white_that_is_cut_off_beside_the_fingers_is_named(gain: float):
+    """A table of 110 DN, as it is and three times as bright: how far the edges are shifted by what the sensor cuts off
+    can't be seen.
+    """
+    frames, truths = frames_of(scene(8, background=Background(kind="plain", level_dn=110.0, boxes=0, cables=0)))
+    lit = tuple(replace(f, image=np.clip(gain * f.image.astype(float), 0.0, 255.0).astype(np.uint8)) for f in frames)
+    seen = watch(lit, truths, new_monitor())
+    assert_nothing_misleads(seen)
+    assert ["overexposed" in (record.reason or "") for record in seen.records[1:]] == [gain > 1.0] * 7
+    assert valid(seen)[1:].all() == (gain == 1.0)

@@ -70,6 +70,7 @@ class Evidence:
     ``believed``: the gripper may be taken to be there.
     ``since_first``: ``motion`` counts from where the first frames had the camera, which the reference allows, not
     from the reference.  ``unproven``: nothing in the frame proves where the gripper is, though a frame before did.
+    ``overexposed``: most of the gripper's edges lie beside white that is cut off.
     """
 
     shift: Array
@@ -87,6 +88,7 @@ class Evidence:
     believed: bool = True
     since_first: bool = False
     unproven: bool = False
+    overexposed: bool = False
 
     @property
     def moved(self) -> bool:
@@ -162,6 +164,8 @@ class Policy:
             return "the stream of frames is at fault"
         if evidence.explanation.probable.cause in NO_REFERENCE:
             return evidence.explanation.text or str(evidence.explanation.probable.cause)
+        if beyond is not None and evidence.overexposed:
+            return f"{beyond}; white beside the fingers is overexposed, which shifts their edges: shorten the exposure"
         return beyond
 
     def unmeasured(

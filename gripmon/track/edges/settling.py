@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.compiled import compiled
@@ -77,7 +78,8 @@ class Measurement:
     ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far
     as it is known without the image; ``jaw_seen``: what the image tells of the report's error, None for nothing.
 
-    ``blur_px``: standard deviation across the edges that agreed, None with few of them.
+    ``blur_px``: standard deviation across the edges that agreed, None with few of them.  ``cut_off`` (v,): which of the
+    seen edges are less certain by white that is cut off beside them than by all else that their points share.
 
     ``trusted``: enough search lines agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
@@ -97,6 +99,7 @@ class Measurement:
     jaw_known_m: float
     jaw_known_sigma_m: float
     blur_px: float | None
+    cut_off: NDArray[np.bool_]
     trusted: bool = False
     looked_far: bool = False
     jaw_seen: OpeningSeen | None = None
@@ -243,6 +246,7 @@ class Settler:
             expected.jaw_reported_m,
             jaw_known_sigma_m,
             blur_px(edgels.candidates, consensus.weight, settings.edges),
+            (edgels.cut_off_px > edgels.edge_spread_px)[uncertainty.normal.edge],
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:
