@@ -6,11 +6,21 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
-from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, State, Verdict, unmeasured_record
+from gripmon.model.records import (
+    Frame,
+    FrameRecord,
+    Origin,
+    Protection,
+    ReferenceRecord,
+    State,
+    Verdict,
+    unmeasured_record,
+)
 
 TRUTH = make_transform(exp_rotation(np.array([0.5, 0.1, -0.2])), np.array([0.001, -0.002, 0.11]))
 FRAME = Frame(3, 0, np.zeros((4, 4), np.uint8), 0.03)
@@ -21,8 +31,6 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 
 def record(error: np.ndarray, covariance: np.ndarray, source: Origin = Origin.UPDATE) -> FrameRecord:
     """A published transform of which the truth is ``perturb(transform, error)``."""
-    import msgspec
-
     estimate = TRUTH.copy()
     estimate[:3, 3] -= error[:3]
     estimate[:3, :3] = exp_rotation(-error[3:]) @ TRUTH[:3, :3]
@@ -49,7 +57,10 @@ def test_errors_and_their_squared_norm_follow_the_published_convention():
         nees.append(row.nees)
     assert np.mean(nees) == pytest.approx(6.0, abs=5.0 * np.sqrt(12.0 / 400))
     held = judge(record(np.full(6, 1e-3), covariance, Origin.HELD), shot, 0, 3, 1.0)
-    assert np.isnan(held.error).all() and held.far == pytest.approx(np.sqrt(3.0) * 1e-3)
+    assert np.isnan(held.error).all() and held.misleading  # 1.7 mm off, with a verdict of valid
+    bounded = msgspec.structs.replace(record(np.full(6, 2e-4), covariance), protection=Protection(3e-4, 1.0, 1e-5, ""))
+    assert judge(bounded, shot, 0, 3, 1.0).misleading  # 0.35 mm off, by its own bound at most 0.3
+    assert not judge(record(np.full(6, 2e-4), covariance), shot, 0, 3, 1.0).misleading
 
 
 def track(error_um: np.ndarray, **changes: Any) -> Any:
@@ -62,10 +73,10 @@ def track(error_um: np.ndarray, **changes: Any) -> Any:
         "frame": np.arange(n) % 10,
         "judged": np.ones(n, bool),
         "valid": np.ones(n, bool),
+        "misleading": np.zeros(n, bool),
         "error": error,
         "smoothed": error[:, :3],
         "nees": np.full(n, 6.0),
-        "far": np.linalg.norm(error[:, :3], axis=1),
         "time_ms": np.linspace(1.0, 2.0, n),
     }
     return Track(**{**columns, **changes})
@@ -81,7 +92,7 @@ def test_figures_of_known_errors():
     assert out["mean_um"] == pytest.approx([2.0, 0.0, 49.5])
     assert out["p95_um"] == pytest.approx([3.0, 0.0, 94.05])
     assert out["max_um"] == pytest.approx([3.0, 0.0, 99.0])
-    assert (out["frames"], out["scenes"], out["measured"], out["valid"], out["wrong"]) == (100, 10, 1.0, 1.0, 0.0)
+    assert (out["frames"], out["scenes"], out["measured"], out["valid"], out["misleading"]) == (100, 10, 1.0, 1.0, 0.0)
     assert out["median_ms"] == pytest.approx(1.5)
     assert out["verdict"] == "2.0 x the limit"
 
@@ -91,7 +102,7 @@ def test_figures_of_known_errors():
     [
         ({}, "met"),
         ({"error": np.full((20, 6), np.nan)}, "lost 100.0 %"),
-        ({"far": np.array([0.0] * 19 + [3e-4])}, "lies 5.0 %"),
+        ({"misleading": np.arange(20) == 19}, "misleading 5.0 %"),
         ({"nees": np.full(20, 8.0)}, "covariance too small"),
         ({"nees": np.full(20, 1.0)}, "covariance too large"),
         ({"nees": np.array([5.0] * 19 + [40.0])}, "covariance too small"),
@@ -105,17 +116,12 @@ def test_verdicts(change: dict[str, Any], verdict: str):
     assert out["verdict"] == verdict
 
 
-def test_a_valid_transform_that_is_wrong_counts_also_where_errors_do_not():
+def test_a_misleading_transform_counts_also_where_errors_do_not():
     from benchmarks.accuracy_stats import figures
 
-    far = np.zeros(20)
-    far[4] = 5e-4
-    unjudged = track(np.ones((20, 3)), judged=np.arange(20) > 10, far=far)
+    unjudged = track(np.ones((20, 3)), judged=np.arange(20) > 10, misleading=np.arange(20) == 4)
     out = figures(unjudged, 30.0, None, always_seen=True, standing=False)
-    assert out["wrong"] == pytest.approx(0.05) and out["wrong_frames"] == [[0, 4]] and out["verdict"] is None
-    assert figures(track(np.ones((20, 3)), far=far, valid=far == 0.0), 30.0, None, always_seen=True, standing=False)[
-        "wrong"
-    ] == pytest.approx(0.0)
+    assert out["misleading"] == pytest.approx(0.05) and out["verdict"] is None
 
 
 @pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")

@@ -18,8 +18,9 @@ from gripmon.model.stopping import end_with_parent
 _DESCRIPTION = """\
 Runs the monitor, by edges and by corners, over simulated scenes of every condition (clutter, occlusion, blur, noise,
 light, jaws, bumps …) and over the rendered sequences beside the checkout, if they are there; compares with the truth:
-errors of the TCP in camera x, y, z (µm) and of the rotation, how often the transform is given, valid, and valid but
-wrong, its squared normalised error (NEES, 6 where the covariance is true) and the time a frame takes."""
+errors of the TCP in camera x, y, z (µm) and of the rotation, how often the transform is given, valid, and
+misleading (valid, yet farther off than the alert limit or its own bound), its squared normalised error (NEES, 6 where
+the covariance is true) and the time a frame takes."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import accuracy_plots
-from benchmarks.accuracy_notes import WHY
+from benchmarks.accuracy_notes import TEXTURE, WHY
 from benchmarks.accuracy_runs import Track
 from benchmarks.accuracy_table import LEGEND, about, cells, number, percent, summary, triple
 from benchmarks.rows import is_simulated
@@ -75,7 +75,7 @@ def _ours(rows: dict[str, Any], way: str, title: str) -> str:
         "rot",
         "given",
         "valid",
-        "wrong",
+        "misleading",
         "NEES",
         "gate",
         "ms",
@@ -110,7 +110,7 @@ def _unmet(rows: dict[str, Any]) -> str:
         for name, row in rows.items()
         if not row["skipped"] and row["ours"]["edges"]["verdict"] != "met"
     ]
-    return "\n".join(["### What is not met by edges, and why", "", *(lines or ["Everything is."])])
+    return "\n".join(["### What is not met by edges, and why", "", TEXTURE, "", *(lines or ["Everything is."])])
 
 
 def _peers(rows: dict[str, Any]) -> str:

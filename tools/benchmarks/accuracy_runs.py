@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.peers import LOST_M, PEERS, timed
 from benchmarks.scenes import Sequence, Shot
 from gripmon.judge.drift import DriftSettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
 from gripmon.model.records import Array, FrameRecord, Origin, ReferenceRecord, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
@@ -26,17 +27,17 @@ class Track:
 
     ``error`` (n, 6): perturbation from the estimate to the truth, m and rad, camera axes, NaN where it gave nothing
     new; ``smoothed`` (n, 3) the same of the smoothed position; ``nees`` (n,) the squared normalised error (NaN without
-    a covariance); ``valid``: verdict; ``far`` (n,): distance of whatever was published from the truth, m.
+    a covariance); ``valid``: verdict; ``misleading``: valid, yet farther off than the alert limit or its own bound.
     """
 
     scene: NDArray[np.intp]
     frame: NDArray[np.intp]
     judged: NDArray[np.bool_]
     valid: NDArray[np.bool_]
+    misleading: NDArray[np.bool_]
     error: Array
     smoothed: Array
     nees: Array
-    far: Array
     time_ms: Array
 
     @classmethod
@@ -46,10 +47,10 @@ class Track:
             np.array([r.frame for r in rows], dtype=np.intp),
             np.array([r.judged for r in rows], dtype=bool),
             np.array([r.valid for r in rows], dtype=bool),
+            np.array([r.misleading for r in rows], dtype=bool),
             np.array([r.error for r in rows]).reshape(-1, 6),
             np.array([r.smoothed for r in rows]).reshape(-1, 3),
             np.array([r.nees for r in rows]),
-            np.array([r.far for r in rows]),
             np.array([r.time_ms for r in rows]),
         )
 
@@ -66,13 +67,14 @@ class Row:
     frame: int
     judged: bool
     valid: bool
+    misleading: bool
     error: Array
     smoothed: Array
     nees: float
-    far: float
     time_ms: float
 
 
+ALERT_LIMIT_M = PolicySettings().alert_limit_m
 NOTHING6, NOTHING3 = np.full(6, np.nan), np.full(3, np.nan)
 
 
@@ -101,10 +103,10 @@ def monitor_for(sequence: Sequence, way: str) -> Monitor:
 
 def judge(record: FrameRecord, shot: Shot, scene: int, index: int, time_ms: float) -> Row:
     """A record against the truth.  NEES = error' covariance^-1 error, in the published convention."""
-    error, nees, far, smoothed = NOTHING6, np.nan, np.nan, NOTHING3
+    error, nees, off_m, smoothed = NOTHING6, np.nan, 0.0, NOTHING3
     if record.cam_T_grip is not None and record.covariance is not None:
         published = perturbation_between(from_record(record.cam_T_grip), shot.cam_T_grip)
-        far = float(np.linalg.norm(published[:3]))
+        off_m = float(np.linalg.norm(published[:3]))
         if record.source is not Origin.HELD:
             error = published
             nees = float(error @ np.linalg.solve(np.reshape(record.covariance, (6, 6)), error))
@@ -113,7 +115,9 @@ def judge(record: FrameRecord, shot: Shot, scene: int, index: int, time_ms: floa
         smooth_T = make_transform(rotation_from_xyzw(s.rotation_xyzw), np.array(s.translation_m))
         smoothed = perturbation_between(smooth_T, shot.cam_T_grip)[:3]
     valid = record.verdict is Verdict.VALID
-    return Row(scene, index, shot.judged, valid, error, smoothed, nees, far, time_ms)
+    bound_m = np.inf if record.protection is None else record.protection.position_m
+    misleading = valid and off_m > min(ALERT_LIMIT_M, bound_m)
+    return Row(scene, index, shot.judged, valid, misleading, error, smoothed, nees, time_ms)
 
 
 class PeerRun:
@@ -129,10 +133,9 @@ class PeerRun:
         jaw_m = gripper.jaw_nominal_m if jaw_m is None else min(max(jaw_m, gripper.jaw_min_m), gripper.jaw_max_m)
         pose, time_ms = timed(self._peer, image, jaw_m)
         error = NOTHING6 if pose is None else perturbation_between(pose, shot.cam_T_grip)
-        far = float(np.linalg.norm(error[:3]))
-        if far > LOST_M:
+        if np.linalg.norm(error[:3]) > LOST_M:
             error = NOTHING6
-        return Row(self._scene, index, shot.judged, False, error, NOTHING3, np.nan, far, time_ms)
+        return Row(self._scene, index, shot.judged, False, False, error, NOTHING3, np.nan, time_ms)
 
 
 def run(sequences: Iterable[Sequence], peers: tuple[str, ...]) -> dict[str, Track]:

@@ -10,8 +10,6 @@ from benchmarks.accuracy_runs import Track
 from benchmarks.conditions import CLEAN, Limit
 from benchmarks.peers import MARKERLESS
 
-WRONG_M = 2e-4
-"""A valid transform further from the truth than this is a lie."""
 GATE = 22.46
 """Chi-square of six degrees of freedom that one value in a thousand exceeds."""
 NEES_RANGE, IN_GATE = (4.5, 7.5), 0.99
@@ -26,20 +24,18 @@ Figures = dict[str, Any]
 def figures(track: Track, fps: float, limit_um: Limit | None, *, always_seen: bool, standing: bool) -> Figures:
     """Plain values of one estimator on one condition; lengths in µm, rotations in millidegrees, times in ms.
 
-    Errors are those of judged frames that gave a new transform; ``wrong`` is over all frames, judged or not.
+    Errors are those of judged frames that gave a new transform; ``misleading`` is over all frames, judged or not.
     """
     judged, measured = track.judged, track.judged & track.measured
     error_um = 1e6 * np.abs(track.error[measured, :3])
     turn_mdeg = 1e3 * np.rad2deg(np.linalg.norm(track.error[measured, 3:], axis=1))
     sure = measured & track.valid & np.isfinite(track.nees)
-    wrong = track.valid & (track.far > WRONG_M)
     out: Figures = {
         "frames": int(judged.sum()),
         "scenes": len(set(track.scene.tolist())),
         "measured": share(track.measured[judged]),
         "valid": share(track.valid[judged]),
-        "wrong": share(wrong),
-        "wrong_frames": [[int(s), int(f)] for s, f in zip(track.scene[wrong], track.frame[wrong], strict=True)],
+        "misleading": share(track.misleading),
         "mean_um": over(error_um, "mean"),
         "p95_um": over(error_um, "p95"),
         "max_um": over(error_um, "max"),
@@ -89,13 +85,13 @@ def against_peers(ours: Figures, peers: dict[str, Figures]) -> Figures:
 
 def verdict(row: Figures, limit_um: Limit, *, always_seen: bool) -> str:
     """``met``, or by which factor the mean error exceeds the limit on the worst axis, and what else is wrong: frames
-    without a transform where the gripper shows (lost), valid ones that are wrong (lies), a covariance that is not true.
+    without a transform where the gripper shows (lost), misleading ones, a covariance that is not true.
     """
     faults = [] if row["mean_um"] is None else [factor_text(row["mean_um"], limit_um)]
     if always_seen and row["measured"] < 1.0:
         faults.append(f"lost {100.0 * (1.0 - row['measured']):.1f} %")
-    if row["wrong"] > 0.0:
-        faults.append(f"lies {100.0 * row['wrong']:.1f} %")
+    if row["misleading"] > 0.0:
+        faults.append(f"misleading {100.0 * row['misleading']:.1f} %")
     if row["nees"] is not None and (row["nees"] > NEES_RANGE[1] or row["in_gate"] < IN_GATE):
         faults.append("covariance too small")
     elif row["nees"] is not None and row["nees"] < NEES_RANGE[0]:

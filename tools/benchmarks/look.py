@@ -20,7 +20,7 @@ from benchmarks.rendered import all_row_names, sequences
 from benchmarks.scenes import Sequence, Shot, make_scene
 from gripmon.judge.drift import DriftSettings
 from gripmon.model.geometry import to_record
-from gripmon.model.records import Array, FrameRecord, ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.settings import LookSettings
 
@@ -130,13 +130,7 @@ class _Both:
             monitor.learn()
             row = judge(record, shot, 0, index, time_ms)
             self.rows[k].append(row)
-            self.misleading[k] += row.valid and _misleads(record, row)
-
-
-def _misleads(record: FrameRecord, row: Row) -> bool:
-    """Farther off than the alert limit, or than its own bound."""
-    bound = MonitorSettings().policy.alert_limit_m
-    return row.far > bound or (record.protection is not None and row.far > record.protection.position_m)
+            self.misleading[k] += row.misleading
 
 
 def _three(values: Array) -> str:
