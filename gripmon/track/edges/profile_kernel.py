@@ -46,10 +46,10 @@ _at = np.uintp
 
 
 @compiled
-def read_profiles(image: Any, map_x: Any, map_y: Any) -> Any:
+def read_profiles(image: Any, map_x: Any, map_y: Any, full_scale: float) -> Any:
     """Grey levels (n, s): an image (h, w, 1 or 3), blue first, interpolated at maps (r, n, s), mean over r.  By cubic
     convolution with the slope :data:`SHARPNESS` (Keys 1981), which no step rounds; beyond the image everything is as at
-    its border.  What is not a number is read there, too.
+    its border.  What is not a number is read there, too.  A colour that is cut off near a search line doesn't count.
     """
     rows, count, samples = map_x.shape
     profiles = np.empty((count, samples))
@@ -67,7 +67,8 @@ def read_profiles(image: Any, map_x: Any, map_y: Any) -> Any:
         width, height = right - left + 4, bottom - top + 4
         if width * height > len(patch):
             patch = np.empty(width * height)
-        _cut_out(image, left - 1, top - 1, width, height, patch)
+        weights = _whole_colours(image, left - 1, top - 1, width, height, SATURATION_SHARE * full_scale)
+        _cut_out(image, left - 1, top - 1, width, height, weights, patch)
         for q in range(taps):
             base[q] = (row[q] - top) * width + (column[q] - left)
         _interpolate(patch, base, width, across, down, grey)
@@ -114,8 +115,31 @@ def _extent(whole: Any) -> tuple[int, int]:
 
 
 @compiled
-def _cut_out(image: Any, left: int, top: int, width: int, height: int, patch: Any) -> None:
-    """Grey levels of a part of the image, row by row; beyond the image those at its border."""
+def _whole_colours(
+    image: Any, left: int, top: int, width: int, height: int, level: float
+) -> tuple[float, float, float]:
+    """What blue, green and red are worth in the grey of a part of the image: nothing where a pixel has a ``level`` at
+    which they are cut off, which would shift its edges before the grey of all three shows it; unless all are.
+    """
+    rows, columns, channels = image.shape
+    blue, green, red = BLUE, GREEN, RED
+    if channels == 3:
+        for y in range(min(max(top, 0), rows - 1), min(max(top + height, 1), rows)):
+            for x in range(min(max(left, 0), columns - 1), min(max(left + width, 1), columns)):
+                blue = 0.0 if image[y, x, 0] >= level else blue
+                green = 0.0 if image[y, x, 1] >= level else green
+                red = 0.0 if image[y, x, 2] >= level else red
+    total = blue + green + red
+    return (blue / total, green / total, red / total) if total > 0.0 else (BLUE, GREEN, RED)
+
+
+@compiled
+def _cut_out(
+    image: Any, left: int, top: int, width: int, height: int, weights: tuple[float, float, float], patch: Any
+) -> None:
+    """Grey levels of a part of the image, row by row; beyond the image those at its border.  ``weights`` of blue, green
+    and red.
+    """
     rows, columns, channels = image.shape
     if channels == 1 and left >= 0 and top >= 0 and left + width <= columns and top + height <= rows:
         for v in range(height):
@@ -128,7 +152,7 @@ def _cut_out(image: Any, left: int, top: int, width: int, height: int, patch: An
             x = min(max(left + u, 0), columns - 1)
             grey = float(image[y, x, 0])
             if channels == 3:
-                grey = BLUE * grey + GREEN * image[y, x, 1] + RED * image[y, x, 2]
+                grey = weights[0] * grey + weights[1] * image[y, x, 1] + weights[2] * image[y, x, 2]
             patch[v * width + u] = grey
 
 

@@ -73,7 +73,8 @@ def read_profiles(
     image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32], response: str = "linear"
 ) -> Array:
     """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: grey levels (n, s), which no step of
-    it rounds.  Colour (blue first) is reduced to grey here, so that cost grows with edges.
+    it rounds.  Colour (blue first) is reduced to grey here, so that cost grows with edges: of those colours that aren't
+    cut off (overexposed) near a search line, if there are any.
 
     OpenCV's bicubic kernel; beyond the image everything is as at its border.  With the ``response`` srgb grey levels in
     proportion to the light, which the lens blurs: an edge lies in the middle of that (IEC 61966-2-1).
@@ -83,7 +84,10 @@ def read_profiles(
     if map_x.ndim == 2:
         map_x, map_y = map_x[None], map_y[None]
     profiles: Array = profile_kernel.read_profiles(
-        _pixels(image), np.ascontiguousarray(map_x, np.float32), np.ascontiguousarray(map_y, np.float32)
+        _pixels(image),
+        np.ascontiguousarray(map_x, np.float32),
+        np.ascontiguousarray(map_y, np.float32),
+        full_scale(image),
     )
     if response == "linear":
         return profiles

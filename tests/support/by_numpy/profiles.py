@@ -17,7 +17,7 @@ from gripmon.track.edges.profile_kernel import (
     SHARPNESS,
     SURELY,
 )
-from gripmon.track.edges.profiles import BESIDE_SAMPLES, Candidates, Edgels, _kernel, _pixels
+from gripmon.track.edges.profiles import BESIDE_SAMPLES, Candidates, Edgels, _kernel, _pixels, full_scale
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
 
@@ -25,10 +25,17 @@ def read_profiles(
     image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32], response: str = "linear"
 ) -> Array:
     pixels = _pixels(image).astype(float)
-    grey = pixels @ [BLUE, GREEN, RED] if pixels.shape[2] == 3 else pixels[:, :, 0]
-    (column, across), (row, down) = _cubic(map_x, grey.shape[1]), _cubic(map_y, grey.shape[0])
-    columns = [sum(down[j] * grey[row[j], column[i]] for j in range(4)) for i in range(4)]
-    return np.asarray(sum(across[i] * columns[i] for i in range(4)).mean(axis=0))
+    (column, across), (row, down) = _cubic(map_x, pixels.shape[1]), _cubic(map_y, pixels.shape[0])
+    columns = [sum(down[j][..., None] * pixels[row[j], column[i]] for j in range(4)) for i in range(4)]
+    colours = np.asarray(sum(across[i][..., None] * columns[i] for i in range(4)).mean(axis=0))
+    if pixels.shape[2] == 1:
+        return np.asarray(colours[..., 0])
+    left, right = column[0].min(axis=(0, 2)), column[3].max(axis=(0, 2)) + 1
+    top, bottom = row[0].min(axis=(0, 2)), row[3].max(axis=(0, 2)) + 1
+    cut_off = pixels >= SATURATION_SHARE * full_scale(image)
+    whole = [~cut_off[a:b, c:d].any(axis=(0, 1)) for a, b, c, d in zip(top, bottom, left, right, strict=True)]
+    weights = np.array([BLUE, GREEN, RED]) * np.where(np.any(whole, axis=1, keepdims=True), whole, True)
+    return np.asarray(np.einsum("nsc,nc->ns", colours, weights / weights.sum(axis=1, keepdims=True)))
 
 
 def _cubic(place: NDArray[np.float32], size: int) -> tuple[list[NDArray[np.intp]], list[Array]]:
