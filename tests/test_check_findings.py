@@ -171,6 +171,8 @@ def test_images_of_a_colour_camera_are_a_warning_until_their_response_is_said(
         capsys.readouterr()
         _, found = checked(config, capsys)
         assert found["source"][0] == level and ("response: srgb" in found["source"][1]) == (level == "WARN")
+        main(["run", str(config)])  # of a live camera, only this tells
+        assert ("response: srgb" in capsys.readouterr().err) == (level == "WARN")
 
 
 def test_corners_of_which_none_can_be_measured_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -119,10 +119,13 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
         first, *more = unreadable
         others = f", nor can the next {len(more)}" if more else ""
         return detail, f"its first frame can't be read ({first}){others}"
-    return detail, None if isinstance(config, SecondConfig) else _unlike_light(config, frame.image)
+    return detail, None if isinstance(config, SecondConfig) else unlike_light(config, frame.image)
 
 
-def _unlike_light(config: Config, image: Image) -> str | None:
+def unlike_light(config: Config, image: Image) -> str | None:
+    """What is odd about an image's grey levels: a colour camera's, of which the configuration doesn't say how they
+    follow the light.
+    """
     told = config.settings.monitor.corners.edges.response != "linear"
     if told or image.ndim < 3 or image.dtype != np.uint8 or float(np.ptp(image, axis=2).mean()) < COLOURED_LEVELS:
         return None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Unpack
 
@@ -20,11 +22,14 @@ from gripmon.model.records import (
     CommandReply,
     Frame,
     FrameRecord,
+    Image,
     MonitorState,
     unmeasured_record,
     withheld,
 )
 from gripmon.monitor import Monitor
+
+_log = logging.getLogger(__name__)
 
 KEEP_LAST_EVERY_S = 60.0
 """How old the stored last transform may be; references and alerts are stored when they change."""
@@ -40,10 +45,13 @@ class Daemon(Loop):
         estimates: EstimatesFile,
         jaw: JawFeed | None = None,
         keeper: StateKeeper | None = None,
+        odd_about: Callable[[Image], str | None] = lambda _: None,
         **parts: Unpack[Parts],
     ) -> None:
+        """``odd_about``: what the log says of the first image, None for nothing."""
         super().__init__(**parts)
         self._monitor = monitor
+        self._odd_about: Callable[[Image], str | None] | None = odd_about
         self._estimates = estimates
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
@@ -71,6 +79,10 @@ class Daemon(Loop):
     def _handle(self, frame: Frame) -> None:
         arrived_ns = frame.arrived_ns if frame.arrived_ns is not None else time.monotonic_ns()
         self._seq = frame.seq
+        if self._odd_about is not None and frame.image is not None:
+            if odd := self._odd_about(frame.image):
+                _log.warning("%s", odd)
+            self._odd_about = None
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
         several = self._not_alone()

@@ -25,7 +25,7 @@ from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish.inputs import ZenohPulses
 from gripmon.laser.matching import ReportedPulse
 from gripmon.laser.watching import PulsedWatch
-from gripmon.model.records import FrameRecord, Outlines
+from gripmon.model.records import FrameRecord, Image, Outlines
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
 
@@ -42,6 +42,7 @@ def run(
     keeper: StateKeeper | None = None,
     duration_s: float | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
+    odd_about: Callable[[Image], str | None] = lambda _: None,
     **parts: Unpack[Parts],
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal arrives; then close everything that was passed in.
@@ -50,14 +51,15 @@ def run(
     frame; raises OSError if it can't be opened.  ``jaw``, if given, replaces the frames' own jaw opening.  ``keeper``
     stores the monitor's state for a restart.  ``reports``: additional values of the state message; ``notices``: alerts
     from the start-up; ``stop``: a stop request from the start-up (:func:`gripmon.model.stopping.signals_exit`);
-    ``outlines``: the gripper's outlines for snapshots.  The logger ``gripmon`` is left as the caller set it up (see
-    :func:`gripmon.daemon.service.log_to_stderr`).
+    ``outlines``: the gripper's outlines for snapshots; ``odd_about``: what the log says of the first image.  The logger
+    ``gripmon`` is left as the caller set it up (see :func:`gripmon.daemon.service.log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame, the source failed, or
     internal errors persisted; 130 SIGINT.
     """
     with _closing(parts, estimates, jaw, keeper, outlines) as lines:
-        return Daemon(monitor, estimates=lines, jaw=jaw, keeper=keeper, **parts).run(duration_s)
+        daemon = Daemon(monitor, estimates=lines, jaw=jaw, keeper=keeper, odd_about=odd_about, **parts)
+        return daemon.run(duration_s)
 
 
 def run_second(

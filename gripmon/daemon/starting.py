@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from gripmon.daemon.api import Monitor, look_ahead, open_configured
+from gripmon.daemon.api import Monitor, look_ahead, open_configured, unlike_light
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_second
 from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
 from gripmon.daemon.forecast import limits_warning
@@ -155,6 +155,7 @@ def run_monitor(
             duration_s=duration_s,
             stop=stop,
             outlines=lambda record: _outlines(config, record),
+            odd_about=lambda image: unlike_light(config, image),
         )
 
 
