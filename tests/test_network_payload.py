@@ -26,6 +26,9 @@ def test_raw_pixels_of_every_encoding_are_what_they_were():
     bgr, mono = colour(), grey()
     bgr16, mono16 = colour(1, np.uint16), grey().astype(np.uint16) * 257
     alpha = grey(7)[:, :, None]
+    # White of video, 235, is the end of the range.
+    luma = np.where(mono < 20, 235, mono).astype(np.uint8)
+    of_luma = np.rint(np.minimum(luma * (255.0 / 235.0), 255.0)).astype(np.uint8)
     expected: dict[str, tuple[np.ndarray, np.ndarray]] = {
         "mono8": (mono, mono),
         "8UC1": (mono, mono),
@@ -38,8 +41,8 @@ def test_raw_pixels_of_every_encoding_are_what_they_were():
         "rgb16": (bgr16[:, :, ::-1].astype("<u2"), bgr16),
         "bgra8": (np.concatenate([bgr, alpha], axis=2), bgr),
         "rgba8": (np.concatenate([bgr[:, :, ::-1], alpha], axis=2), bgr),
-        "yuv422_yuy2": (np.stack([mono, grey(3)], axis=2), mono),
-        "yuv422": (np.stack([grey(3), mono], axis=2), mono),
+        "yuv422_yuy2": (np.stack([luma, grey(3)], axis=2), of_luma),
+        "yuv422": (np.stack([grey(3), luma], axis=2), of_luma),
     }
     for encoding, (pixels, image) in expected.items():
         out = decoded(pixels.tobytes(), raw_note(encoding))

@@ -13,6 +13,9 @@ from gripmon.model.records import Frame, Image, Refusal
 BLUE, GREEN, RED = 0.114, 0.587, 0.299
 """Luma weights of ITU-R BT.601."""
 
+_LUMA_WHITE = 235  # of BT.601: brighter light is cut off there, which has to be the end of the grey levels, too
+_GREY_OF_LUMA = np.rint(np.minimum(np.arange(256), _LUMA_WHITE) * (255.0 / _LUMA_WHITE)).astype(np.uint8)
+
 GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
 """The same weights in OpenCV's channel order."""
 
@@ -51,7 +54,7 @@ ENCODINGS: dict[str, Pixels] = {
     "rgb16": Pixels(3, "u2", "COLOR_RGB2BGR"),
     "bgra8": Pixels(4, "u1", "COLOR_BGRA2BGR"),
     "rgba8": Pixels(4, "u1", "COLOR_RGBA2BGR"),
-    # Keep only the luma: it is all that is measured.
+    # Keep only the luma, white at the end of the range: it is all that is measured.
     "yuv422_yuy2": Pixels(2, "u1", only=0),
     "yuv422": Pixels(2, "u1", only=1),
     **_bayer(),
@@ -70,12 +73,13 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
         image = image[:, :, pixels.only]
     # OpenCV handles only the machine's own byte order.
     image = np.ascontiguousarray(image, dtype=f"={pixels.dtype}")
-    if pixels.conversion is None:
+    if pixels.only is None and pixels.conversion is None:
         return image
     import cv2
 
-    converted: Image = cv2.cvtColor(image, getattr(cv2, pixels.conversion))
-    return converted
+    if pixels.conversion is None:
+        return np.asarray(cv2.LUT(image, _GREY_OF_LUMA))
+    return np.asarray(cv2.cvtColor(image, getattr(cv2, pixels.conversion)))
 
 
 def in_full_scale(frame: Frame, bit_depth: int) -> Frame:
