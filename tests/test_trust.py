@@ -551,17 +551,20 @@ def test_the_same_frames_give_the_same_records_to_the_byte():
 # --- light ---
 
 
-@pytest.mark.parametrize("gain", [1.0, 3.0])
-def test_white_that_is_cut_off_beside_the_fingers_is_named(gain: float):
-    """A table of 110 DN, as it is and three times as bright: how far the edges are shifted by what the sensor cuts off
-    can't be seen.
+@pytest.mark.parametrize(("gain", "black_dn", "whole"), [(1.0, 0.0, True), (3.0, 0.0, False), (1.5, 95.0, False)])
+def test_white_and_black_that_is_cut_off_beside_the_fingers_is_named(gain: float, black_dn: float, whole: bool):
+    """A table of 110 DN as it is; three times as bright; and with a black level above the fingers' grey: how far the
+    edges are shifted by what is cut off can't be seen.
     """
     frames, truths = frames_of(scene(8, background=Background(kind="plain", level_dn=110.0, boxes=0, cables=0)))
-    lit = tuple(replace(f, image=np.clip(gain * f.image.astype(float), 0.0, 255.0).astype(np.uint8)) for f in frames)
-    seen = watch(lit, truths, new_monitor())
+
+    def lit(image: np.ndarray) -> np.ndarray:
+        return np.clip(gain * (image.astype(float) - black_dn), 0.0, 255.0).astype(np.uint8)
+
+    seen = watch(tuple(replace(f, image=lit(f.image)) for f in frames), truths, new_monitor())
     assert_nothing_misleads(seen)
-    assert ["overexposed" in (record.reason or "") for record in seen.records[1:]] == [gain > 1.0] * 7
-    assert valid(seen)[1:].all() == (gain == 1.0)
+    assert ["is cut off" in (record.reason or "") for record in seen.records[1:]] == [not whole] * 7
+    assert valid(seen)[1:].all() == whole
 
 
 @pytest.mark.parametrize("gains", [(0.5, 5.0, 0.5), (0.8, 2.5, 2.5), (1.0, 1.0, 1.0)])

@@ -275,7 +275,7 @@ class FrameAnalysis:
             standing.believed,
             since_first=error is not None and bool(error.any()),
             unproven=standing.unproven,
-            overexposed=2 * int(measurement.cut_off.sum()) > len(measurement.cut_off),
+            cut_off=2 * int(measurement.cut_off.sum()) > len(measurement.cut_off),
         )
 
     def _since_start(self, shift: Array, covariance: Array) -> Array | None:

@@ -70,7 +70,7 @@ class Evidence:
     ``believed``: the gripper may be taken to be there.
     ``since_first``: ``motion`` counts from where the first frames had the camera, which the reference allows, not
     from the reference.  ``unproven``: nothing in the frame proves where the gripper is, though a frame before did.
-    ``overexposed``: most of the gripper's edges lie beside white that is cut off.
+    ``cut_off``: most of the gripper's edges lie beside white or black that is cut off.
     """
 
     shift: Array
@@ -88,7 +88,7 @@ class Evidence:
     believed: bool = True
     since_first: bool = False
     unproven: bool = False
-    overexposed: bool = False
+    cut_off: bool = False
 
     @property
     def moved(self) -> bool:
@@ -164,8 +164,8 @@ class Policy:
             return "the stream of frames is at fault"
         if evidence.explanation.probable.cause in NO_REFERENCE:
             return evidence.explanation.text or str(evidence.explanation.probable.cause)
-        if beyond is not None and evidence.overexposed:
-            return f"{beyond}; white beside the fingers is overexposed, which shifts their edges: shorten the exposure"
+        if beyond is not None and evidence.cut_off:
+            return f"{beyond}; white or black beside the edges is cut off, which shifts them: change the exposure"
         return beyond
 
     def unmeasured(

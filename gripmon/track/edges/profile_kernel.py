@@ -29,7 +29,7 @@ FLAT_PEAK_CURVATURE = 1e-6
 """Curvature of a peak over its height below which rounding alone makes it one."""
 
 SATURATION_SHARE = 0.998
-"""Share of an image's range from which grey levels count as cut off: 254.5 of 255."""
+"""Share of an image's range from which grey levels count as cut off: 254.5 of 255; and 0.5 of 255 below."""
 
 SURELY, HARDLY = 1.1, 1.6
 """Way from an edge to the end of the range, in widths of the edge response: a step that is cut off at nine tenths of
@@ -67,7 +67,7 @@ def read_profiles(image: Any, map_x: Any, map_y: Any, full_scale: float) -> Any:
         width, height = right - left + 4, bottom - top + 4
         if width * height > len(patch):
             patch = np.empty(width * height)
-        weights = _whole_colours(image, left - 1, top - 1, width, height, SATURATION_SHARE * full_scale)
+        weights = _whole_colours(image, left - 1, top - 1, width, height, full_scale)
         _cut_out(image, left - 1, top - 1, width, height, weights, patch)
         for q in range(taps):
             base[q] = (row[q] - top) * width + (column[q] - left)
@@ -116,19 +116,20 @@ def _extent(whole: Any) -> tuple[int, int]:
 
 @compiled
 def _whole_colours(
-    image: Any, left: int, top: int, width: int, height: int, level: float
+    image: Any, left: int, top: int, width: int, height: int, full_scale: float
 ) -> tuple[float, float, float]:
-    """What blue, green and red are worth in the grey of a part of the image: nothing where a pixel has a ``level`` at
-    which they are cut off, which would shift its edges before the grey of all three shows it; unless all are.
+    """What blue, green and red are worth in the grey of a part of the image: nothing where they are cut off in a pixel,
+    which would shift its edges before the grey of all three shows it; unless all are.
     """
     rows, columns, channels = image.shape
+    white, black = SATURATION_SHARE * full_scale, (1.0 - SATURATION_SHARE) * full_scale
     blue, green, red = BLUE, GREEN, RED
     if channels == 3:
         for y in range(min(max(top, 0), rows - 1), min(max(top + height, 1), rows)):
             for x in range(min(max(left, 0), columns - 1), min(max(left + width, 1), columns)):
-                blue = 0.0 if image[y, x, 0] >= level else blue
-                green = 0.0 if image[y, x, 1] >= level else green
-                red = 0.0 if image[y, x, 2] >= level else red
+                blue = 0.0 if image[y, x, 0] >= white or image[y, x, 0] <= black else blue
+                green = 0.0 if image[y, x, 1] >= white or image[y, x, 1] <= black else green
+                red = 0.0 if image[y, x, 2] >= white or image[y, x, 2] <= black else red
     total = blue + green + red
     return (blue / total, green / total, red / total) if total > 0.0 else (BLUE, GREEN, RED)
 
@@ -297,7 +298,7 @@ def find_candidates(
             found[1, k] = response[c]
             found[2, k] = max(peak_noise / centre, step_px * unrest / curvature)
             found[3, k] = step_px * width
-            found[4, k] = _doubt(profiles, n, place, bright, width, SATURATION_SHARE * full_scale)
+            found[4, k] = _doubt(profiles, n, place, bright, width, full_scale)
             k += 1
     return (
         sample[:k].copy(),
@@ -326,21 +327,23 @@ def _unrest(change: Any, at: int, near: int, far: int) -> float:
 
 
 @compiled
-def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: float) -> float:
-    """From 0 for an edge that is surely whole to 1 for one whose bright side, ``side`` (-1 or 1) of its ``place`` in
-    search line ``n``, is surely cut off: there is grey of ``level`` within :data:`SURELY` to :data:`HARDLY` widths.
+def _doubt(profiles: Any, n: int, place: float, side: int, width: float, full_scale: float) -> float:
+    """From 0 for an edge that is surely whole to 1 for one that is surely cut off: within :data:`SURELY` to
+    :data:`HARDLY` widths of its ``place`` in search line ``n`` there is white at the end of the range on the bright
+    ``side`` (-1 or 1), or black at its beginning on the other.
 
     Overexposure cuts the upper part of a blurred step off; what is left is steepest nearer to the dark side, by up to
-    most of the edge's width.  By how much can't be told from the rest of the search line without knowing the lens's
-    blur exactly, so that such edges only get a larger standard deviation.
+    most of the edge's width.  So does a black level that is too high with the lower part, the other way round.  By how
+    much can't be told from the rest of the search line without knowing the lens's blur exactly, so that such edges only
+    get a larger standard deviation.
     """
-    start = int(np.rint(place))
+    start, white, black = int(np.rint(place)), SATURATION_SHARE * full_scale, (1.0 - SATURATION_SHARE) * full_scale
     for step in range(int(HARDLY * width) + 2):
-        k = start + side * step
-        if k < 0 or k >= profiles.shape[1]:
-            return 0.0
-        if profiles[n, k] >= level:
-            way = abs(k - place) / width
+        up, down = start + side * step, start - side * step
+        bright = 0 <= up < profiles.shape[1] and profiles[n, up] >= white
+        dark = 0 <= down < profiles.shape[1] and profiles[n, down] <= black
+        if bright or dark:
+            way = abs((up if bright else down) - place) / width
             return min(max((HARDLY - way) / (HARDLY - SURELY), 0.0), 1.0)
     return 0.0
 

@@ -36,7 +36,7 @@ class Candidates:
     """Edgel hypotheses of one image: ``sample`` (k,) index of the search line, ``offset_px`` (k,) along its normal,
     ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px`` (k,)
     standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a Gaussian,
-    ``cut_off`` (k,) from 0 to 1 how sure it is that its bright side is.  ``zoom``: factor on the lengths of the search
+    ``cut_off`` (k,) from 0 to 1 how sure it is that one of its sides is.  ``zoom``: factor on the lengths of the search
     lines that were read.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of the
     image's type.
     """
@@ -74,7 +74,7 @@ def read_profiles(
 ) -> Array:
     """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: grey levels (n, s), which no step of
     it rounds.  Colour (blue first) is reduced to grey here, so that cost grows with edges: of those colours that aren't
-    cut off (overexposed) near a search line, if there are any.
+    cut off (overexposed, or black) near a search line, if there are any.
 
     OpenCV's bicubic kernel; beyond the image everything is as at its border.  With the ``response`` srgb grey levels in
     proportion to the light, which the lens blurs: an edge lies in the middle of that (IEC 61966-2-1).
@@ -193,7 +193,7 @@ class Edgels:
     where the taught polarity disagrees; ``edge_spread_px`` (e,) the standard deviation that all points of an edge
     share.
 
-    ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
+    ``cut_off_px`` (e,): what comes on top where one of an edge's sides may be cut off; it isn't known well enough to
     prefer other edges.
     """
 

@@ -79,7 +79,7 @@ class Measurement:
     as it is known without the image; ``jaw_seen``: what the image tells of the report's error, None for nothing.
 
     ``blur_px``: standard deviation across the edges that agreed, None with few of them.  ``cut_off`` (v,): which of the
-    seen edges are less certain by white that is cut off beside them than by all else that their points share.
+    seen edges are less certain by what is cut off beside them, white or black, than by all else.
 
     ``trusted``: enough search lines agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.

@@ -32,7 +32,8 @@ def read_profiles(
         return np.asarray(colours[..., 0])
     left, right = column[0].min(axis=(0, 2)), column[3].max(axis=(0, 2)) + 1
     top, bottom = row[0].min(axis=(0, 2)), row[3].max(axis=(0, 2)) + 1
-    cut_off = pixels >= SATURATION_SHARE * full_scale(image)
+    end = full_scale(image)
+    cut_off = (pixels >= SATURATION_SHARE * end) | (pixels <= (1.0 - SATURATION_SHARE) * end)
     whole = [~cut_off[a:b, c:d].any(axis=(0, 1)) for a, b, c, d in zip(top, bottom, left, right, strict=True)]
     weights = np.array([BLUE, GREEN, RED]) * np.where(np.any(whole, axis=1, keepdims=True), whole, True)
     return np.asarray(np.einsum("nsc,nc->ns", colours, weights / weights.sum(axis=1, keepdims=True)))
@@ -171,16 +172,18 @@ def doubt(
     ``profiles`` (n, s) in grey levels up to ``end``; for each edge: its profile ``sample``, ``place`` and ``width`` of
     its response in samples, and on which ``side`` (-1, 1) it is bright.
     """
-    out = np.zeros(len(sample))
-    level = SATURATION_SHARE * end
-    if not (profiles >= level).any():
-        return out
-    last = profiles.shape[1] - 1
+    white, black = SATURATION_SHARE * end, (1.0 - SATURATION_SHARE) * end
     start = np.round(place).astype(np.intp)
     steps = np.arange(int(np.ceil(HARDLY * float(np.max(width, initial=1.0)))) + 2)
-    columns = np.clip(start[:, None] + side[:, None] * steps, 0, last)
-    reached = profiles[sample[:, None], columns] >= level
-    way = np.abs(start + side * reached.argmax(axis=1) - place) / width
-    out[:] = np.clip((HARDLY - way) / (HARDLY - SURELY), 0.0, 1.0)
-    out[~reached.any(axis=1)] = 0.0
+    out = np.zeros(len(sample))
+    nearest = np.full(len(sample), len(steps))
+    for toward, cut_off in ((-side, profiles <= black), (side, profiles >= white)):  # of two as near, the bright one
+        columns = start[:, None] + toward[:, None] * steps
+        inside = (columns >= 0) & (columns < profiles.shape[1])
+        reached = inside & cut_off[sample[:, None], np.clip(columns, 0, profiles.shape[1] - 1)]
+        step = np.where(reached.any(axis=1), reached.argmax(axis=1), len(steps))
+        way = np.abs(start + toward * step - place) / width
+        nearer = (step < len(steps)) & (step <= nearest)
+        out[nearer] = np.clip((HARDLY - way) / (HARDLY - SURELY), 0.0, 1.0)[nearer]
+        nearest = np.minimum(nearest, step)
     return out
