@@ -23,7 +23,7 @@ from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import Measurement
 
 BY_HAND_PX = 1.0
-"""Standard deviation of a corner that a person set by hand, where it wasn't measured or instead of the measured one."""
+"""Standard deviation of a corner set by hand that replaces a measured one, or one that couldn't be measured."""
 
 MADE_TO_M = 2e-5
 """Manufacturing tolerance of a fingertip's corners against the gripper file (each coordinate, standard deviation)."""

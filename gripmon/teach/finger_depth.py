@@ -28,12 +28,12 @@ MAJORITY = 0.5
 """Least part of the total length of candidate edges that must run along the fingers, as in the monitor's search for
 their ends."""
 ALONG_RAD = math.radians(50.0)
-"""Largest angle between an edge's image and the direction to the tip: perspective turns edges along a finger so far."""
+"""Largest angle between the image of an edge along a finger and the direction to its tip: perspective turns it."""
 STEEPEST = 0.25
 """Cosine between line of sight and fingers below which the contact plane is too oblique to place corners on it."""
-AT_ONCE = 0.75
-"""Least part of the turn, within the length of a cut corner, that a corner makes at once.  On the tightest curve that
-isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
+CORNER_TURN_SHARE = 0.75
+"""Least part of the turn, within the length of a cut corner, that a corner makes at its first vertex.  On the
+tightest curve that isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
@@ -268,7 +268,7 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
         ahead = finger.xy[to] - finger.xy[at]
         turns.append(math.atan2(way[0] * ahead[1] - way[1] * ahead[0], float(way @ ahead)))
         way, at, travelled_px = ahead, to, travelled_px + length_px
-    return bool(turns) and abs(turns[0]) < AT_ONCE * abs(sum(turns))
+    return bool(turns) and abs(turns[0]) < CORNER_TURN_SHARE * abs(sum(turns))
 
 
 def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], direction: Array, height: float) -> None:
@@ -318,7 +318,7 @@ def innermost(tips: Sequence[Array]) -> list[Array]:
     for _ in range(_ROUNDS):
         across = inner[1] - inner[0]
         far = [p @ across / float(np.linalg.norm(across)) for p in points]
-        # Vertices within a tenth of the gap of the innermost one: the paper's rectangle has two on each finger.
+        # Vertices within a tenth of the gap of the innermost one: corners in a rectangle have two on each finger.
         gap = abs(float(far[1].min() - far[0].max()))
         near = far[0] > far[0].max() - 0.1 * gap, far[1] < far[1].min() + 0.1 * gap
         inner = [p[chosen].mean(axis=0) for p, chosen in zip(points, near, strict=True)]

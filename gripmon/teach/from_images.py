@@ -45,8 +45,8 @@ Pose = tuple[Array, Array]
 class GripperFromImages:
     """``gripper`` and its pose: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the TCP
     then rotation, camera axes.  ``opening_m``: at which the coordinates hold; ``outline_sigma_px``: median standard
-    deviation of the outline's vertices from their scatter over the images; ``left_out``: images that weren't used, and
-    why; ``notes``: what is unknown or was assumed.
+    deviation of the outline's vertices from their scatter over the images, and ``images``, the number of these, both at
+    this opening; ``left_out``: images that weren't used, and why; ``notes``: what is unknown or was assumed.
     """
 
     gripper: Gripper
@@ -135,8 +135,8 @@ def gripper_from_images(
 ) -> GripperFromImages:
     """A gripper and its reference from ten to some hundred ``images`` in front of changing backgrounds.
 
-    ``openings_m``: the jaw's opening in each image (None: images of one opening are found from the images); every
-    opening that is to be used needs at least ten images.  The scale comes from ``distance_m`` (of the fingertips from
+    ``openings_m``: the jaw's opening in each image (None: images of one opening are recognised by themselves); an
+    opening with fewer than ten images isn't used.  The scale comes from ``distance_m`` (of the fingertips from
     the camera, along the optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference``
     calibration, or from several openings.
 
@@ -185,7 +185,7 @@ def gripper_from_images(
     else:
         assert reference is not None
         cam_T_grip, covariance = reference
-    notes += _said(placed, scale, reference, left_out, len(taken))
+    notes += _assumptions(placed, scale, reference, left_out, len(taken))
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
     used = len(seen.matte.kept)
@@ -353,7 +353,9 @@ def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) 
     return out
 
 
-def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int) -> list[str]:
+def _assumptions(
+    placed: Placed, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int
+) -> list[str]:
     """What is unknown or was assumed, as texts."""
     notes = []
     if reference is None:

@@ -24,13 +24,14 @@ from gripmon.track.edges.roles import PARALLEL_COSINE
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0
 """Largest distance, besides its own scatter, by which the line of an inner edge may miss the outline's corner that it
-runs to: on a bevel of 0.25 mm, 100 mm away, it lies this far beside it."""
+runs to: with a bevel of 0.25 mm, 100 mm away, it misses it by as much."""
 LARGEST_GAP = 0.5
-"""Largest gap between such an edge and its corner, over its length: there its line is known as well as along itself."""
+"""Largest gap between such an edge and its corner, over its length: there its line is less than twice as uncertain as
+at its end."""
 LONG_SIDE = 0.5
 """Least length of a finger's side over its longest side; shorter pieces belong to the curve at its end."""
 LONGEST_SHARE = 0.25
-"""Largest part of a side before a curve that counts with the curve."""
+"""Largest part of a straight side that is fitted with the curve that continues it."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Line:
     """An edge's offset at both ends of its sampled part, px, with its covariance (2, 2) from the points' scatter.
 
     ``inlier`` (k,): which points belong to it; ``rms_px``: their scatter; ``seen``: the part of the search lines that
-    show it; ``rival_px``: distance to another line that nearly as many search lines show, None if there is none.
+    show it; ``rival_px``: distance to another line that nearly as many points support, None if there is none.
     """
 
     ends_px: Array
@@ -59,27 +59,27 @@ class Line:
 
 
 def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line | None:
-    """The line that most search lines of all images show within ``reach_px`` of the expected one (2,); None if there is
-    none.
+    """The line that most edge points of all images support within ``reach_px`` of the expected one (2,), px at both
+    ends; None if there is none.
 
-    Of two lines seen equally well, the one closer to the expected line is taken.
+    Of two lines supported equally well, the one closer to the expected line is taken.
     """
     if len(points.way) < _FEWEST:
         return None
     shifts = np.arange(-round(reach_px / _STEP_PX), round(reach_px / _STEP_PX) + 1) * _STEP_PX
     starts = np.array([expected_px + s + 0.5 * t * np.array([-1.0, 1.0]) for s in shifts for t in _TILTS_PX])
     away = np.abs(starts.mean(axis=1) - expected_px.mean())
-    votes = _votes(points, starts)
-    wish = votes * (1.0 - 0.5 * np.square(away / (reach_px + _STEP_PX)))
-    best = int(wish.argmax())
+    support = _support(points, starts)
+    score = support * (1.0 - 0.5 * np.square(away / (reach_px + _STEP_PX)))
+    best = int(score.argmax())
     line = settle_line(points, starts[best])
     if line is None:
         return None
     apart = np.abs(starts.mean(axis=1) - line.ends_px.mean()) > 1.5 * _START_PX
-    rivals = np.flatnonzero(apart & (votes > 0.8 * votes[best]))
+    rivals = np.flatnonzero(apart & (support > 0.8 * support[best]))
     rival_px = None
     if len(rivals):
-        rival_px = float(starts[rivals[votes[rivals].argmax()]].mean() - line.ends_px.mean())
+        rival_px = float(starts[rivals[support[rivals].argmax()]].mean() - line.ends_px.mean())
     return Line(line.ends_px, line.covariance_px2, line.inlier, line.rms_px, line.seen, rival_px)
 
 
@@ -134,7 +134,7 @@ def of_image(points: EdgePoints, image: int) -> EdgePoints:
     )
 
 
-def _votes(points: EdgePoints, starts: Array) -> Array:
+def _support(points: EdgePoints, starts: Array) -> Array:
     """Sum (s,) over all points of a weight that decreases with their distance from each line (s, 2)."""
     lines = starts[:, :1] * (1.0 - points.way) + starts[:, 1:] * points.way
     nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
@@ -194,7 +194,7 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
 
 
 LARGEST_SLOPE = 5.0
-"""Largest depth per metre of offset: a face seen at less than 11° shows no depth."""
+"""Largest depth per metre of offset: that of a face 11° from the line of sight."""
 
 UNKNOWN_SLOPE = 2.0
 """Standard deviation of the depth per metre of offset where faces don't show it."""

@@ -23,9 +23,9 @@ from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
 from gripmon.teach.silhouette import Stations, in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX
 
-UNLIKE = 0.2
-"""Largest sum of both fingers' motions over their difference: jaws of which one is fixed have 1, tips at different
-depths that move alike a few hundredths."""
+LARGEST_COMMON_MOTION = 0.2
+"""Largest sum of both fingers' motions over their difference: it is 1 if one jaw is fixed, a few hundredths for tips at
+different depths that move equally far."""
 OFF_PLANE = 0.05
 """Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
 away."""
@@ -69,7 +69,7 @@ def place_by_motion(
     ]) / camera.fx_px  # fmt: skip
     tips = rough[:, :, 0]
     half = 0.5 * (tips[:, 1] - tips[:, 0])
-    if (np.linalg.norm(tips.sum(axis=1), axis=1) > UNLIKE * 2.0 * np.linalg.norm(half, axis=1)).any():
+    if (np.linalg.norm(tips.sum(axis=1), axis=1) > LARGEST_COMMON_MOTION * 2.0 * np.linalg.norm(half, axis=1)).any():
         return None
     far = int(np.linalg.norm(half, axis=1).argmax())
     start = np.concatenate([
@@ -102,7 +102,7 @@ def _tips(finger: Outline) -> NDArray[np.intp]:
 
 
 def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
-    """Vector (3,) from the middle of the first finger to that of the other, which looks alike."""
+    """Vector (3,) from the middle of the first finger to that of the other: mirror images have corresponding ones."""
     middles = []
     for finger, of_finger in zip(fingers, q, strict=True):
         points, ends = _rays(finger) / of_finger[:, None], np.reshape(finger.pieces, (-1, 2))
@@ -113,7 +113,7 @@ def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
 def _solve(
     camera: Camera, fingers: Sequence[Outline], seen: OpeningSeen, around: Sequence[OpeningSeen], half: Array, q: Array
 ) -> _Unknowns | None:
-    """Gauss-Newton with a new measurement in each iteration."""
+    """Gauss-Newton with a new measurement in each iteration; None where too little of a finger is seen."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     count, openings = int(first[-1]), len(around)
     size = count + 3 * len(fingers) + 2 * openings

@@ -33,7 +33,7 @@ ACCURACY_OPENINGS = 3
 
 
 class Mount(NamedTuple):
-    """Pose of a camera against the gripper, but for where in the image the TCP is.
+    """Pose of a camera against the gripper, except for where in the image the TCP is.
 
     ``distance_m`` from the camera's centre to the TCP.  ``tilt_rad`` (0 to pi) between the camera's optical axis and
     the gripper's z axis: 0 looks along the fingers.  ``side_rad``: the side of the gripper on which the camera is,

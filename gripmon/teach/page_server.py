@@ -1,4 +1,4 @@
-"""The page's web server: reachable only from this machine unless told otherwise, and only with the address's token.
+"""The page's web server: reachable only from this machine unless another address is given, and only with the token.
 
 A page of another site in the same browser can also send requests here, or have its name resolve to 127.0.0.1 (DNS
 rebinding).  So every request must name this host, carry the token in its path, and come from this page if the browser
@@ -173,7 +173,7 @@ class _Http(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that disconnects early is no error to report."""
+        """Log only for debugging: a browser that disconnects early isn't an error."""
         _log.debug("request of %s failed", client_address, exc_info=True)
 
 

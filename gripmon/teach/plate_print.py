@@ -158,8 +158,8 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Moves:
-    """``offset_px`` (n,), each search line's position of the line, and ``worth`` (n,), its relative information."""
+class LineOffsets:
+    """``offset_px`` (n,) of the edge on each search line, and its relative information ``worth`` (n,)."""
 
     offset_px: Array
     worth: Array
@@ -211,8 +211,8 @@ def rough_line(scene: Scene, way: Array, reach_px: float) -> Array:
     return best
 
 
-def moves(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> Moves:
-    """The correction of the line ``ends_px`` (2,) that each search line asks for."""
+def line_offsets(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> LineOffsets:
+    """Where each search line shows the edge, linearised about the line ``ends_px`` (2,)."""
     line = ends_px[0] * (1.0 - way) + ends_px[1] * way
     fit = _fit(scene, way, line, blur_px)
     step = (_predicted(scene, line + 0.25, blur_px) - _predicted(scene, line - 0.25, blur_px)) / 0.5
@@ -222,10 +222,10 @@ def moves(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> Moves:
     gr, fr = ((weight * a * left).sum(axis=1) for a in (slope, finger))
     worth = np.maximum(gg - gf**2 / ff, 0.0)
     move = (gr - gf / ff * fr) / np.maximum(worth, 1e-6 * max(float(worth.max()), 1e-12))
-    return Moves(line + move, worth)
+    return LineOffsets(line + move, worth)
 
 
-def sharpness(scene: Scene, way: Array, ends_px: Array) -> float:
+def estimate_blur_px(scene: Scene, way: Array, ends_px: Array) -> float:
     """Standard deviation (px) of the blur that explains the image best."""
     line = ends_px[0] * (1.0 - way) + ends_px[1] * way
     left = []

@@ -34,7 +34,7 @@ MISFIT_SIGMAS = (4.0, 12.0)
 nothing is found, and from which it must be mislabelled.
 """
 
-CLEARLY = 1.25
+MIRRORED_GAIN = 1.25
 """Factor by which mirrored corners must fit better before they are reported as exchanged."""
 
 _SPREAD = 24  # number of poses around that of the corners
@@ -146,7 +146,7 @@ class Snapper:
         if self._misfit(placed[0], MISFIT_SIGMAS[0]) is not None:
             return False
         other = self._found(image, placed, opening_m, reported)
-        return other is not None and other.trusted and _worth(other) > CLEARLY * worth
+        return other is not None and other.trusted and _worth(other) > MIRRORED_GAIN * worth
 
     def _measure(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, reported: bool) -> Measurement:
         meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)

@@ -177,7 +177,8 @@ class _Reader:
 
 
 def read_urdf(path: Path, joint: str | None) -> Linkage:
-    """Read a URDF's gripper, moved by ``joint`` (None: the only one that moves something and follows no other).
+    """Read a URDF's gripper, moved by ``joint``.  None: by the only joint that moves and mimics no other, or by two
+    such joints of one kind and range on one link, together.
 
     Raises :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which one opens the jaws.
     """
@@ -213,7 +214,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
 
 
 def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_Joint, dict[str, float]]:
-    """The jaws' joint, and each driving joint's value over its value: two equal ones move together."""
+    """The jaws' joint, and the joints driven with it, by name: the ratio of their values to its value."""
     free = [j for j in joints if j.kind != "fixed" and j.mimic is None]
     if name is not None:
         chosen = [j for j in free if j.name == name]
