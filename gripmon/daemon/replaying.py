@@ -126,7 +126,7 @@ class Counts:
         self.usable = 0
         self._verdicts: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()  # why nothing was measured, by the text before the colon
-        self._said: dict[str, str] = {}  # the first reason of each kind, whole
+        self._examples: dict[str, str] = {}  # the first reason of each kind, whole
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
@@ -137,7 +137,7 @@ class Counts:
         if record.reason and not record.measured:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
-            self._said.setdefault(kind, record.reason)
+            self._examples.setdefault(kind, record.reason)
         self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
 
     def summary(self) -> str:
@@ -147,10 +147,10 @@ class Counts:
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
         text = f"{self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
         if failed := self._reasons["internal error"]:
-            text += f"; {failed} failed ({self._said['internal error']})"
+            text += f"; {failed} failed ({self._examples['internal error']})"
         if not self.usable:
             reason = max(self._reasons, key=self._reasons.__getitem__, default="")
-            text += f"; no frame could be used ({self._said.get(reason, 'no measurement')})"
+            text += f"; no frame could be used ({self._examples.get(reason, 'no measurement')})"
         return text
 
     def _median_ms(self) -> float:

@@ -188,7 +188,10 @@ def rough_pose(
     jaw_opening_m: float | None,
     contact_m: float,
 ) -> Array:
-    """``cam_T_grip`` (4, 4) from rough corners of a known gripper, good to some pixels; or :class:`CalibrationError`."""
+    """``cam_T_grip`` (4, 4) from rough corners of a known gripper, good to some pixels.
+
+    Raises :class:`CalibrationError`.
+    """
     check_rough(gripper, rough)
     points_m = gripper.points_grip_m(jaw_opening_m)
     known = np.array([points_m[gripper.point_ids.index(name)] for name in rough])

@@ -47,8 +47,8 @@ _MOST_POINTS = 1500
 class Chain:
     """Consecutive vertices ``uv_px`` (v, 2) in the image, ``closed`` or from end to end.  ``folds_px`` (f, v, 2): the
     same with one tenth of the images left out; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px``
-    (pieces,) scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left in the
-    image.
+    (pieces,) scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left
+    in the image.
     """
 
     uv_px: Array

@@ -33,8 +33,9 @@ _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor ha
 
 
 class Seen(msgspec.Struct, frozen=True, kw_only=True):
-    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply; ``shown`` counts the pictures; ``lines``
-    of its log, the newest last; ``ended``: how it ended, None while it runs or if it was never started.
+    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply, and ``bound`` on its position's error, as a
+    text; ``shown`` counts the pictures; ``lines`` of its log, the newest last; ``ended``: how it ended, None while it
+    runs or if it was never started.
     """
 
     running: bool

@@ -25,7 +25,7 @@ from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite,
 from gripmon.teach.session import TeachSession
 
 _Name = Annotated[str, Meta(max_length=40)]
-_Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
+_Answers = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
 _PICTURES = {
     VIEW: "image/jpeg", "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png",
     "target.pdf": "application/pdf",
@@ -36,7 +36,7 @@ class Do(Request, frozen=True):
     """Carry out a step with the values of its fields."""
 
     step: _Name
-    values: _Said = msgspec.field(default_factory=dict)
+    values: _Answers = msgspec.field(default_factory=dict)
 
 
 class CaptureOrder(Request, frozen=True):
@@ -44,7 +44,7 @@ class CaptureOrder(Request, frozen=True):
 
     step: _Name
     action: Literal["start", "stop", "by_itself", "by_hand", "take", "next", "drop"]
-    values: _Said = msgspec.field(default_factory=dict)
+    values: _Answers = msgspec.field(default_factory=dict)
     name: Annotated[str, Meta(max_length=200)] = ""
 
 
@@ -171,7 +171,7 @@ class SetupSite:
         )  # fmt: skip
 
     def _picture(self, step: steps.Step) -> str | None:
-        """With the time at which it was written, so that the browser asks for each anew."""
+        """Its address, with the time at which it was written, so that the browser loads every new one."""
         if step.picture is None:
             return None
         with contextlib.suppress(FileNotFoundError):
@@ -185,7 +185,7 @@ class SetupSite:
         return (*field.choices, *grippers())
 
     def _box(self, field: steps.Field) -> str | None:
-        """Empty where nothing is to be confirmed, or no target is known yet."""
+        """Text of the field's box; None for another field, empty if there is nothing to confirm or no target yet."""
         if field.asks is None:
             return None
         with contextlib.suppress(InputError):

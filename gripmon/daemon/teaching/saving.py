@@ -65,7 +65,7 @@ class FileSaving:
         )
 
     def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
-        """As :class:`gripmon.teach.page.Saving`."""
+        """As :class:`gripmon.teach.session.Saving`."""
         paths = self._paths
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
@@ -97,7 +97,7 @@ class FileSaving:
         return Saved(written=written, notes=tuple(notes), next=follows)
 
     def _names_it_already(self, order: SaveOrder) -> bool:
-        """Whether a given configuration needs no change, which would only be to name the taught model."""
+        """Whether the given configuration stays as it is: it names a taught model already, or none is saved."""
         config = self._inputs.config
         return config is not None and (config.taught_path is not None or not order.taught)
 
