@@ -29,7 +29,7 @@ from gripmon.model.records import Array
 
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, count as contradicting their uncertainty."""
-IMPOSSIBLE, MISSHAPEN = 1e-6, 0.005
+RECTANGLE_PROBABILITY, RECTANGLE_MISFIT = 1e-6, 0.005
 """An inferred gripper's corners are not a rectangle if they are less probable than the first and deviate by more than
 the second, a fraction of their reach: fingers may be misaligned by less.
 """
@@ -163,7 +163,7 @@ def calibrate_plane(
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
     p_value = float(chdtrc(freedom, size)) if freedom else 1.0
-    if known is None and p_value < IMPOSSIBLE and _misfit(found) > MISSHAPEN:
+    if known is None and p_value < RECTANGLE_PROBABILITY and _misfit(found) > RECTANGLE_MISFIT:
         raise CalibrationError(_no_rectangle(corners.names, found.residuals_m, p_value))
     enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
     motion[:, len(own) - 2 * len(corners.names) : len(own)] *= enlarged
@@ -233,7 +233,7 @@ def _misfit(found: Standing) -> float:
 def _no_rectangle(names: Sequence[str], residuals_m: Array, p_value: float) -> str:
     sizes_m = np.linalg.norm(residuals_m, axis=1)
     return (
-        f"the innermost corners make no rectangle on the plate (probability {p_value:.1g}; "
+        f"the innermost corners don't form a rectangle on the plate (probability {p_value:.1g}; "
         f"{names[int(sizes_m.argmax())]} is {1e3 * float(sizes_m.max()):.3f} mm off): both "
         "fingertips flat on the plate, rough corners nearer to the real ones where a line of the plate runs beside a "
         "finger, the target as it was described"

@@ -31,7 +31,9 @@ INFERRED_FROM = 4
 LARGEST_MISFIT = 0.1
 """Residuals, over the corners' spread, above which they mean another gripper and not inaccuracy."""
 SMALLEST_SPREAD_M = 1e-5
-NO_RECTANGLE = "the innermost corners are no rectangle; two corners on each of two parallel fingertips, by their names"
+NO_RECTANGLE = (
+    "the innermost corners aren't a rectangle; two corners on each of two parallel fingertips, by their names"
+)
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 """Signs of x and y of the innermost corners."""
 
