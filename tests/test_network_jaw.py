@@ -213,7 +213,7 @@ def test_what_is_malformed_is_said_once_an_occasion(clock: list[float], caplog: 
         "over 100 malformed frames on a/b: reason 1",
         "over 1,000 malformed frames on a/b: reason 1",
     ]
-    assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (said once)"]
+    assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (logged once)"]
     clock[0] += link.REMEMBERED_S + 1.0
     assert seen.fault() == ""
     seen.add("another reason")
@@ -272,8 +272,8 @@ def test_what_is_said_is_the_fault_that_there_is(clock: list[float], caplog: pyt
             seen.add("640x480 pixels; 1280x720 as configured")
     assert seen.fault() == "some malformed frames on a/b: 640x480 pixels; 1280x720 as configured"
     assert [record.getMessage() for record in caplog.records] == [
-        "malformed frame on a/b: damaged JPEG file (said once)",
-        "malformed frame on a/b: 640x480 pixels; 1280x720 as configured (said once)",
+        "malformed frame on a/b: damaged JPEG file (logged once)",
+        "malformed frame on a/b: 640x480 pixels; 1280x720 as configured (logged once)",
     ]
     for _ in range(120):
         seen.add("damaged JPEG file")

@@ -127,7 +127,7 @@ def correct(
 
 def _check_target(out: Path, recordings: Sequence[Path]) -> None:
     if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{out}: is of no kind that can be written; one of {', '.join(_SUFFIXES)}", "out")
+        raise InputError(f"{out}: can't be written in this format; one of {', '.join(_SUFFIXES)}", "out")
     if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
         raise InputError(f"{out}: is a recording to correct; another file", "out")
 

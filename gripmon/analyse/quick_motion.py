@@ -174,7 +174,9 @@ LINE_OVER_FLOOR = 8.0
 don't overlap it is three times the floor on average).
 """
 LOWEST_BIN = 5
+"""First frequency bin in which a line is searched for; slower motion remains there."""
 SWING_FRAMES = 12
+"""Frames over which squares are averaged to find swinging."""
 SWING_OVER_USUAL, SWING_OVER_CLAIMED = 8.0, 5.0
 """Variance of a swinging camera's frames, in multiples of the usual one and of the reported one."""
 

@@ -21,10 +21,12 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 MAX_LAG_S = 30.0
+"""Longest lag of the second differences."""
 TRIMMED_FRACTION, TRIMMED_MEAN = 0.98, 0.8735
 """Fraction of the squares that is averaged (the rest may be outliers), and its mean for normal errors."""
 CHI2_MEDIAN = 0.4549
 MIN_WHITE_VARIANCE = 1e-4
+"""Least white variance; also the least mean square by which the fit's rows are weighted."""
 MIN_SLOW_VARIANCE = 0.3
 """Prior of the lasting error: the reported variance that is not found elsewhere, and at least this."""
 PRIOR_BACKGROUNDS = 3.0
