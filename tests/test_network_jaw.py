@@ -15,7 +15,7 @@ from support.loopback import free_endpoint, plain_session, wait_until
 from gripmon.io.publish.inputs import (
     MOST_REPORTS,
     DecodeOpening,
-    Reported,
+    ReportedOpening,
     StampedOpenings,
     ZenohJaw,
     opening_of_joints,
@@ -140,17 +140,17 @@ def test_stamps_of_another_clock_are_said_and_the_newest_is_taken():
 def test_between_rare_reports_the_jaw_moves_at_the_end():
     """A robot that reports changes says nothing while the jaws stand."""
     openings = StampedOpenings()
-    openings.add(Reported(1_000_000_000, 0.02), 0.0, 1.0)
-    openings.add(Reported(1_900_000_000, 0.03), 0.9, 1.0)
+    openings.add(ReportedOpening(1_000_000_000, 0.02), 0.0, 1.0)
+    openings.add(ReportedOpening(1_900_000_000, 0.03), 0.9, 1.0)
     assert openings.at(1_000_000_000) == openings.at(1_500_000_000) == openings.at(1_800_000_000) == 0.02
     assert openings.at(1_850_000_000) == pytest.approx(0.025)
     # Those of another order, and too many.
-    openings.add(Reported(1_860_000_000, 0.026), 0.91, 1.0)
+    openings.add(ReportedOpening(1_860_000_000, 0.026), 0.91, 1.0)
     assert openings.at(1_860_000_000) == 0.026 and openings.at(1_880_000_000) == pytest.approx(0.028)
     for k in range(2 * MOST_REPORTS):
-        openings.add(Reported(2_000_000_000 + k, 0.03), 1.0, 1.0)
+        openings.add(ReportedOpening(2_000_000_000 + k, 0.03), 1.0, 1.0)
     assert len(openings) == MOST_REPORTS
-    openings.add(Reported(3_000_000_000, 0.04), 2.5, 1.0)
+    openings.add(ReportedOpening(3_000_000_000, 0.04), 2.5, 1.0)
     assert len(openings) == 1
 
 

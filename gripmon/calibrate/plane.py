@@ -21,7 +21,7 @@ from gripmon.calibrate.bundle import (
     lens_vector,
     plate_pose,
 )
-from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, GripperOnPlate, off_plate, stand
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between
@@ -209,12 +209,12 @@ def _plate(lens: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle
     return cam_T_plate, covariance, bundle
 
 
-def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], Standing]:
+def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], GripperOnPlate]:
     """A function from a solution's inputs to the gripper's pose on the plate; ``made`` is the camera as calibrated."""
     each_px2, free = corners.each_px2, corners.free if known is not None else None
     known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
 
-    def solve(given: _Given) -> Standing:
+    def solve(given: _Given) -> GripperOnPlate:
         found = stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
         if free is None:
             return found
@@ -224,7 +224,7 @@ def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) ->
     return solve
 
 
-def _misfit(found: Standing) -> float:
+def _misfit(found: GripperOnPlate) -> float:
     """Misfit of the innermost corners, over their reach."""
     left, reach = found.residuals_m[:INFERRED_FROM], found.corners_m[:INFERRED_FROM, :2]
     return float(np.linalg.norm(left) / np.linalg.norm(reach))
@@ -288,7 +288,7 @@ def _ends(changed: Callable[[Array], _Given], covariance: Array) -> list[tuple[_
     return [(changed(_STEP * root), changed(-_STEP * root)) for root in independent_errors(covariance)]
 
 
-def _slope(up: Standing, down: Standing) -> tuple[Array, Array, Array]:
+def _slope(up: GripperOnPlate, down: GripperOnPlate) -> tuple[Array, Array, Array]:
     """Derivatives by one independent error, per standard deviation: of pose and inferred lengths (6 + s,), of the
     residuals (2c,), of tilt and gap (3,).
     """

@@ -39,7 +39,7 @@ _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class GripperOnPlate:
     """A gripper on a plate: ``corners_m`` (c, 3), given or inferred, ``residuals_m`` (c, 2) on the plate in the
     gripper's axes, ``apart`` (3,): tilt about the gripper's x and y (rad) and gap (m, positive if the gripper is nearer
     to the camera than the plate) of the pose that explains the corners best without the plate; None if undetermined.
@@ -58,7 +58,7 @@ def stand(
     covariance_px: Array,
     corners_m: Array | None,
     contact_m: float = 0.0,
-) -> Standing:
+) -> GripperOnPlate:
     """All steps for one image: ``uv_px`` (c, 2) weighted by ``covariance_px`` (c, 2, 2); the gripper's ``corners_m``
     (c, 3), whose contact plane lies at z = ``contact_m``, or None to infer them (see :func:`infer_rectangle`; then all
     are contact points).  Raises :class:`CalibrationError`.
@@ -91,7 +91,7 @@ def stand(
     plate_T_grip[:2, :2], plate_T_grip[:2, 3], plate_T_grip[2, 3] = _turn(q), shift, -contact_m
     cam_T_grip = cam_T_plate @ plate_T_grip
     apart = None if corners_m is None else _apart(cam_T_grip, xy, variance, corners_m)
-    return Standing(cam_T_grip, known, residuals, apart)
+    return GripperOnPlate(cam_T_grip, known, residuals, apart)
 
 
 def back_project(cam_T_plate: Array, xy: Array, z_plate_m: Array) -> Array:

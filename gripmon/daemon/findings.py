@@ -74,7 +74,7 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """A checked configuration: for a wrist camera a ``forecast``, for a second camera plain values (m, rad, px, ns),
     and the surroundings.
     """
@@ -98,17 +98,17 @@ class Checked:
         return [each for each in found if each is not None]
 
 
-def check_file(path: Path) -> Checked:
+def check_file(path: Path) -> CheckResult:
     """Check a configuration file of a wrist camera or a second camera.  Raises :class:`ConfigError`, and
     :class:`NoResultError` if a laser calibration or recorded frames can't be used.
     """
     if not is_second(path):
         config = load_config(path)
-        return Checked(forecast(config), None, _look_around(config))
+        return CheckResult(forecast(config), None, _look_around(config))
     second = load_second(path)
     around, watch = _look_around(second), second.settings.laser.watch
     expected = expectation(str(second.calibration_path), second.calibration, watch)
-    return Checked(None, {**_second_values(second), "foreseen": expected}, around)
+    return CheckResult(None, {**_second_values(second), "foreseen": expected}, around)
 
 
 def _look_around(config: Config | SecondConfig) -> Surroundings:

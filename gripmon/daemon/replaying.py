@@ -51,7 +51,7 @@ _log = logging.getLogger(__name__)
 _LATENCY_BIN = 0.02  # natural logarithm
 
 
-class Past(NamedTuple):
+class RecordedInputs(NamedTuple):
     """What affected a monitor besides its frames."""
 
     state: MonitorState | None = None
@@ -60,14 +60,14 @@ class Past(NamedTuple):
     """In order; each came after the frame that it names."""
 
 
-NOTHING_BEFORE = Past()
+NOTHING_BEFORE = RecordedInputs()
 
 
 def replay(
     source: str | Path | Source,
     config: Config,
     recorder: Recorder | None = None,
-    past: Past = NOTHING_BEFORE,
+    past: RecordedInputs = NOTHING_BEFORE,
     warn: Callable[[str], None] = _log.warning,
 ) -> Iterator[FrameRecord]:
     """Process every frame of a source that isn't live: one record each, in order; the same input gives the same
@@ -184,7 +184,7 @@ class FrameReplay:
     def records(self, step: Callable[[], None]) -> Iterator[FrameRecord]:
         """One record per frame; ``step`` is called after each."""
         recorded = self._recorded
-        past = NOTHING_BEFORE if recorded is None else Past(recorded.state, recorded.source.commands)
+        past = NOTHING_BEFORE if recorded is None else RecordedInputs(recorded.state, recorded.source.commands)
         for record in replay(self._source, self._config, self._recorder, past, self._warn):
             yield record
             self._counts.add(record)

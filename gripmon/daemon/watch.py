@@ -84,7 +84,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 1.8
 
 
-class Judged(NamedTuple):
+class FrameOutcome(NamedTuple):
     """What is kept of a frame.  ``usable``: it was measured; ``refused``: its image could not be used; ``reason``: what
     is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
@@ -99,7 +99,7 @@ class Judged(NamedTuple):
     protection_m: float | None = None
 
 
-_NOTHING = Judged(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
+_NOTHING = FrameOutcome(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
 
 
 class Watch:
@@ -129,7 +129,7 @@ class Watch:
         """A frame was judged; returns the alerts that are due besides the record's own."""
         return self.judged(_of_record(record), now_s)
 
-    def judged(self, frame: Judged, now_s: float) -> list[Alert]:
+    def judged(self, frame: FrameOutcome, now_s: float) -> list[Alert]:
         """The same for a frame of either kind of camera."""
         alerts = self._end_of_silence(now_s)
         self.frames += 1
@@ -207,7 +207,7 @@ class Watch:
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
-    def last(self) -> Judged:
+    def last(self) -> FrameOutcome:
         """What is kept of the last frame while its state and verdict still hold; otherwise one without values."""
         if (self.state, self.verdict) == (self._judged.state, self._judged.verdict):
             return self._judged
@@ -250,9 +250,9 @@ def _kind(message: str) -> str:
     return FIGURES.sub("", ":".join(message.split(":")[:2]))
 
 
-def _of_record(record: FrameRecord) -> Judged:
+def _of_record(record: FrameRecord) -> FrameOutcome:
     counts = record.verdict is not Verdict.UNKNOWN
-    return Judged(
+    return FrameOutcome(
         record.state,
         record.verdict,
         usable=record.source is not Origin.HELD,

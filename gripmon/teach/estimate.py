@@ -23,8 +23,8 @@ from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.records import Array
-from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, Pooled, find_line, pool, slopes
-from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
+from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
 from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
@@ -60,7 +60,7 @@ class EdgeLines:
     Without a line (``line`` None, no images) it is an outline in view of which too little is seen.
     """
 
-    sampled: Sampled
+    sampled: SampledEdge
     line: Line | None
     images: tuple[int, ...]
     ends_px: Array
@@ -107,7 +107,7 @@ class _Measured:
         rows = np.concatenate([np.array([edge.sampled.rows for edge in edges]), inset], axis=2)
         return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows)
 
-    def pooled(self, motion_covariance: Array) -> Pooled:
+    def pooled(self, motion_covariance: Array) -> PooledOffsets:
         """Pool all edges, with a prior (7, 7) of pose and opening."""
         prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
         return pool(
@@ -120,7 +120,7 @@ class _Measured:
         return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
 
 
-def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
+def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> PooledOffsets:
     """Error of the reference and the opening (``common``, the first 7) from the outlines, with a prior (7, 7) about
     zero.
 

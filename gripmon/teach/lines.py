@@ -19,7 +19,7 @@ _START_PX = 1.0  # half width of a line in the search: two lines closer than thi
 _FLOOR_PX = 0.05  # least assumed scatter of edge points: pixels are that coarse
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
-_FEWEST = 6
+_FEWEST_POINTS = 6
 _ROUNDS = 20
 _SETTLED_PX = 1e-4
 
@@ -64,7 +64,7 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
 
     Of two lines supported equally well, the one closer to the expected line is taken.
     """
-    if len(points.way) < _FEWEST:
+    if len(points.way) < _FEWEST_POINTS:
         return None
     shifts = np.arange(-round(reach_px / _STEP_PX), round(reach_px / _STEP_PX) + 1) * _STEP_PX
     starts = np.array([expected_px + s + 0.5 * t * np.array([-1.0, 1.0]) for s in shifts for t in _TILTS_PX])
@@ -95,7 +95,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
         residual = root * (points.offset_px - design @ ends_px)
         weight = tukey_weights(np.abs(residual), width)
         near = np.abs(residual) < width
-        if np.count_nonzero(near) < _FEWEST:
+        if np.count_nonzero(near) < _FEWEST_POINTS:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
         width = min(TUKEY * scale, _START_PX)
@@ -109,7 +109,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
             break
     residual = root * (points.offset_px - design @ ends_px)
     inlier = np.abs(residual) < width
-    if np.count_nonzero(inlier) < _FEWEST:
+    if np.count_nonzero(inlier) < _FEWEST_POINTS:
         return None
     # Neighbours see the same pixels and the same texture: a whole stretch of them counts as one point.
     rms_px = float(np.sqrt(np.mean(np.square(residual[inlier]))))
@@ -142,7 +142,7 @@ def _support(points: EdgePoints, starts: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Pooled:
+class PooledOffsets:
     """Offsets ``ends_m`` (e, 2) and their covariances (e, 2, 2); ``own_m`` (e, 2), the part that is the edges' own, and
     ``usual_own_m`` (g,), its standard deviation over edges of a kind; ``common`` (m,), the common unknowns, with
     ``common_covariance`` (m, m).
@@ -156,7 +156,9 @@ class Pooled:
     common_covariance: Array
 
 
-def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array) -> Pooled:
+def pool(
+    ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array
+) -> PooledOffsets:
     """Posterior of the offsets ``ends_m`` (e, 2), whose noise has ``covariance_m2`` (e, 2, 2).
 
     ``rows`` (e, 2, m): derivatives, metres of offset by the common unknowns, which have a prior ``prior_covariance``
@@ -190,7 +192,7 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
         own_m2 = new + 1e-18
         if settled:
             break
-    return Pooled(mean, covariance, own, np.sqrt(own_m2), common, common_covariance)
+    return PooledOffsets(mean, covariance, own, np.sqrt(own_m2), common, common_covariance)
 
 
 LARGEST_SLOPE = 5.0

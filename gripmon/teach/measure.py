@@ -32,7 +32,7 @@ from gripmon.teach.estimate import (
     estimate_edges,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
-from gripmon.teach.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.views import ImageRefused, SampledEdge, TeachingImage, TeachingRefused, View, Viewer, sampled
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
@@ -159,7 +159,7 @@ def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[in
     return lines, untaught
 
 
-def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
+def _lines_of(seen: SampledEdge, images: int, search: bool) -> EdgeLines | str:
     """An edge's line in all images together and in each, or the reason why there is none."""
     points, expected_px = seen.points, seen.expected_px
     line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import ALONG_RAD, FLAT_SIGMA_RAD, Outline, Placed, innermost
+from gripmon.teach.finger_depth import ALONG_RAD, FLAT_SIGMA_RAD, Outline, PlacedOutlines, innermost
 from gripmon.teach.image_motion import STATIONS, normals, rough_shift_px
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
 from gripmon.teach.silhouette import Stations, in_image, measure_transitions
@@ -31,7 +31,7 @@ OFF_PLANE = 0.05
 away."""
 INDEPENDENT_PX = 4.0
 """Neighbouring edge points have correlated errors: one per this length counts (as where chains are split)."""
-TIP = 0.1
+TIP_SHARE = 0.1
 """Part of a finger's length that is its tip."""
 _TURNS = 8
 _ROUGHLY_PX = 30
@@ -57,7 +57,7 @@ def place_by_motion(
     seen: OpeningSeen,
     around: Sequence[OpeningSeen],
     pose: tuple[Array, Array] | None,
-) -> Placed | None:
+) -> PlacedOutlines | None:
     """Two fingers in space; with ``pose``, the rotation (3, 3) and the TCP (3,) at unit depth, as a calibration has
     them.  None where this can't be determined: not two fingers, or fingers that don't move against each other.
     """
@@ -98,7 +98,7 @@ def _rays(finger: Outline) -> Array:
 def _tips(finger: Outline) -> NDArray[np.intp]:
     """Vertices of its tip."""
     ahead = finger.xy @ finger.outwards
-    return np.flatnonzero(ahead > ahead.max() - TIP * float(np.ptp(ahead)))
+    return np.flatnonzero(ahead > ahead.max() - TIP_SHARE * float(np.ptp(ahead)))
 
 
 def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
@@ -232,7 +232,7 @@ def _border(still: NDArray[np.bool_], stations: Stations) -> Array:
     return np.asarray(np.take_along_axis(away, np.abs(away).argmin(axis=1)[:, None], axis=1)[:, 0])
 
 
-def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Array] | None) -> Placed:
+def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Array] | None) -> PlacedOutlines:
     """The result, with axes: x as the jaws move, z along the fingers."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     q = [found.q[first[k] : first[k + 1]] for k in range(len(fingers))]
@@ -257,7 +257,7 @@ def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Arr
     points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
     slopes = np.sqrt(np.square(found.slope_sigma).mean(axis=0))
     sigma = np.array([slopes[1], slopes[0], 0.0]) if pose is None else np.zeros(3)
-    return Placed(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, False, sigma, by_motion=True)
+    return PlacedOutlines(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, False, sigma, by_motion=True)
 
 
 def _along(finger: Outline, points: Array) -> Array:

@@ -47,7 +47,7 @@ LEAST_INFORMATION_SHARE = 0.1
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
-_MOVES = 6
+_LINE_UPDATES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ def _line_before(
     row = np.arange(len(base.way))
     seen: SeenEdge | None = None
     blur_px = 1.0 if known_px is None else known_px
-    for turn in range(_MOVES):
+    for turn in range(_LINE_UPDATES):
         if known_px is None and turn < 2:
             blur_px = estimate_blur_px(scene, base.way, ends_px)
         asked = line_offsets(scene, base.way, ends_px, blur_px)

@@ -35,11 +35,11 @@ from gripmon.model.errors import InputError, in_short
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
+    CornersRequest,
+    EmptyRequest,
     Failure,
-    Nothing,
     PictureInfo,
     Place,
-    Put,
     Reply,
     Saved,
     SaveOrder,
@@ -254,13 +254,13 @@ class _Handler(BaseHTTPRequestHandler):
         return found
 
     def _post(self, path: str) -> Served:
-        action = (Nothing, self._end) if path == "done" else self.server.site.post(path)
+        action = (EmptyRequest, self._end) if path == "done" else self.server.site.post(path)
         if action is None:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
         kind, act = action
         return self.server.encode(act(self._body(kind))), "application/json"
 
-    def _end(self, _order: Nothing) -> None:
+    def _end(self, _order: EmptyRequest) -> None:
         """End the process once this request has been answered."""
         self._last = self.close_connection = True
 
@@ -311,8 +311,8 @@ class TeachSite:
     def post(self, path: str) -> Action | None:
         session = self._session
         actions: dict[str, Action] = {
-            "look": (Put, session.look),
-            "take": (Nothing, lambda _: session.take()),
+            "look": (CornersRequest, session.look),
+            "take": (EmptyRequest, lambda _: session.take()),
             "save": (SaveOrder, session.save),
         }
         return actions.get(path)
@@ -365,7 +365,7 @@ class OutlineSession:
             corners_only=True,
         )
 
-    def look(self, put: Put) -> Reply:
+    def look(self, put: CornersRequest) -> Reply:
         """Always :class:`BadRequest`."""
         raise BadRequest("corners don't snap without a gripper file; they are placed and saved")
 

@@ -15,7 +15,7 @@ from gripmon.model.records import Array, Image
 from gripmon.model.targets import Charuco, Chequerboard, Target
 from gripmon.track.edges.profiles import read_profiles
 
-_BESIDE = 0.1
+_LEVEL_OFFSET = 0.1
 """Distance from a corner, in squares, along both axes, at which a square shows its own colour, outside of any mark."""
 _MARK_PX = 12
 """Size of a mark's cells in the rendered board."""
@@ -78,7 +78,7 @@ def plate_print(
     cells = np.rint((xy_m - origin_m) / step_m).astype(np.intp)
     uv_px, grey = [], []
     for right, down in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
-        beside = sighting.plate_m + np.array([right, down, 0.0]) * _BESIDE * step_m
+        beside = sighting.plate_m + np.array([right, down, 0.0]) * _LEVEL_OFFSET * step_m
         uv_px.append(camera.project(beside @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]))
         grey.append(_at(image, uv_px[-1]))
     sign = np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)

@@ -29,7 +29,7 @@ _GREEN = (80, 220, 60)
 _READY = "ready to be taken"
 
 
-class Captured(msgspec.Struct, frozen=True, kw_only=True):
+class CaptureState(msgspec.Struct, frozen=True, kw_only=True):
     """``note``: what happened to the newest image; ``ended``: a folder or video has no more images; ``shown`` counts
     the live images; ``itself``: images are taken automatically."""
 
@@ -141,13 +141,13 @@ class Capture:
             cv2.circle(shown, (u, v), max(2, shown.shape[1] // 250), _GREEN, -1, cv2.LINE_AA)
         return encoded(shown, ".jpg")
 
-    def state(self) -> Captured:
+    def state(self) -> CaptureState:
         """For the page."""
         source, views = self._source, None
         if self._target is not None:
             views = self._coverage()
         with self._lock:
-            return Captured(
+            return CaptureState(
                 images=self.images(), running=source is not None, itself=self._itself,
                 live=source is not None and source.live, ended=self._ended, shown=self._shown, note=self._note,
                 coverage=views,

@@ -25,7 +25,7 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import ReferenceRecord
 from gripmon.teach.api import Picture, taught_model, to_yaml
-from gripmon.teach.messages import Put, Saved, SaveOrder, SavingRefused
+from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
@@ -244,7 +244,7 @@ def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[b
     found = setup.evaluate(picture.image, corners, (), picture.jaw_opening_m)
     if found.snapped.refused is not None:
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
-    put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
+    put = CornersRequest(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
 
     def save(replace: bool) -> Saved:
         order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=replace)
