@@ -160,7 +160,7 @@ def _check_shape(corners_m: Array, plate_xy: Array, q: Array, shift: Array) -> N
 
 def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
     """Sides (2,) along x and y, and ``(q1, q2, sx, sy)``, of the rectangle whose corners are the first four points, in
-    the order of :func:`calibrate_plane`; from means of opposite sides.  :class:`CalibrationError` if it isn't a
+    the order of :func:`gripmon.calibrate_plane`; from means of opposite sides.  :class:`CalibrationError` if it isn't a
     rectangle.
     """
     a, b, c, d = plate_xy_m[:INFERRED_FROM]

@@ -211,8 +211,8 @@ def slopes(
     """Depth (e,) of an edge's rim per metre of its offset (e,) across the line of sight; NaN where the gripper file has
     no two faces at the edge.
 
-    ``axes`` as from :func:`sight_axes`.  The rim of an outline with equal bevels is the outer one, that of a crease
-    the one on the side to which it is shifted.
+    ``axes`` as from :func:`gripmon.track.edges.taught.sight_axes`.  The rim of an outline with equal bevels is the
+    outer one, that of a crease the one on the side to which it is shifted.
     """
     across, depth = axes
     out = np.full(len(gripper.edge_ids), np.nan)

@@ -65,7 +65,7 @@ class FoundOutline:
 @dataclass(frozen=True, slots=True)
 class _Base:
     """An edge between two rough ends as the lens shows it: ``uv_px`` (n, 2) and ``normal`` (n, 2), to the right when
-    going from the first end; ``way`` (n,) from 0 to 1 between ``first`` and ``last``, the ends of the sampled part.
+    going from the first end; ``way`` (n,) from 0 to 1 between the ends of the sampled part.
     """
 
     uv_px: Array

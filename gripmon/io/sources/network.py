@@ -198,7 +198,7 @@ class NetworkCamera:
         while (arrival := self._take(deadline_s)) is not None:
             try:
                 content = self._content(arrival.sample)
-            except Exception as error:  # noqa: BLE001  whatever a stranger sends, it must not end the monitor
+            except Exception as error:  # noqa: BLE001  malformed input from anyone must not end the monitor
                 if not isinstance(error, PayloadError):
                     _log.debug("a payload on %s", self.key, exc_info=error)
                 fault = str(error) or type(error).__name__
