@@ -272,7 +272,7 @@ def _check_held(fixed: Fixed) -> None:
         raise CalibrationError("fy_px can't be held at a value of its own with square pixels; fx_px, or without aspect")
     for name in ("fx_px", "fy_px"):
         if name in fixed and fixed[name] is None and not (name == "fy_px" and "aspect" in fixed):
-            raise CalibrationError(f"{name} is to be held, but without a value; {name}=VALUE (px)")
+            raise CalibrationError(f"{name} is to be held, but not said at what; {name}=VALUE (px)")
 
 
 def _start(lens_model: LensModel, focal_px: float, fixed: Fixed) -> Array:

@@ -120,13 +120,12 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
         first, *more = unreadable
         others = f", nor can the next {len(more)}" if more else ""
         return detail, f"its first frame can't be read ({first}){others}"
-    return detail, None if isinstance(config, SecondConfig) else _response_warning(config, frame.image)
+    return detail, None if isinstance(config, SecondConfig) else _unlike_light(config, frame.image)
 
 
-def _response_warning(config: Config, image: Image) -> str | None:
-    """A warning for a colour image if the camera's response is configured as linear; None otherwise."""
-    stated = config.settings.monitor.corners.edges.response != "linear"
-    if stated or image.ndim < 3 or image.dtype != np.uint8 or float(np.ptp(image, axis=2).mean()) < COLOURED_LEVELS:
+def _unlike_light(config: Config, image: Image) -> str | None:
+    told = config.settings.monitor.corners.edges.response != "linear"
+    if told or image.ndim < 3 or image.dtype != np.uint8 or float(np.ptp(image, axis=2).mean()) < COLOURED_LEVELS:
         return None
     known = "monitor.corners.edges.response: srgb, unless its gamma is 1"
     return f"grey levels of a colour camera mostly aren't in proportion to the light: {known}"

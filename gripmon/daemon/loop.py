@@ -12,7 +12,7 @@ import msgspec
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import JawFeed
-from gripmon.daemon.snapshots import JudgedFrame
+from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
@@ -75,7 +75,7 @@ class Daemon(Loop):
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
         several = self._not_alone()
         self._deliver("transform", self._publisher.transform, withheld(record, several) if several else record)
-        self._newest = JudgedFrame(frame, record, time.monotonic())
+        self._newest = Newest(frame, record, time.monotonic())
         # Everything below is less urgent.
         self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:

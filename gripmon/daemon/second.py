@@ -11,7 +11,7 @@ from typing import Unpack
 import msgspec
 
 from gripmon.daemon.estimates import EstimatesFile
-from gripmon.daemon.snapshots import JudgedFrame
+from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
 from gripmon.daemon.watch import FrameOutcome
 from gripmon.io.publish.inputs import ZenohPulses
@@ -110,7 +110,7 @@ class SecondCamera(Loop):
         self._alert_all(alerts, self._pulsed.state, frame.stamp_ns)
         self._gather_alerts()
         judged = self._judged(refused, failure)
-        self._newest = JudgedFrame(frame, self._frame_record(frame, judged), time.monotonic())
+        self._newest = Newest(frame, self._frame_record(frame, judged), time.monotonic())
         for alert in self._watch.judged(judged, time.monotonic()):
             self._alert(alert, judged.state, frame.stamp_ns)
         self._end_of_frame(frame, failure, judged.state)

@@ -42,7 +42,7 @@ _NICENESS = 10  # the loop has priority
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
-class JudgedFrame(NamedTuple):
+class Newest(NamedTuple):
     """The newest frame, its record, and when it was judged (monotonic)."""
 
     frame: Frame
@@ -53,7 +53,7 @@ class JudgedFrame(NamedTuple):
 class _Job(NamedTuple):
     asked: PendingCommand
     reply: CommandReply
-    newest: JudgedFrame
+    newest: Newest
     asked_s: float
 
 
@@ -65,7 +65,7 @@ class Snapshots:
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
 
-    def answer(self, asked: PendingCommand, reply: CommandReply, newest: JudgedFrame | None) -> None:
+    def answer(self, asked: PendingCommand, reply: CommandReply, newest: Newest | None) -> None:
         """Send the reply with the newest frame and its record, later; refuse if there is no frame."""
         if newest is None:
             asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))

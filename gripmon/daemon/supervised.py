@@ -15,7 +15,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.service import ServiceManager
-from gripmon.daemon.snapshots import JudgedFrame, Snapshots
+from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import PendingCommand, ZenohCommands
@@ -99,7 +99,7 @@ class Loop(ABC):
         self._robot, self._camera = robot, camera
         self._commands = commands
         self._snapshots = snapshots or Snapshots()
-        self._newest: JudgedFrame | None = None
+        self._newest: Newest | None = None
         self._reports = reports or Reports()
         self._notices = notices
         self._open_alerts: tuple[OpenAlert, ...] = ()  # of the monitor
