@@ -182,7 +182,7 @@ def test_verify_tells_equal_hand_eyes_from_different_ones(
     near = hand_eye_file(tmp_path / "near.yaml", 0.5 * SIGMAS)
     far = hand_eye_file(tmp_path / "far.yaml", np.array([0.0, 3e-4, 0.0, 0.0, 0.0, 0.0]))
     code, out, _ = gripmon(capsys, "verify", made / "hand_eye.yaml", near)
-    assert code == 0 and out.splitlines()[-1] == "same (not told apart at a level of 0.01)"
+    assert code == 0 and out.splitlines()[-1] == "same (not distinguished at a level of 0.01)"
     code, out, _ = gripmon(capsys, "verify", made / "hand_eye.yaml", far)
     assert code == 3 and "  +0.3000 ± 0.0283" in out and out.splitlines()[-1] == "different (at a level of 0.01)"
     code, out, _ = gripmon(capsys, "verify", made / "hand_eye.yaml", far, "--json")
@@ -254,7 +254,7 @@ BAD: list[tuple[tuple[object, ...], str]] = [
     (("export", "hand_eye.yaml", "--format", "urdf", "--fit"), "--fit: has no meaning with --format urdf"),
     (("export", "camera.yaml", "--format", "ros", "--camera-frame", "x"), "--camera-frame: has no meaning"),
     (("export", "hand_eye.yaml", "--format", "json", "--robot-base-frame", "x"), "--robot-base-frame: has no meaning"),
-    (("export", "hand_eye.yaml", "--format", "urdf", "--camera-frame", "a b"), "camera_frame: 'a b' is no frame's"),
+    (("export", "hand_eye.yaml", "--format", "urdf", "--camera-frame", "a b"), "camera_frame: 'a b' isn't a frame's"),
     (("export", "hand_eye.yaml", "--format", "urdf", "--name", "a b"), "--name: a b: isn't a plain name"),
     (("export", "camera.yaml", "--format", "ros", "--out", "camera.yaml"), "camera.yaml: is there already"),
     (("export", "nothing.yaml", "--format", "ros"), "nothing.yaml: there is no such file"),

@@ -93,7 +93,7 @@ def test_files_and_sections_say_the_same(folder: Path):
          "hand_eye.yaml: gripper: is two_box_fingers with other contents"),
         (HE, lambda v: v["gripper"].update(name="other", sha256="0" * 64), "gripper: is other, the"),
         ("gripper.yaml", lambda v: v.update(name="renamed"),
-         ("gripper: is two_box_fingers, the configuration has renamed, the same but for its name; "
+         ("gripper: is two_box_fingers, the configuration has renamed, the same except for its name; "
           "name: two_box_fingers in the gripper file")),
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.0, 0.0, -0.1]),
          "hand_eye.yaml: cam_T_grip.translation_m: puts the TCP behind the camera"),

@@ -217,7 +217,7 @@ def test_notices_of_the_start_are_alerts_behind_the_reference():
 @pytest.fixture(autouse=True)
 def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """These frames take no time, of which commands would get a quarter."""
-    monkeypatch.setattr(supervised, "_RESTS_FOR", 0.0)
+    monkeypatch.setattr(supervised, "_COMMAND_PAUSE_RATIO", 0.0)
 
 
 def test_a_command_is_kept_and_published_before_it_is_answered():

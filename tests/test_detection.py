@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-from gripmon.calibrate.chequers import _Turns
+from gripmon.calibrate.chequers import _Alternating
 from gripmon.calibrate.detection import detect, ends_all_round
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
@@ -189,7 +189,7 @@ def test_a_fisheyes_border_where_steps_shrink_by_a_third():
 
 def test_a_knights_move_is_no_step_of_a_chequerboard():
     """It leads to a corner of the other kind, too; where the true neighbours are hidden it must not count."""
-    turns = _Turns(np.ones(1, np.complex128))
+    turns = _Alternating(np.ones(1, np.complex128))
     right, down = np.array([30.0, 4.0]), np.array([-6.0, 26.0])
     assert turns.basis(0, right, down)
     assert not turns.basis(0, right, down + 2.0 * right)

@@ -6,7 +6,7 @@ import pytest
 from support.daemon_bench import Bench, pause
 from support.stand_ins import ScriptedSource
 
-from gripmon.daemon.watch import OVER_S, DaemonSettings, Drops, Watch
+from gripmon.daemon.watch import DROP_WINDOW_S, DaemonSettings, Drops, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity
 
 
@@ -25,7 +25,7 @@ def test_few_are_nobodys_business(handled_per_s: int, dropped_per_s: int):
 
 def test_many_are_said_after_ten_seconds_with_what_to_change():
     said = after(Drops(0.2), 20, 10, 50)
-    assert not any(said[: int(OVER_S)]) and all(said[int(OVER_S) :])
+    assert not any(said[: int(DROP_WINDOW_S)]) and all(said[int(DROP_WINDOW_S) :])
     assert said[-1] == (
         "83 % of the frames were dropped in 10 s: 60 a second arrived, the monitor had time for 10; lower the camera's "
         "rate (source.fps, or its driver's) to that, give smaller images, or free the processor of other work"
@@ -63,7 +63,7 @@ def test_the_alert_is_raised_and_cleared_once():
 
 
 def test_the_daemon_raises_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gripmon.daemon.watch.OVER_S", 0.02)
+    monkeypatch.setattr("gripmon.daemon.watch.DROP_WINDOW_S", 0.02)
     monkeypatch.setattr("gripmon.daemon.watch._LOOK_EVERY_S", 0.0)
 
     def drop(source: object) -> None:

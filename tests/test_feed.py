@@ -138,9 +138,9 @@ def test_nothing_to_send_is_a_failure(heard: Heard, folder: Path, capsys: pytest
             "feed: --connect has no effect beside --zenoh-config",
         ),
         (["{empty}", "--robot", "arm"], "no image in"),
-        (["{folder}", "--robot", "arm", "--key", "cell//camera"], "feed: key 'cell//camera' is none"),
-        (["{folder}", "--robot", "arm", "--key", "gripmon/**"], "feed: key 'gripmon/**' is none"),
-        (["{folder}", "--robot", "arm", "--key", ""], "feed: key '' is none"),
+        (["{folder}", "--robot", "arm", "--key", "cell//camera"], "feed: key 'cell//camera' isn't a key"),
+        (["{folder}", "--robot", "arm", "--key", "gripmon/**"], "feed: key 'gripmon/**' isn't a key"),
+        (["{folder}", "--robot", "arm", "--key", ""], "feed: key '' isn't a key"),
     ],
 )
 def test_what_cant_be_sent_is_said_in_one_line(

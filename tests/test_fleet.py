@@ -15,7 +15,7 @@ from support.router_process import ROOT, RouterProcess, running
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.io.wire import PublishSettings
-from gripmon.io.wire.session import load_file, said
+from gripmon.io.wire.session import load_file, value_of
 from gripmon.model.records import CommandName
 
 PREFIX = "gripmon/arm/wrist"
@@ -172,8 +172,8 @@ def test_a_region_has_all_rules_of_a_single_router():
     rules = {}
     for name in ("router", "regional"):
         config = zenoh.Config.from_file(ROOT / "configs" / "zenoh" / f"{name}.json5")
-        rules[name] = {part: said(config, f"access_control/{part}") for part in ("rules", "subjects", "policies")}
-        rules[name]["filter"] = said(config, "low_pass_filter")
+        rules[name] = {part: value_of(config, f"access_control/{part}") for part in ("rules", "subjects", "policies")}
+        rules[name]["filter"] = value_of(config, "low_pass_filter")
     for part, values in rules["router"].items():
         assert [value for value in values if value not in rules["regional"][part]] == []
     extra = [rule["id"] for rule in rules["regional"]["rules"] if rule not in rules["router"]["rules"]]

@@ -28,7 +28,7 @@ from support.teach_page_browser import Visitor, browser, page
 
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, MonitorName
-from gripmon.daemon.fleet_page import CARDS_MOST, PICTURE_PX, FleetSite, Order, Shown
+from gripmon.daemon.fleet_page import CARDS_MOST, PICTURE_PX, FleetSite, FleetView, Order
 from gripmon.daemon.overlay import overlay
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import (
@@ -248,7 +248,7 @@ def test_over_http(cell: Cell):
     try:
         assert server.url.startswith("http://127.0.0.2:")
         status, shown = asked(server, "fleet?find=arm")
-        assert status == 200 and msgspec.convert(shown, Shown).cards[0].robot == "arm"
+        assert status == 200 and msgspec.convert(shown, FleetView).cards[0].robot == "arm"
         for host in (f"127.0.0.1:{server.port}", f"localhost:{server.port}", "evil.example"):
             assert asked(server, "fleet", host)[0] == 403
         order = msgspec.to_builtins(cell.order("reject", "rec-4"))

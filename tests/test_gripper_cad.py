@@ -277,7 +277,7 @@ def test_a_mesh_that_is_cut_off_and_a_length_in_millimetres_are_refused_in_one_l
     (tmp_path / "half.stl").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     for words, said in (
         ((tmp_path / "half.stl",), "cut off"),  # by which words depends on the libraries
-        ((whole, "--length", "40"), "--length: 40 m: is no length of a finger; metres, as 0.04"),
+        ((whole, "--length", "40"), "--length: 40 m: is not a finger's length; metres, such as 0.04"),
     ):
         assert from_cad(*words, "--unit", "mm", "--out", tmp_path / "g.yaml") == 2
         error = capsys.readouterr().err
@@ -317,7 +317,7 @@ def test_the_command_says_what_the_bevels_of_sharp_edges_cost_and_who_takes_it_o
         assert (read_gripper(out).edge_bevel_m == width_m).all()
     for wrong in ("0.2", "-0.0001", "nan"):
         assert from_cad(*paths, "--unit", "mm", f"--bevel={wrong}", "--out", out, "--force") == 2
-        assert capsys.readouterr().err.endswith(" m: is no width of a bevel; 0 to 0.02 m\n")
+        assert capsys.readouterr().err.endswith(" m: is not a bevel's width; 0 to 0.02 m\n")
     with pytest.raises(SystemExit, match="2"):
         from_cad(*paths, "--unit", "mm", "--bevel", "wide", "--out", out, "--force")
     assert "'wide' isn't the width of a bevel; metres, e.g. 0.0002" in capsys.readouterr().err

@@ -155,7 +155,7 @@ def test_json_has_both_directions_and_the_covariance(turned: bool):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"gripper_frame": "a frame"}, "gripper_frame: 'a frame' is no frame's name"),
+        ({"gripper_frame": "a frame"}, "gripper_frame: 'a frame' isn't a frame's name"),
         ({"gripper_frame": "/tool0"}, "gripper_frame: '/tool0'"),
         ({"camera_frame": 'x"/><evil'}, "camera_frame: "),
         ({"camera_frame": ""}, "camera_frame: ''"),

@@ -15,7 +15,7 @@ from support.loopback import free_endpoint, plain_session, wait_until
 from gripmon.io.publish.inputs import (
     MOST_REPORTS,
     DecodeOpening,
-    Reported,
+    ReportedOpening,
     StampedOpenings,
     ZenohJaw,
     opening_of_joints,
@@ -140,17 +140,17 @@ def test_stamps_of_another_clock_are_said_and_the_newest_is_taken():
 def test_between_rare_reports_the_jaw_moves_at_the_end():
     """A robot that reports changes says nothing while the jaws stand."""
     openings = StampedOpenings()
-    openings.add(Reported(1_000_000_000, 0.02), 0.0, 1.0)
-    openings.add(Reported(1_900_000_000, 0.03), 0.9, 1.0)
+    openings.add(ReportedOpening(1_000_000_000, 0.02), 0.0, 1.0)
+    openings.add(ReportedOpening(1_900_000_000, 0.03), 0.9, 1.0)
     assert openings.at(1_000_000_000) == openings.at(1_500_000_000) == openings.at(1_800_000_000) == 0.02
     assert openings.at(1_850_000_000) == pytest.approx(0.025)
     # Those of another order, and too many.
-    openings.add(Reported(1_860_000_000, 0.026), 0.91, 1.0)
+    openings.add(ReportedOpening(1_860_000_000, 0.026), 0.91, 1.0)
     assert openings.at(1_860_000_000) == 0.026 and openings.at(1_880_000_000) == pytest.approx(0.028)
     for k in range(2 * MOST_REPORTS):
-        openings.add(Reported(2_000_000_000 + k, 0.03), 1.0, 1.0)
+        openings.add(ReportedOpening(2_000_000_000 + k, 0.03), 1.0, 1.0)
     assert len(openings) == MOST_REPORTS
-    openings.add(Reported(3_000_000_000, 0.04), 2.5, 1.0)
+    openings.add(ReportedOpening(3_000_000_000, 0.04), 2.5, 1.0)
     assert len(openings) == 1
 
 
@@ -213,7 +213,7 @@ def test_what_is_malformed_is_said_once_an_occasion(clock: list[float], caplog: 
         "over 100 malformed frames on a/b: reason 1",
         "over 1,000 malformed frames on a/b: reason 1",
     ]
-    assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (said once)"]
+    assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (logged once)"]
     clock[0] += link.REMEMBERED_S + 1.0
     assert seen.fault() == ""
     seen.add("another reason")
@@ -272,8 +272,8 @@ def test_what_is_said_is_the_fault_that_there_is(clock: list[float], caplog: pyt
             seen.add("640x480 pixels; 1280x720 as configured")
     assert seen.fault() == "some malformed frames on a/b: 640x480 pixels; 1280x720 as configured"
     assert [record.getMessage() for record in caplog.records] == [
-        "malformed frame on a/b: damaged JPEG file (said once)",
-        "malformed frame on a/b: 640x480 pixels; 1280x720 as configured (said once)",
+        "malformed frame on a/b: damaged JPEG file (logged once)",
+        "malformed frame on a/b: 640x480 pixels; 1280x720 as configured (logged once)",
     ]
     for _ in range(120):
         seen.add("damaged JPEG file")

@@ -252,7 +252,7 @@ MIRRORED = CORNERS_M * np.array([1.0, -1.0, 1.0])
         (CORNERS_M[[0, 3, 2, 1]], None, "have each other's names"),
         (CORNERS_M[:4] * [1.0, 0.0, 1.0], None, "coincide"),
         (CORNERS_M[[0, 0]], CORNERS_M[:2], "coincide"),
-        (CORNERS_M[:4] + np.eye(4)[:, 3:] * [0.012, 0.004, 0.0], None, "no rectangle"),
+        (CORNERS_M[:4] + np.eye(4)[:, 3:] * [0.012, 0.004, 0.0], None, "aren't a rectangle"),
     ],
 )  # fmt: skip
 def test_what_is_no_gripper_is_refused(corners_m: np.ndarray, known_m: np.ndarray | None, reason: str):

@@ -170,12 +170,12 @@ def test_an_inferred_gripper_that_is_no_rectangle_is_refused_or_warned_of():
         corners_m[3, 0] += by_m
         return trial(np.random.default_rng(11), corners_m=corners_m, noise_px=0.02, corner_px=0.02)
 
-    with pytest.raises(CalibrationError, match=r"make no rectangle on the plate .* mm off"):
+    with pytest.raises(CalibrationError, match=r"don't form a rectangle on the plate .* mm off"):
         solved(bent(1e-3), None)
     # Fingers may be a little out of line: that is warned of, however well it is seen.
     found = solved(bent(1e-4), None)
     assert found.p_value < 1e-6
-    assert any("make no rectangle" in w and "uncertainty x" in w for w in average([found], True).warnings)
+    assert any("don't form a rectangle" in w and "uncertainty x" in w for w in average([found], True).warnings)
 
 
 def test_corners_off_the_plate_are_warned_of():

@@ -17,7 +17,7 @@ from support.router_process import ROOT, plain_config, running
 from gripmon.cli import main
 from gripmon.daemon.config import is_second, load_config, load_second
 from gripmon.io.wire import PublishError, PublishSettings, zenoh_config
-from gripmon.io.wire.session import ZenohFileError, load_file, said
+from gripmon.io.wire.session import ZenohFileError, load_file, value_of
 
 SHIPPED = sorted((ROOT / "configs" / "zenoh").glob("*.json5"))
 LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
@@ -43,15 +43,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", [file.name for file in SHIPPED])
 def test_shipped_files_stay_on_this_machine_or_speak_tls(folder: Path, name: str):
     config = load_file(folder / name)
-    places = endpoints(said(config, "listen/endpoints")) + endpoints(said(config, "connect/endpoints"))
+    places = endpoints(value_of(config, "listen/endpoints")) + endpoints(value_of(config, "connect/endpoints"))
     assert places
     assert [p for p in places if not (p.startswith("tls/") or p.startswith(LOOPBACK))] == []
     assert all("127.0.0.1" in p for p in places)  # no one else's address is shipped
-    assert said(config, "scouting/multicast/enabled") is False
+    assert value_of(config, "scouting/multicast/enabled") is False
     if any(p.startswith("tls/") for p in places):
-        assert said(config, "transport/link/protocols") == ["tls"]
-        assert said(config, "transport/link/tls/enable_mtls") is True
-        assert said(config, "transport/link/tls/verify_name_on_connect") is not False
+        assert value_of(config, "transport/link/protocols") == ["tls"]
+        assert value_of(config, "transport/link/tls/enable_mtls") is True
+        assert value_of(config, "transport/link/tls/verify_name_on_connect") is not False
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.name)
@@ -70,18 +70,18 @@ def test_what_a_file_does_not_say_is_cautious(tmp_path: Path):
     path = tmp_path / "short.json5"
     path.write_text("{ mode: 'peer' }")
     config = zenoh_config(PublishSettings(zenoh_config="short.json5"), tmp_path)
-    assert said(config, "listen/endpoints") == [] and said(config, "scouting/multicast/enabled") is False
+    assert value_of(config, "listen/endpoints") == [] and value_of(config, "scouting/multicast/enabled") is False
     path.write_text("{ listen: {endpoints: ['tcp/127.0.0.1:1']}, scouting: {multicast: {enabled: true}} }")
     config = zenoh_config(PublishSettings(zenoh_config="short.json5"), tmp_path)
-    assert said(config, "mode") == "peer"
-    assert (
-        said(config, "listen/endpoints") == ["tcp/127.0.0.1:1"] and said(config, "scouting/multicast/enabled") is True
-    )
+    assert value_of(config, "mode") == "peer"
+    assert value_of(config, "listen/endpoints") == ["tcp/127.0.0.1:1"]
+    assert value_of(config, "scouting/multicast/enabled") is True
 
 
 def test_certificates_count_from_their_file_and_are_there(folder: Path, tmp_path: Path):
     config = zenoh_config(PublishSettings(zenoh_config="monitor.json5"), folder)
-    assert said(config, "transport/link/tls/connect_certificate") == str(folder / "certificates" / "monitor-arm1.pem")
+    own = str(folder / "certificates" / "monitor-arm1.pem")
+    assert value_of(config, "transport/link/tls/connect_certificate") == own
     (tmp_path / "monitor.json5").write_bytes((folder / "monitor.json5").read_bytes())
     with pytest.raises(PublishError) as caught:
         zenoh_config(PublishSettings(zenoh_config="monitor.json5"), tmp_path)

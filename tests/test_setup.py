@@ -32,7 +32,7 @@ from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import other_target, target_in
 from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.robot_file import reference_text
-from gripmon.daemon.setup.site import CaptureOrder, Do
+from gripmon.daemon.setup.site import CaptureOrder, StepRequest
 from gripmon.daemon.setup.steps import defaults, in_fields
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
@@ -41,7 +41,7 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import read_image
 from gripmon.model.records import Frame, Image, Transform, Verdict
 from gripmon.model.targets import parse_target
-from gripmon.teach.messages import BadRequest, Nothing, Put, SaveOrder
+from gripmon.teach.messages import BadRequest, CornersRequest, EmptyRequest, SaveOrder
 
 TARGET = parse_target(new_user.TARGET)
 
@@ -482,12 +482,12 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         u, v = (np.array(truth["corners"][name]) + rng.uniform(-4.0, 4.0, 2)).tolist()
         corners[f"{name[0].upper()}_in_{name.rpartition('_')[2]}"] = u, v
     try:
-        assert _sent(site, "open", Do(step="corners")) == {"url": "page/"}
+        assert _sent(site, "open", StepRequest(step="corners")) == {"url": "page/"}
         assert _shown(site)["saves"] == ["corners"]
-        put = Put(corners=corners, image=0, jaw_opening_m=opening_m)
+        put = CornersRequest(corners=corners, image=0, jaw_opening_m=opening_m)
         order = SaveOrder(put=put, robot="arm1", camera_name="wrist", config=False, taught=False)
         assert _sent(site, "page/save", order).written == {"standing/corners.yaml": "the corners"}
-        _sent(site, "page/done", Nothing())
+        _sent(site, "page/done", EmptyRequest())
         assert site.get("page/state") is None
         project.keep({"jaw_opening": str(opening_m)})
         project.do("reference")
@@ -496,9 +496,9 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         (tmp_path / "robot.yaml").write_text(yaml.safe_dump({"cam_T_grip": found}))
         project.keep({"reference_by": "a file", "reference_file": "robot.yaml"})
         project.do("reference")
-        _sent(site, "open", Do(step="teach"))
+        _sent(site, "open", StepRequest(step="teach"))
         assert _shown(site)["needed"] == 0  # the reference is known
-        put = Put(corners={}, image=0, jaw_opening_m=opening_m)
+        put = CornersRequest(corners={}, image=0, jaw_opening_m=opening_m)
         saved = _sent(site, "page/save", SaveOrder(put=put, robot="arm1", camera_name="wrist"))
         assert "the configuration" in saved.written.values()
         config = load_config(tmp_path / "config.yaml")
@@ -508,11 +508,11 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         project.keep({"reference_by": "from corners alone"})
         states = {state.name: state for state in project.states()}
         assert states["reference"].progress == "skipped" and "--reference" not in states["teach"].command
-        _sent(site, "open", Do(step="teach"))
+        _sent(site, "open", StepRequest(step="teach"))
         assert _shown(site)["needed"] == 4
         _started_and_stopped(site, tmp_path)
         with pytest.raises(BadRequest, match="no step nose"):
-            _sent(site, "open", Do(step="nose"))
+            _sent(site, "open", StepRequest(step="nose"))
         project.keep({"gripper": "from the plate"})
         with pytest.raises(InputError, match="an inferred gripper needs its images on the target"):
             project.do("standing")
@@ -544,18 +544,18 @@ def _started_and_stopped(site: SetupSite, folder: Path) -> None:
     values = read_yaml(folder / "config.yaml")
     values["source"], values["publish"] = {"kind": "live", "device": "/dev/video987"}, {"listen": [free_endpoint()]}
     (folder / "config.yaml").write_text(yaml.safe_dump(values))
-    _sent(site, "start", Nothing())
+    _sent(site, "start", EmptyRequest())
     wait_until(lambda: any("/dev/video987" in line for line in site.state().monitor.lines), "what the monitor says")
     assert site.state().monitor.running and site.state().monitor.ended is None
     with pytest.raises(BadRequest, match="is already running"):
-        _sent(site, "start", Nothing())
+        _sent(site, "start", EmptyRequest())
     with pytest.raises(BadRequest, match="the monitor uses the camera"):
         _sent(site, "capture", CaptureOrder(step="teaching", action="start"))
-    _sent(site, "stop", Nothing())
+    _sent(site, "stop", EmptyRequest())
     assert (site.state().monitor.running, site.state().monitor.ended) == (False, "stopped")
     (folder / "config.yaml").write_text("robot: [\n")
     with pytest.raises(BadRequest, match=r"config\.yaml"):
-        _sent(site, "start", Nothing())
+        _sent(site, "start", EmptyRequest())
 
 
 def _shown(site: SetupSite) -> dict[str, Any]:

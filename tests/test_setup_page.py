@@ -221,7 +221,7 @@ def test_bad_input_is_one_line_and_nothing_is_lost(user: new_user.NewUser, drive
         for values, words in (
             ({"target": "squares:3x3:1"}, "is not a target"),
             ({"target": "chequerboard:9x6:25"}, "millimetres?"),
-            ({"target": "circles:12x10:0.008:0.004", "paper": "a9"}, "is no paper"),
+            ({"target": "circles:12x10:0.008:0.004", "paper": "a9"}, "isn't a paper size"),
             ({"paper": "50x60"}, "too small"),
             ({"paper": "a4", "bar_measured": "15"}, "near the 150 mm"),
         ):

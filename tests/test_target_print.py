@@ -83,7 +83,7 @@ def test_it_lies_on_the_paper_with_a_margin():
 @pytest.mark.parametrize(
     ("text", "paper", "words"),
     [
-        ("circles:12x10:0.008:0.004", "a9", "'a9' is no paper; a5, a4"),
+        ("circles:12x10:0.008:0.004", "a9", "'a9' isn't a paper size; a5, a4"),
         ("circles:12x10:0.008:0.004", "20x20", "which has 50 to 5000 mm a side"),
         ("chequerboard:20x14:0.02", "a4", "a4: 210 x 297 mm is too small for chequerboard:20x14:0.02"),
         ("charuco:8x6:0.03:0.022:DICT_NO", "a4", "there is no dictionary DICT_NO"),

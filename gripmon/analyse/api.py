@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from gripmon.analyse.build import Analysed, build
+from gripmon.analyse.build import AnalysedRecording, build
 from gripmon.analyse.content import Report
 from gripmon.analyse.corrected import CorrectedRun, correct_table, name_of, write
 from gripmon.analyse.correction import STAGES
@@ -39,7 +39,7 @@ class Reported:
     """The report as data (SI units), and each recording with its report."""
 
     report: Report
-    analysed: tuple[Analysed, ...]
+    analysed: tuple[AnalysedRecording, ...]
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -127,7 +127,7 @@ def correct(
 
 def _check_target(out: Path, recordings: Sequence[Path]) -> None:
     if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{out}: is of no kind that can be written; one of {', '.join(_SUFFIXES)}", "out")
+        raise InputError(f"{out}: can't be written in this format; one of {', '.join(_SUFFIXES)}", "out")
     if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
         raise InputError(f"{out}: is a recording to correct; another file", "out")
 

@@ -44,7 +44,7 @@ _SEEN = (
 
 
 @dataclass(frozen=True, slots=True)
-class Analysed:
+class AnalysedRecording:
     """A recording and its report."""
 
     source: Recording
@@ -56,7 +56,7 @@ def build(
     faults: Sequence[str] = (),
     affected_m: float | None = None,
     affected_rad: float | None = None,
-) -> tuple[Report, tuple[Analysed, ...]]:
+) -> tuple[Report, tuple[AnalysedRecording, ...]]:
     """The report on recordings, in order of robot and time; ``faults``: what could not be read at all.
 
     ``affected_m`` and ``affected_rad``: from where on work counts as affected; None: the limits for a warning.
@@ -67,7 +67,7 @@ def build(
     return Report(_summary(reports), __version__, reports, tuple(faults)), tuple(analysed)
 
 
-def _analysed(source: Recording, affected_m: float | None, affected_rad: float | None) -> Analysed:
+def _analysed(source: Recording, affected_m: float | None, affected_rad: float | None) -> AnalysedRecording:
     table, meta = source.frames, source.meta
     clock, clock_faults = straightened(table.seq, table.stamp_ns)
     limits = limits_of(source, affected_m, affected_rad)
@@ -112,7 +112,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         integrity=integrity_of(table, limits),
         faults=(*(fault for fault in source.faults if fault not in dropped), *clock_faults),
     )
-    return Analysed(source, msgspec.structs.replace(report, summary=paragraph(report)))
+    return AnalysedRecording(source, msgspec.structs.replace(report, summary=paragraph(report)))
 
 
 def _keys(source: Recording) -> dict[tuple[str, int], int]:
@@ -202,7 +202,7 @@ def _summary(reports: Sequence[RecordingReport]) -> str:
     return " ".join([head, *(headline(r) for r in moved)])
 
 
-_FEWEST = 30
+_FEWEST_FRAMES = 30  # of an estimate of noise, or of a slice
 _SLICES = 120
 _MOST_STRETCHES = 2000  # of a history
 _NEIGHBOURS_NS = SECOND_NS // 2
@@ -253,7 +253,7 @@ def _noise(table: FrameTable, track: Track) -> Noise | None:
     pairs = np.flatnonzero(track.measured[1:] & track.measured[:-1] & (np.diff(track.stamp_ns) < _NEIGHBOURS_NS))
     valid = table.verdict == table.VERDICTS.index("valid")
     pairs = pairs[valid[pairs] & valid[pairs + 1]]
-    if len(pairs) < _FEWEST:
+    if len(pairs) < _FEWEST_FRAMES:
         return None
     sigma = robust_sigma(track.against_first[pairs + 1] - track.against_first[pairs]) / np.sqrt(2.0)
     claimed = np.median(track.sigma[pairs], axis=0)
@@ -274,7 +274,7 @@ def _shares(names: Sequence[str], codes: NDArray[np.int8]) -> tuple[Share, ...]:
 def _slices(table: FrameTable, clock: Clock) -> tuple[Slice, ...]:
     if len(table) < 2 or clock.stamp_ns[-1] == clock.stamp_ns[0]:
         return ()
-    number = max(min(_SLICES, len(table) // _FEWEST), 1)
+    number = max(min(_SLICES, len(table) // _FEWEST_FRAMES), 1)
     length_ns = int(clock.stamp_ns[-1] - clock.stamp_ns[0]) + 1
     # Relative to the first, since a float can't represent Unix nanoseconds exactly.
     edges = clock.stamp_ns[0] + np.linspace(0, length_ns, number + 1).astype(np.int64)

@@ -91,7 +91,7 @@ class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):
         ),
     ]
     start_ns: Annotated[int, _is("for a motion its change point")]
-    limit_ns: Annotated[int | None, _is("when a motion exceeded the limit; null: it is no motion")] = None
+    limit_ns: Annotated[int | None, _is("when a motion exceeded the limit; null: it isn't a motion")] = None
     end_ns: int
     ended_by: Annotated[str, _is("recalibration, return, measured_again, or end_of_recording")]
     reference_id: str
@@ -127,7 +127,7 @@ class Integrity(msgspec.Struct, frozen=True, kw_only=True):
     p99_m: Annotated[float, _is("99 % of them are at most that")]
     median_rad: Annotated[float, _is("median of the bounds on the rotation error")]
     p99_rad: float
-    risk: Annotated[float, _is("probability a frame that the error exceeds a bound")]
+    risk: Annotated[float, _is("probability per frame that the error exceeds a bound")]
 
 
 class Noise(msgspec.Struct, frozen=True):

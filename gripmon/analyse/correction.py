@@ -14,8 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.quick_motion import BURST_MARGIN, MIN_CHANGE_CHI2, Found, find, swings, vibration
-from gripmon.analyse.smoothing import Bools, Dynamics, Ints, Shares, Smoothed, learn_shares, likeliest_dynamics, smooth
+from gripmon.analyse.quick_motion import BURST_MARGIN, MIN_CHANGE_CHI2, FoundChange, find, swings, vibration
+from gripmon.analyse.smoothing import (
+    Bools,
+    Dynamics,
+    Ints,
+    Smoothed,
+    VarianceShares,
+    learn_shares,
+    likeliest_dynamics,
+    smooth,
+)
 from gripmon.analyse.vectors import (
     Blocks,
     Run,
@@ -75,7 +84,7 @@ class Correction:
     segment: Ints
     source: NDArray[np.int8]
     change_points: tuple[ChangePoint, ...]
-    learnt: Shares
+    learnt: VarianceShares
     dynamics: Dynamics
     faults: tuple[str, ...] = ()
 
@@ -110,12 +119,12 @@ def correct(
 STAGES = 3
 
 
-def _changes(run: Run) -> list[Found]:
+def _changes(run: Run) -> list[FoundChange]:
     """Change points by frame index; a gap before a change is part of its interval."""
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
-        Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
+        FoundChange(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
         for found in find(y, 3600.0 / run.frame_s)
         if (found.excess > BURST_MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
@@ -155,24 +164,24 @@ def _unexplained(part: Array, law: Array) -> float:
 class _Fit:
     """Smoothed blocks at ``time_s`` (m,) with their ``segment`` (m,); error variances; quick motion per frame."""
 
-    found: list[Found]
+    found: list[FoundChange]
     time_s: Array
     segment: Ints
     smoothed: Smoothed
-    shares: Shares
+    shares: VarianceShares
     dynamics: Dynamics
     swing: Array
     quick: Array
     quick_error: Array
 
 
-def _segments(run: Run, found: list[Found]) -> Ints:
+def _segments(run: Run, found: list[FoundChange]) -> Ints:
     out = np.zeros(len(run.y), np.int64)
     out[[f.index for f in found]] = 1
     return np.cumsum(out)
 
 
-def _fit(run: Run, found: list[Found]) -> _Fit:
+def _fit(run: Run, found: list[FoundChange]) -> _Fit:
     segment = _segments(run, found)
     good = np.flatnonzero(run.usable)
     swing: Array = np.zeros((len(good), 6))
@@ -253,7 +262,7 @@ def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, outliers: Bools) -> Correctio
     )
 
 
-def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: Found, x: Array, spread: Array) -> None:
+def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: FoundChange, x: Array, spread: Array) -> None:
     """In a gap before a change, the change may have happened at any moment with equal probability."""
     before = np.flatnonzero(run.usable[: found.index])[-1]
     gap = np.arange(before + 1, found.index)

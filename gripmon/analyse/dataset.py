@@ -229,7 +229,7 @@ SCHEMA = pa.schema(
         _field("covariance", pa.list_(_F), "6 x 6 by rows, position (m) then rotation (rad), camera axes"),
         _field("protection_m", _F, "bound on the position error in each frame of the stretch; null: none"),
         _field("protection_rad", _F, "bound on the rotation error"),
-        _field("integrity_risk", _F, "probability a frame that the error exceeds a bound"),
+        _field("integrity_risk", _F, "probability per frame that the error exceeds a bound"),
         _field("moved", pa.bool_(), "the camera moved within this episode, at once or slowly"),
         _field("crept_m", _F, "from the stretch's first half to its second, on average; null: not beyond chance"),
         _field("motion_ns", _I, "when the camera moved, before this stretch; null: it is the first"),

@@ -269,7 +269,7 @@ def drift_onset(track: Track, noticed_ns: int, not_before_ns: int, level: Array,
 
 
 _NEAR_NS = SECOND_NS // 4  # largest distance of an onset in the frames from its change point
-_ALIKE = (0.5, 2.0)  # ratio of sizes
+_SIZE_RATIO = (0.5, 2.0)  # ratio of sizes
 _NEARLY_ALL = 0.8  # fraction of a drift's size: a larger step is that drift
 
 _SHORT_FRAMES = 20_000  # recordings up to this are searched as a whole
@@ -279,7 +279,7 @@ _MARGIN_NS = 20 * SECOND_NS
 
 
 def _change_point_onset(
-    points: Sequence[ChangePoint], onset: Onset, moved: Displacement | None, least: float = _ALIKE[0]
+    points: Sequence[ChangePoint], onset: Onset, moved: Displacement | None, least: float = _SIZE_RATIO[0]
 ) -> Onset | None:
     """The change point of this step, if there is one at its beginning with a similar size, at least ``least`` times as
     large; else None.
@@ -291,7 +291,7 @@ def _change_point_onset(
         return None
     point = max(near, key=lambda p: float(np.linalg.norm(p.size[:3])))
     size_m = float(np.linalg.norm(point.size[:3]))
-    if moved is not None and not least * moved.size_m <= size_m <= _ALIKE[1] * moved.size_m:
+    if moved is not None and not least * moved.size_m <= size_m <= _SIZE_RATIO[1] * moved.size_m:
         return None
     return _onset_of(point)
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.build import Analysed
+from gripmon.analyse.build import AnalysedRecording
 from gripmon.analyse.content import (
     Event,
     RecordingReport,
@@ -44,7 +44,7 @@ _WEB = resources.files("gripmon.analyse") / "web"
 _RANK = {"error": 2, "warning": 1, "info": 0}
 
 
-def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] = lambda: None) -> bytes:
+def page(report: Report, analysed: Sequence[AnalysedRecording], step: Callable[[], None] = lambda: None) -> bytes:
     """The whole page, UTF-8; ``step`` is called after each recording.
 
     ``analysed``: the recordings of ``report``, in the same order, for their pictures.
@@ -53,7 +53,7 @@ def page(report: Report, analysed: Sequence[Analysed], step: Callable[[], None] 
 
     from gripmon.analyse.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
 
-    shown: dict[tuple[int, int], tuple[Shown | None, ...]] = {}
+    shown: dict[tuple[int, int], tuple[ShownPicture | None, ...]] = {}
     figures: dict[str, str] = {}
     if len(analysed) > 1:
         figures["overview"] = as_json(overview_figure(report.recordings))
@@ -110,12 +110,12 @@ def _cards(events: Sequence[Event]) -> list[Event]:
     return worthy[:_MOST_CARDS]
 
 
-def _pictures(analysed: Analysed, event: Event) -> tuple[Shown | None, ...]:
+def _pictures(analysed: AnalysedRecording, event: Event) -> tuple[ShownPicture | None, ...]:
     seqs = event.before_seq, event.at_seq, event.after_seq
     return cut_alike([_judged(analysed, seq) for seq in seqs], event.look)
 
 
-def _judged(analysed: Analysed, seq: int | None) -> JudgedPicture | None:
+def _judged(analysed: AnalysedRecording, seq: int | None) -> JudgedPicture | None:
     picture = None if seq is None else analysed.source.picture(seq)
     if seq is None or picture is None:
         return None
@@ -124,7 +124,7 @@ def _judged(analysed: Analysed, seq: int | None) -> JudgedPicture | None:
     return JudgedPicture(picture, used=not held)
 
 
-def _index(analysed: Analysed, seq: int) -> int:
+def _index(analysed: AnalysedRecording, seq: int) -> int:
     table = analysed.source.frames
     return min(int(np.searchsorted(table.seq, seq)), len(table) - 1)
 
@@ -237,7 +237,7 @@ class JudgedPicture(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ShownPicture:
     """A picture on the page; ``uri`` is a JPEG in a data URI."""
 
     seq: int
@@ -248,7 +248,7 @@ class Shown:
 
 def cut_alike(
     pictures: Sequence[JudgedPicture | None], look: LookNote | msgspec.UnsetType = msgspec.UNSET
-) -> tuple[Shown | None, ...]:
+) -> tuple[ShownPicture | None, ...]:
     """Pictures in order of time (any may be None), cropped to the same part of the image; the gripper's outline in the
     first one is also drawn into the later ones, in white.  A ``look`` is drawn over all of them instead of edge points.
     """
@@ -292,7 +292,7 @@ def _shown(
     box: tuple[int, int, int, int],
     outline: Sequence[Points],
     look: LookNote | msgspec.UnsetType,
-) -> Shown | None:
+) -> ShownPicture | None:
     left, top, right, bottom = box
     picture, used = judged
     image = to_8_bit(picture.image)
@@ -332,7 +332,7 @@ def _shown(
     if not done:
         return None
     text = base64.b64encode(encoded.tobytes()).decode("ascii")
-    return Shown(int(picture.seq), f"data:image/jpeg;base64,{text}", *size)
+    return ShownPicture(int(picture.seq), f"data:image/jpeg;base64,{text}", *size)
 
 
 def _draw_look(

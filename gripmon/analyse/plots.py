@@ -37,7 +37,9 @@ _STRIP_PX = 15
 
 
 def drift_figure(report: RecordingReport) -> go.Figure:
-    """The TCP's way from the calibration and the reference, its parts, its turn, and what it meant."""
+    """The TCP's displacement from the calibration and the reference in force (mm), its components, the rotation (°),
+    and strips of verdicts, states and affected times.
+    """
     figure = _figure(0.035, 0.36, 0.27, 0.16, 0.21)
     curves = {curve.name: curve for curve in report.curves}
     if len(report.references) > 1:
@@ -189,7 +191,7 @@ def _strips(figure: go.Figure, report: RecordingReport, row: int) -> None:
 
 
 def _strip(figure: go.Figure, row: int, label: str, stretches: Sequence[Stretch], colours: dict[str, str]) -> None:
-    """One line of a strip chart, a colour a name."""
+    """One line of a strip chart, one colour per name."""
     for name in dict.fromkeys(s.name for s in stretches):
         mine = [s for s in stretches if s.name == name]
         x = np.array([t for s in mine for t in (1e-6 * s.start_ns, 1e-6 * max(s.end_ns, s.start_ns + 1), np.nan)])
@@ -272,13 +274,15 @@ def _plain(text: str) -> str:
 
 
 def as_json(figure: go.Figure) -> str:
-    """For a script element: nothing in it ends that."""
+    """JSON for a script element, escaped so that no text in it can end the element."""
     text: Any = figure.to_json()
     return str(text).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def mountings_figure(names: Sequence[str], shift_m: np.ndarray, mountings: np.ndarray) -> go.Figure:
-    """The TCP of each stretch of a dataset against the first one's, along the camera's axes, a colour a mounting."""
+    """The TCP of each stretch of a dataset against the first one's, along the camera's axes (mm);
+    one colour per mounting.
+    """
     figure = _figure(0.05, 1 / 3, 1 / 3, 1 / 3)
     for number in np.unique(mountings).tolist():
         mine = np.flatnonzero(mountings == number)

@@ -47,7 +47,7 @@ MIN_NOISE_VARIANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundChange:
     """A change between the frames ``index - 1`` and ``index``; with :data:`PLACE_PROBABILITY` between the frame before
     ``first`` and ``last``.  ``excess``: statistic over threshold.
     """
@@ -109,13 +109,13 @@ def _local_median(squared: Array, stride: int) -> Array:
     return np.repeat(smooth, stride)[: len(squared)]
 
 
-def find(y: Array, frames_per_hour: float) -> list[Found]:
+def find(y: Array, frames_per_hour: float) -> list[FoundChange]:
     """Change points in the frames ``y`` (n, a), whitened by their reported covariance."""
     limits = [threshold(length, frames_per_hour, y.shape[1]) for length in SIDE_FRAMES]
     statistic = np.stack(
         [squared_changes(y, length) / limit for length, limit in zip(SIDE_FRAMES, limits, strict=True)]
     )
-    found: list[Found] = []
+    found: list[FoundChange] = []
     for index in _peaks(statistic.max(axis=0), 1.0):
         place = _place(y, index, int(SIDE_FRAMES[int(statistic[:, index].argmax())]))
         if place is not None and (not found or place.index - found[-1].index >= SAME_CHANGE_FRAMES // 2):
@@ -135,7 +135,7 @@ def _peaks(statistic: Array, limit: float) -> list[int]:
     return sorted(taken)
 
 
-def _place(y: Array, index: int, length: int) -> Found | None:
+def _place(y: Array, index: int, length: int) -> FoundChange | None:
     """The most likely place within a window: each side has its own mean, errors are white."""
     begin, end = max(index - 2 * length, 0), min(index + 2 * length, len(y))
     part = y[begin:end]
@@ -155,7 +155,7 @@ def _place(y: Array, index: int, length: int) -> Found | None:
         left = probability[low - 1] if low > 0 else -1.0
         right = probability[high + 1] if high + 1 < len(candidates) else -1.0
         low, high = (low - 1, high) if left >= right else (low, high + 1)
-    return Found(*(int(begin + candidates[k]) for k in (best, low, high)))
+    return FoundChange(*(int(begin + candidates[k]) for k in (best, low, high)))
 
 
 def _own_noise(part: Array) -> Array:
@@ -174,7 +174,9 @@ LINE_OVER_FLOOR = 8.0
 don't overlap it is three times the floor on average).
 """
 LOWEST_BIN = 5
+"""First frequency bin in which a line is searched for; slower motion remains there."""
 SWING_FRAMES = 12
+"""Frames over which squares are averaged to find swinging."""
 SWING_OVER_USUAL, SWING_OVER_CLAIMED = 8.0, 5.0
 """Variance of a swinging camera's frames, in multiples of the usual one and of the reported one."""
 

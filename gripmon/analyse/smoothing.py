@@ -21,10 +21,12 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 MAX_LAG_S = 30.0
+"""Longest lag of the second differences."""
 TRIMMED_FRACTION, TRIMMED_MEAN = 0.98, 0.8735
 """Fraction of the squares that is averaged (the rest may be outliers), and its mean for normal errors."""
 CHI2_MEDIAN = 0.4549
 MIN_WHITE_VARIANCE = 1e-4
+"""Least white variance; also the least mean square by which the fit's rows are weighted."""
 MIN_SLOW_VARIANCE = 0.3
 """Prior of the lasting error: the reported variance that is not found elsewhere, and at least this."""
 PRIOR_BACKGROUNDS = 3.0
@@ -49,7 +51,7 @@ largest number.
 
 
 @dataclass(frozen=True)
-class Shares:
+class VarianceShares:
     """(a,) each: variance of a block's own error, of the error that lasts for :data:`MID_S`, for :data:`SLOW_S`; of a
     single frame about its block; and the reported variance beyond these.
     """
@@ -88,7 +90,7 @@ def step_of(time_s: Array) -> float:
     return float(np.median(steps)) if len(steps) else 1.0
 
 
-def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Array, trimmed: bool) -> Shares:
+def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Array, trimmed: bool) -> VarianceShares:
     """From block means ``y`` (m, a) at the times (m,), which belong to a ``segment`` (m,) each; ``frame`` (a,) is the
     variance of frames about their block.
     """
@@ -119,7 +121,7 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
     slow = (backgrounds * np.minimum(out[2], 2.0 * expected) + PRIOR_BACKGROUNDS * expected) / (
         backgrounds + PRIOR_BACKGROUNDS
     )
-    return Shares(white, mid, slow, frame, np.maximum(1.0 - frame - white - mid - slow, 0.0))
+    return VarianceShares(white, mid, slow, frame, np.maximum(1.0 - frame - white - mid - slow, 0.0))
 
 
 def _seen(lag_s: float, correlation_s: float) -> float:
@@ -128,7 +130,7 @@ def _seen(lag_s: float, correlation_s: float) -> float:
 
 
 def likeliest_dynamics(
-    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
+    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: VarianceShares
 ) -> tuple[Dynamics, list[float]]:
     """The most likely random walk of the pose, per axis; and the times (s) at which its rate changes."""
     series = _Series(*_for_likelihood(time_s, y, variance, restarts, shares), shares.slow)
@@ -144,7 +146,7 @@ def likeliest_dynamics(
 
 
 def _for_likelihood(
-    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
+    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: VarianceShares
 ) -> tuple[Array, Array, Array, Bools, Array]:
     """Coarser means; errors that last for less become white noise in them."""
     group = max(round(LIKELIHOOD_STEP_S / step_of(time_s)), -(-len(time_s) // MAX_LIKELIHOOD_STEPS), 1)

@@ -52,10 +52,10 @@ class Stretch(msgspec.Struct, frozen=True, kw_only=True):
     valid: Annotated[int, _is("frames whose transform was valid")]
     verdict: Annotated[str, _is("valid: it comes from valid frames; suspect: there were none; unknown: not measured")]
     cam_T_grip: Annotated[tuple[float, ...] | None, _is("x, y, z (m), quaternion x, y, z, w; null: unknown")] = None
-    covariance: Annotated[tuple[float, ...] | None, _is("36 values: a single frame's, for many earn nothing")] = None
+    covariance: Annotated[tuple[float, ...] | None, _is("36 values; a single frame's, not a mean's")] = None
     protection_m: Annotated[float | None, _is("bound on its position error in each of these frames; null: none")] = None
     protection_rad: float | None = None
-    integrity_risk: Annotated[float | None, _is("probability a frame that a bound is exceeded")] = None
+    integrity_risk: Annotated[float | None, _is("probability per frame that a bound is exceeded")] = None
     crept_m: Annotated[float | None, _is("from its first half to its second; null: not beyond chance")] = None
     motion: Annotated[Motion | None, _is("null: the episode begins with it")] = None
     reasons: Annotated[str, _is("why frames weren't valid, the most frequent first")] = ""

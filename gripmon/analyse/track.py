@@ -126,7 +126,7 @@ def _between(from_poses: Array, to_poses: Array) -> Array:
 
 
 def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequence[float] | None) -> Array:
-    """(6,) the part of the shift that is the configured reference's own error, and no drift."""
+    """(6,) the part of the shift that is the configured reference's own error, not drift."""
     if first is None or first.origin != "configuration" or not len(shifts):
         return np.zeros(6)
     if known_error is not None:

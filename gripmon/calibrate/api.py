@@ -144,7 +144,7 @@ def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
         elif value is not None and not math.isfinite(value):
             fault = f"is not a number; {name}=VALUE"
         elif name in ("fx_px", "fy_px") and (value is None or value <= 0.0):
-            fault = f"at what isn't said; {name}=VALUE (px), above 0"
+            fault = f"is to be held, but without a value; {name}=VALUE (px), above 0"
         if fault is not None:
             raise InputError(f"{name}: {fault}")
     if "aspect" in fixed and "fy_px" in fixed:
@@ -210,7 +210,7 @@ def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
     if seen[0] >= max(target.columns, target.rows) or len(sightings) == 1:
         return []
     whole = f"{target.columns} x {target.rows}"
-    return [f"no image shows more than {seen[0]} x {seen[1]} of the target's {whole} points: is it described rightly?"]
+    return [f"no image shows more than {seen[0]} x {seen[1]} of the target's {whole} points: is its description right?"]
 
 
 def calibrate_robot_world(

@@ -37,9 +37,10 @@ from gripmon.model.records import Array
 LARGEST_ITERATIONS = 200
 OUTLIER = 5.0
 """Normalised residual, in robust standard deviations, above which a point is left out at the end."""
-STRANGE = 0.5
+LEAST_VIEW_INLIERS = 0.5
 """Inlier ratio of a view below which it doesn't show the same target with the same camera."""
-PARALLEL = float(np.cos(np.radians(3.0)))
+PARALLEL_COSINE = float(np.cos(np.radians(3.0)))
+"""Cosine between the normals of the plate's poses above which views count as equally tilted."""
 ROUNDS = 12
 """Maximum number of rounds of reweighting and of correcting the offsets of discs' centres."""
 
@@ -172,7 +173,7 @@ class BundleProblem:
         if found.converged:
             return found.state
         normals = np.stack([T[:3, 2] for T in found.state[1]])
-        if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL:
+        if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL_COSINE:
             raise CalibrationError(DEGENERATE)
         raise CalibrationError(
             f"did not converge in {LARGEST_ITERATIONS} steps; more views, more tilted against each other, or a model "
@@ -181,7 +182,7 @@ class BundleProblem:
 
     def _check_views(self, used: Sequence[NDArray[np.bool_]]) -> None:
         for sighting, good in zip(self._sightings, used, strict=True):
-            if len(used) > 1 and good.mean() < STRANGE:
+            if len(used) > 1 and good.mean() < LEAST_VIEW_INLIERS:
                 raise CalibrationError(
                     f"{sighting.name}: {int((~good).sum())} of {len(good)} points contradict the other images; images "
                     "of one camera and focus, or without this one"

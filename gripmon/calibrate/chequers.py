@@ -31,7 +31,7 @@ from gripmon.model.records import Array
 SCALES = (1.0, 2.0, 3.5)
 """Standard deviations (px) of the smoothing with which corners are searched."""
 MOST_CANDIDATES = 4000
-WEAKEST = 0.02
+LEAST_STRENGTH = 0.02
 """Minimum strength of a candidate, relative to the strongest ones."""
 _RING = 32
 _SECOND = 2
@@ -39,7 +39,7 @@ _LATTICES = 3
 
 
 @dataclass(frozen=True)
-class _Turns:
+class _Alternating:
     """Neighbouring corners are negatives of each other: where one has dark squares, the other has light ones."""
 
     second: NDArray[np.complex128]
@@ -69,7 +69,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
         good, second = crossing(grey, candidates, np.full(len(candidates), 2.0 * scale + 2.0))
         candidates, second = candidates[good], second[good]
         for _ in range(_LATTICES):
-            lattice = find_lattice(candidates, _Turns(second))
+            lattice = find_lattice(candidates, _Alternating(second))
             if not lattice:
                 break
             chosen = np.array(list(lattice.values()))
@@ -106,7 +106,7 @@ def saddles(grey: Grey, sigma_px: float) -> Array:
     strength = xy * xy - xx * yy  # all three kernels have a gain of 4
     radius = round(2.0 * sigma_px) + 1
     peak = cv2.dilate(strength, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
-    floor = WEAKEST * float(np.partition(strength.ravel(), -64)[-64])
+    floor = LEAST_STRENGTH * float(np.partition(strength.ravel(), -64)[-64])
     rows, columns = np.nonzero((strength >= peak) & (strength > max(floor, 1e-3)))
     if len(rows) > MOST_CANDIDATES:
         strongest = np.argsort(strength[rows, columns])[-MOST_CANDIDATES:]

@@ -32,7 +32,7 @@ from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Tar
 _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
 _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
-WINDOW = 0.42
+CORNER_RADIUS = 0.42
 """Radius of the window around a corner, in squares."""
 TOO_BLURRED = 0.16
 """Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs twice the number, in
@@ -67,13 +67,13 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
             return NotFound("the board is mirrored; an image that isn't flipped")
         if len(ids) < FEWEST["charuco"]:
             board_is = f"a board of {target.columns} x {target.rows} squares"
-            said = f"{marks} marks and {len(ids)} corners of {board_is}; at least {FEWEST['charuco']}"
-            return NotFound(_blurred(grey) or said)
+            few = f"{marks} marks and {len(ids)} corners of {board_is}; at least {FEWEST['charuco']}"
+            return NotFound(_blurred(grey) or few)
     plate = np.asarray(board.getChessboardCorners(), np.float64)
     # Markers are in the white squares, and must be outside the windows.
     margin = 0.5 * (1.0 - target.marker_m / target.square_m)
     steps = _steps(plate[ids, :2] / target.square_m, corners)
-    window = np.minimum(WINDOW, 1.3 * margin) * steps - (1.0 if 1.3 * margin < WINDOW else 0.0)
+    window = np.minimum(CORNER_RADIUS, 1.3 * margin) * steps - (1.0 if 1.3 * margin < CORNER_RADIUS else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
     return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
@@ -134,7 +134,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     if blur_px > TOO_BLURRED * float(np.median(steps)):
         return NotFound(_too_coarse(blur_px, steps))
     cells = _turned(cells, target.columns, target.rows)
-    uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps, cells)
+    uv_px, covariance, good = _sharp(grey, rough, CORNER_RADIUS * steps, cells)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
     return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST["chequerboard"])
@@ -293,14 +293,14 @@ def _too_blurred(blur_px: float) -> str:
 
 LEAST_CONTRAST = 0.2
 """Minimum contrast of dark and light squares, over the range of their grey levels: less may be light and shadow."""
-BARE = 0.3
+SURROUNDINGS_TOLERANCE = 0.3
 """How far the surroundings may differ from the plate's own ground, over the contrast."""
 _ALL = 0.9
 
 
 def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool) -> bool:
     """True if a lattice (cells (n, 2) from 0 on, at (n, 2) px) has no gaps and the plate beyond all four sides is
-    visible and bare.  False says nothing: a finger, the image's border, or something else may hide the rest.
+    visible and bare.  False proves nothing: a finger, the image's border, or something else may hide the rest.
 
     ``squares``: the points are corners of squares, otherwise centres of discs.
     """
@@ -323,7 +323,7 @@ def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool
         if ((beyond < 1.0) | (beyond > np.array(grey.shape[::-1]) - 2.0)).any():
             return False
         # Beyond a pattern of squares either colour is possible, but the same all along.
-        shown, near = _levels(grey, beyond), BARE * abs(ground - ink)
+        shown, near = _levels(grey, beyond), SURROUNDINGS_TOLERANCE * abs(ground - ink)
         if max(np.mean(np.abs(shown - level) < near) for level in ((ground, ink) if squares else (ground,))) < _ALL:
             return False
     return True

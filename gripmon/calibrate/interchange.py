@@ -1,5 +1,5 @@
-"""Export cameras and hand/eye transforms for other programs: by format name, with the nearest lens that a format
-supports.
+"""Cameras from and for other programs, and hand/eye transforms for them, by format name; a lens that a format doesn't
+support becomes the nearest one.
 
 A robot's tree runs from arm to camera, whereas ``cam_T_grip`` gives the gripper in the camera frame.  So the camera's
 pose in the gripper's frame is written (origin at the TCP, x across the jaws, z out of the gripper), or with
@@ -102,9 +102,9 @@ def write_camera(
     one that it supports, with a warning about the largest error in the image.
     """
     warnings: list[str] = []
-    if not _has(kind, camera):
-        camera, said = _nearest(camera, kind, file, fit)
-        warnings.append(said)
+    if not _supports(kind, camera):
+        camera, warning = _nearest(camera, kind, file, fit)
+        warnings.append(warning)
     if kind == "ros" and len(getattr(camera, "coefficients", ())) == 12:
         warnings.append("rational_polynomial with 12 coefficients: OpenCV takes them, ROS's own text speaks of 8")
     notes = [" ".join(note.split()) for note in (*notes, *warnings)]
@@ -115,7 +115,7 @@ def write_camera(
     return Exported(data, tuple(warnings))
 
 
-def _has(kind: str, camera: LensSettings) -> bool:
+def _supports(kind: str, camera: LensSettings) -> bool:
     tag = camera.__struct_config__.tag
     if tag == "fisheye":
         return kind in _FISHEYE
@@ -267,7 +267,7 @@ class HandEye:
             value = getattr(self, key)
             if not _FRAME.fullmatch(value):
                 raise ValueError(
-                    f"{key}: {value!r} is no frame's name; without blanks, quotes, angle brackets, and no / in front"
+                    f"{key}: {value!r} isn't a frame's name; without blanks, quotes, angle brackets, and no / in front"
                 )
         if self.gripper_frame == self.camera_frame:
             raise ValueError(f"both frames are called {self.camera_frame}; two names")

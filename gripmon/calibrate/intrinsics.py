@@ -222,10 +222,10 @@ def _supported(
             break
         except ValueError as error:
             if not name:
-                raise CalibrationError(f"the fit ends at a camera that can't be meant ({error})") from None
+                raise CalibrationError(f"the fit ends at an implausible camera ({error})") from None
         held.append(name)
-    said = f"held at 0, as the views don't support more of a lens: {', '.join(held)}"
-    return names, free, bundle, (said,) if held else ()
+    warning = f"held at 0, as the views don't support more of a lens: {', '.join(held)}"
+    return names, free, bundle, (warning,) if held else ()
 
 
 def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Sighting], fixed: Fixed) -> Bundle:
@@ -412,9 +412,10 @@ def _parameters(result: IntrinsicsResult) -> list[str]:
             "degrees to different sides determine it"
         )
     lens = [n for n in result.parameters if n.startswith(("coefficients", "kappa"))]
-    untold = [n for n in lens if abs(values[n]) < 2.0 * sigma[n]]
     return out + [
-        f"{n} is not told from 0 ({values[n]:.3g} ± {sigma[n]:.2g}): a model with fewer parameters" for n in untold
+        f"{n} can't be distinguished from 0 ({values[n]:.3g} ± {sigma[n]:.2g}): a model with fewer parameters"
+        for n in lens
+        if abs(values[n]) < 2.0 * sigma[n]
     ]
 
 
@@ -430,7 +431,9 @@ def _views(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> list[str]
     lost = sum(int((~u).sum()) for u in result.used)
     total = sum(len(u) for u in result.used)
     if lost > 0.1 * total:
-        out.append(f"{lost} of {total} points don't fit and were left out: is the target flat, and described rightly?")
+        out.append(
+            f"{lost} of {total} points don't fit and were left out: is the target flat, and its description right?"
+        )
     if result.rms_px > LARGE_RMS_SHARE * result.camera.width_px:
         out.append(
             f"residuals of {result.rms_px:.2g} px are large: is the target flat, the focus fixed, the model right?"

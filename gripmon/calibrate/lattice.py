@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 
 from gripmon.model.records import Array, Image
 
-NEAR = 0.35
-"""Gate for a predicted point, in steps of the lattice: a fisheye's steps change that much."""
+GATE_STEPS = 0.35
+"""Gate for a predicted point, in steps of the lattice: a fisheye's steps change by as much."""
 SEEDS = 60
 """Maximum number of seeds that are tried."""
 _NEIGHBOURS = 8
@@ -28,8 +28,8 @@ _STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 Index = tuple[int, int]
 
 
-class Kin(Protocol):
-    """What points know about each other besides their positions."""
+class LatticeRules(Protocol):
+    """Which points can be neighbours on a lattice, besides their positions."""
 
     def neighbours(self, a: int, b: int, step_px: Array) -> bool:
         """Whether point b, a step (2,) from a, can be its neighbour on the lattice."""
@@ -38,7 +38,7 @@ class Kin(Protocol):
         """Whether two steps from a point can be those of a *square* lattice."""
 
 
-def find_lattice(points_px: Array, kin: Kin) -> dict[Index, int]:
+def find_lattice(points_px: Array, rules: LatticeRules) -> dict[Index, int]:
     """Lattice coordinates (column, row) -> index of the point, for the largest lattice among points (n, 2); the
     lattice's axes have the same handedness as the image's.  Empty if there is none of at least 3 x 3.
     """
@@ -52,10 +52,10 @@ def find_lattice(points_px: Array, kin: Kin) -> dict[Index, int]:
     for seed in np.argsort(np.linalg.norm(points_px - middle, axis=1)).tolist():
         if seed in tried:
             continue
-        bases = _bases(points_px, tree, seed, kin)
+        bases = _bases(points_px, tree, seed, rules)
         count += bool(bases)
         for basis in bases:
-            grown = _grow(points_px, tree, seed, basis, kin)
+            grown = _grow(points_px, tree, seed, basis, rules)
             tried.update(grown.values())
             if len(grown) > len(best):
                 best = grown
@@ -100,7 +100,7 @@ def extent(lattice: dict[Index, int]) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def _bases(points: Array, tree: cKDTree, seed: int, kin: Kin) -> list[tuple[Array, Array]]:
+def _bases(points: Array, tree: cKDTree, seed: int, rules: LatticeRules) -> list[tuple[Array, Array]]:
     """Pairs of steps from a point to neighbours that the opposite neighbours confirm, the shortest first."""
     count = min(_NEIGHBOURS + 1, len(points))
     _, near = tree.query(points[seed], count)
@@ -108,12 +108,12 @@ def _bases(points: Array, tree: cKDTree, seed: int, kin: Kin) -> list[tuple[Arra
     for k in np.atleast_1d(near)[1:].tolist():
         step = points[k] - points[seed]
         back = _near(tree, points[seed] - step, float(np.hypot(*step)))
-        if back is not None and kin.neighbours(seed, k, step) and kin.neighbours(seed, back, -step):
+        if back is not None and rules.neighbours(seed, k, step) and rules.neighbours(seed, back, -step):
             confirmed.append(step)
     out = []
     for a, b in itertools.combinations(confirmed, 2):
         turning = float(a[0] * b[1] - a[1] * b[0])
-        if abs(turning) < 0.2 * float(np.hypot(*a) * np.hypot(*b)) or not kin.basis(seed, a, b):
+        if abs(turning) < 0.2 * float(np.hypot(*a) * np.hypot(*b)) or not rules.basis(seed, a, b):
             continue
         if turning < 0.0:
             a, b = b, a
@@ -125,10 +125,10 @@ def _bases(points: Array, tree: cKDTree, seed: int, kin: Kin) -> list[tuple[Arra
 
 def _near(tree: cKDTree, where: Array, step_px: float) -> int | None:
     distance, index = tree.query(where)
-    return int(index) if distance < NEAR * step_px else None
+    return int(index) if distance < GATE_STEPS * step_px else None
 
 
-def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], kin: Kin) -> dict[Index, int]:
+def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], rules: LatticeRules) -> dict[Index, int]:
     found: dict[Index, int] = {(0, 0): seed}
     taken = {seed}
     local: dict[Index, Array] = {(0, 0): np.stack(basis)}
@@ -143,7 +143,7 @@ def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], k
             behind = (at[0] - sign, at[1]) if axis == 0 else (at[0], at[1] - sign)
             step = here - points[found[behind]] if behind in found else sign * local[at][axis]
             index = _near(tree, here + step, float(np.hypot(*step)))
-            if index is None or index in taken or not kin.neighbours(found[at], index, points[index] - here):
+            if index is None or index in taken or not rules.neighbours(found[at], index, points[index] - here):
                 continue
             found[to] = index
             taken.add(index)
@@ -243,12 +243,13 @@ def sharpest_blur_px(grey: Grey) -> float:
 
 SMALLEST_PX = 4.0
 """Minimum diameter of a disc."""
-ROUND = 0.88
+LEAST_ROUNDNESS = 0.88
 """Minimum area of a blob over that of the ellipse with the same moments (the maximum is its inverse)."""
-SLIMMEST = 0.2
-MOST = 4000
+LEAST_AXIS_RATIO = 0.2
+"""Minimum ratio of the axes of a disc's ellipse."""
+MOST_BLOBS = 4000
 LARGE_PX = 1600
-"""Images larger than this are searched at half size."""
+"""Images larger than this are searched at half size first."""
 SYSTEMATIC_PX = 0.02
 """Standard deviation of a centre that noise doesn't explain."""
 ASYMMETRIC = 0.025
@@ -368,7 +369,7 @@ def _blobs(shown: NDArray[np.uint8], block_px: int, dark: bool) -> tuple[Array, 
     good &= (x > 0) & (y > 0) & (x + w < width) & (y + h < height)
     good[0] = False
     centres, spreads = [], []
-    for k in np.flatnonzero(good)[:MOST].tolist():
+    for k in np.flatnonzero(good)[:MOST_BLOBS].tolist():
         left, top, w_k, h_k, area_k = stats[k].tolist()
         rows, columns = np.nonzero(labels[top : top + h_k, left : left + w_k] == k)
         u, v = columns - columns.mean(), rows - rows.mean()
@@ -377,7 +378,7 @@ def _blobs(shown: NDArray[np.uint8], block_px: int, dark: bool) -> tuple[Array, 
         determinant = a * c - b * b
         roundness = area_k / (4.0 * np.pi * determinant**0.5)
         largest = 0.5 * (a + c) + (0.25 * (a - c) ** 2 + b * b) ** 0.5
-        if ROUND < roundness < 1.0 / ROUND and determinant > (SLIMMEST * largest) ** 2:
+        if LEAST_ROUNDNESS < roundness < 1.0 / LEAST_ROUNDNESS and determinant > (LEAST_AXIS_RATIO * largest) ** 2:
             centres.append((left + columns.mean(), top + rows.mean()))
             spreads.append(((a, b), (b, c)))
     return np.array(centres).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)

@@ -21,7 +21,7 @@ from gripmon.calibrate.bundle import (
     lens_vector,
     plate_pose,
 )
-from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, GripperOnPlate, off_plate, stand
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between
@@ -29,7 +29,7 @@ from gripmon.model.records import Array
 
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, count as contradicting their uncertainty."""
-IMPOSSIBLE, MISSHAPEN = 1e-6, 0.005
+RECTANGLE_PROBABILITY, RECTANGLE_MISFIT = 1e-6, 0.005
 """An inferred gripper's corners are not a rectangle if they are less probable than the first and deviate by more than
 the second, a fraction of their reach: fingers may be misaligned by less.
 """
@@ -163,7 +163,7 @@ def calibrate_plane(
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
     p_value = float(chdtrc(freedom, size)) if freedom else 1.0
-    if known is None and p_value < IMPOSSIBLE and _misfit(found) > MISSHAPEN:
+    if known is None and p_value < RECTANGLE_PROBABILITY and _misfit(found) > RECTANGLE_MISFIT:
         raise CalibrationError(_no_rectangle(corners.names, found.residuals_m, p_value))
     enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
     motion[:, len(own) - 2 * len(corners.names) : len(own)] *= enlarged
@@ -209,12 +209,12 @@ def _plate(lens: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle
     return cam_T_plate, covariance, bundle
 
 
-def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], Standing]:
+def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], GripperOnPlate]:
     """A function from a solution's inputs to the gripper's pose on the plate; ``made`` is the camera as calibrated."""
     each_px2, free = corners.each_px2, corners.free if known is not None else None
     known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
 
-    def solve(given: _Given) -> Standing:
+    def solve(given: _Given) -> GripperOnPlate:
         found = stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
         if free is None:
             return found
@@ -224,7 +224,7 @@ def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) ->
     return solve
 
 
-def _misfit(found: Standing) -> float:
+def _misfit(found: GripperOnPlate) -> float:
     """Misfit of the innermost corners, over their reach."""
     left, reach = found.residuals_m[:INFERRED_FROM], found.corners_m[:INFERRED_FROM, :2]
     return float(np.linalg.norm(left) / np.linalg.norm(reach))
@@ -233,7 +233,7 @@ def _misfit(found: Standing) -> float:
 def _no_rectangle(names: Sequence[str], residuals_m: Array, p_value: float) -> str:
     sizes_m = np.linalg.norm(residuals_m, axis=1)
     return (
-        f"the innermost corners make no rectangle on the plate (probability {p_value:.1g}; "
+        f"the innermost corners don't form a rectangle on the plate (probability {p_value:.1g}; "
         f"{names[int(sizes_m.argmax())]} is {1e3 * float(sizes_m.max()):.3f} mm off): both "
         "fingertips flat on the plate, rough corners nearer to the real ones where a line of the plate runs beside a "
         "finger, the target as it was described"
@@ -288,7 +288,7 @@ def _ends(changed: Callable[[Array], _Given], covariance: Array) -> list[tuple[_
     return [(changed(_STEP * root), changed(-_STEP * root)) for root in independent_errors(covariance)]
 
 
-def _slope(up: Standing, down: Standing) -> tuple[Array, Array, Array]:
+def _slope(up: GripperOnPlate, down: GripperOnPlate) -> tuple[Array, Array, Array]:
     """Derivatives by one independent error, per standard deviation: of pose and inferred lengths (6 + s,), of the
     residuals (2c,), of tilt and gap (3,).
     """

@@ -18,9 +18,9 @@ from gripmon.model.records import Array
 
 BESIDE_STEPS = 2.0
 """Distance beyond the visible points, in steps of the pattern, from which a corner counts as off the plate."""
-VAGUE_M = 1.5e-5
-"""Standard deviation of the TCP above which one image of an inferred gripper is reported as vague."""
-OTHER_WAY_RAD = np.pi / 2.0
+DOUBTFUL_SIGMA_M = 1.5e-5
+"""Standard deviation of the TCP above which one image of an inferred gripper gets a warning."""
+LARGEST_TURN_RAD = np.pi / 2.0
 """Largest difference of rotation from a rough calibration (rad): none is off by as much."""
 _ROUNDS = 3
 
@@ -139,7 +139,7 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
 def against(cam_T_grip: Array, rough_cam_T_grip: Array) -> str | None:
     """What is wrong with a calibration compared with a known rough one, in words; None if nothing is."""
     turned = float(np.linalg.norm(perturbation_between(rough_cam_T_grip, cam_T_grip)[3:]))
-    if turned <= OTHER_WAY_RAD:
+    if turned <= LARGEST_TURN_RAD:
         return None
     return (
         f"the gripper is turned by {np.degrees(turned):.0f} degrees against the rough calibration; corners by their "
@@ -193,7 +193,7 @@ def doubts(image: Coincidence, inferred: bool) -> list[str]:
     if image.p_value < DOUBTED:
         worst = int(np.linalg.norm(image.residuals_m, axis=1).argmax())
         size_mm = 1e3 * float(np.linalg.norm(image.residuals_m[worst]))
-        what = "make no rectangle" if inferred else "don't fit the gripper file"
+        what = "don't form a rectangle" if inferred else "don't fit the gripper file"
         out.append(
             f"the corners {what} (probability {image.p_value:.1g}), most of all {names[worst]}, {size_mm:.3f} mm off: "
             "another jaw opening, another target, a bent finger, or fingertips that don't stand on the plate; "
@@ -202,7 +202,7 @@ def doubts(image: Coincidence, inferred: bool) -> list[str]:
     if image.apart_p is not None and image.apart_p < DOUBTED:
         out.append(_apart_text(image))
     own_mm = 1e3 * float(np.sqrt(np.linalg.eigvalsh(image.own[:3] @ image.own[:3].T)[-1]))
-    if inferred and own_mm > 1e3 * VAGUE_M:
+    if inferred and own_mm > 1e3 * DOUBTFUL_SIGMA_M:
         out.append(
             f"the inferred corners leave the TCP uncertain by {own_mm:.3f} mm (standard deviation): where the fingers' "
             "edges hardly stand out from the plate's print, they are seen along a part only; a plate of discs, light "

@@ -31,13 +31,15 @@ INFERRED_FROM = 4
 LARGEST_MISFIT = 0.1
 """Residuals, over the corners' spread, above which they mean another gripper and not inaccuracy."""
 SMALLEST_SPREAD_M = 1e-5
-NO_RECTANGLE = "the innermost corners are no rectangle; two corners on each of two parallel fingertips, by their names"
+NO_RECTANGLE = (
+    "the innermost corners aren't a rectangle; two corners on each of two parallel fingertips, by their names"
+)
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 """Signs of x and y of the innermost corners."""
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class GripperOnPlate:
     """A gripper on a plate: ``corners_m`` (c, 3), given or inferred, ``residuals_m`` (c, 2) on the plate in the
     gripper's axes, ``apart`` (3,): tilt about the gripper's x and y (rad) and gap (m, positive if the gripper is nearer
     to the camera than the plate) of the pose that explains the corners best without the plate; None if undetermined.
@@ -56,7 +58,7 @@ def stand(
     covariance_px: Array,
     corners_m: Array | None,
     contact_m: float = 0.0,
-) -> Standing:
+) -> GripperOnPlate:
     """All steps for one image: ``uv_px`` (c, 2) weighted by ``covariance_px`` (c, 2, 2); the gripper's ``corners_m``
     (c, 3), whose contact plane lies at z = ``contact_m``, or None to infer them (see :func:`infer_rectangle`; then all
     are contact points).  Raises :class:`CalibrationError`.
@@ -89,7 +91,7 @@ def stand(
     plate_T_grip[:2, :2], plate_T_grip[:2, 3], plate_T_grip[2, 3] = _turn(q), shift, -contact_m
     cam_T_grip = cam_T_plate @ plate_T_grip
     apart = None if corners_m is None else _apart(cam_T_grip, xy, variance, corners_m)
-    return Standing(cam_T_grip, known, residuals, apart)
+    return GripperOnPlate(cam_T_grip, known, residuals, apart)
 
 
 def back_project(cam_T_plate: Array, xy: Array, z_plate_m: Array) -> Array:
@@ -158,7 +160,7 @@ def _check_shape(corners_m: Array, plate_xy: Array, q: Array, shift: Array) -> N
 
 def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
     """Sides (2,) along x and y, and ``(q1, q2, sx, sy)``, of the rectangle whose corners are the first four points, in
-    the order of :func:`calibrate_plane`; from means of opposite sides.  :class:`CalibrationError` if it isn't a
+    the order of :func:`gripmon.calibrate_plane`; from means of opposite sides.  :class:`CalibrationError` if it isn't a
     rectangle.
     """
     a, b, c, d = plate_xy_m[:INFERRED_FROM]

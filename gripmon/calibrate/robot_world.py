@@ -51,10 +51,10 @@ FARTHEST_M = 20.0
 """Largest distance of a target from the camera, and of an arm from its base (m): larger numbers are millimetres."""
 SUSPECT_RAD = 0.02
 """Residual rotation (rad, each axis) above which other readings of the poses are tried."""
-HOPELESS_RAD = 0.1
+LARGEST_RESIDUAL_RAD = 0.1
 """Residual rotation (rad, each axis) above the errors of any arm and camera."""
-_BETTER = 0.1
-_AGREEING = 0.7
+_OTHER_READING_SHARE = 0.1  # another reading must leave less than this part of the residual rotation,
+_OTHER_READING_USED = 0.7  # and use at least this part of the poses
 OFFSETS = (1, -1, 2, -2)
 """Offsets in rows between poses and images that are tried."""
 
@@ -301,9 +301,9 @@ def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> N
             other = refine(target, arm, solve(target, arm))
         except CalibrationError:
             continue
-        if other.rms_rad < _BETTER * found.rms_rad and other.used.mean() >= _AGREEING:
+        if other.rms_rad < _OTHER_READING_SHARE * found.rms_rad and other.used.mean() >= _OTHER_READING_USED:
             raise CalibrationError(f"{text} ({np.degrees(other.rms_rad):.2g} degrees are left, else {left_deg:.2g})")
-    if found.rms_rad > HOPELESS_RAD:
+    if found.rms_rad > LARGEST_RESIDUAL_RAD:
         raise CalibrationError(
             f"the poses of arm and target contradict each other: {left_deg:.2g} degrees are left on average; each "
             "target's pose with the arm's at that time"

@@ -52,10 +52,10 @@ def paper_size(text: str) -> tuple[float, float]:
     right = f"{', '.join(_PAPERS_MM)} or WIDTHxHEIGHT in mm, e.g. 300x200"
     found = re.fullmatch(r"(\d+(?:\.\d*)?)x(\d+(?:\.\d*)?)", text)
     if found is None:
-        raise InputError(f"'{text}' is no paper; {right}", "paper")
+        raise InputError(f"'{text}' isn't a paper size; {right}", "paper")
     width, height = float(found[1]), float(found[2])
     if not (min(width, height) >= 50.0 and max(width, height) <= 5000.0):
-        raise InputError(f"{text} mm is no paper, which has 50 to 5000 mm a side; {right}", "paper")
+        raise InputError(f"{text} mm isn't a paper size, which has 50 to 5000 mm a side; {right}", "paper")
     return width, height
 
 
@@ -168,10 +168,10 @@ def _foot(target: Target, paper_mm: tuple[float, float], bar_mm: float) -> list[
         # The ticks' outer borders are the ends: a ruler is held against them.
         x = min(max(10.0 * tick - 0.15, 0.0), bar_mm - 0.3)
         lines.append(page.shape(("box", (x, 0.3 - high, 0.3, high)), left, low - 8.0))
-    said = f"{bar_mm:g} mm from end to end: measure it; print at 100 %, without fitting to the page"
+    text = f"{bar_mm:g} mm from end to end: measure it; print at 100 %, without fitting to the page"
     return [
         *lines,
-        page.text(left, low - 4.0, said),
+        page.text(left, low - 4.0, text),
         page.text(left, low, f"{name_of(target)}   gripmon {__version__}"),
     ]
 

@@ -104,7 +104,7 @@ def compare_hand_eye(
 def _chi2(difference: Array, covariance: Array) -> float:
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     if not (sigma > 0.0).all():
-        raise CalibrationError("the uncertainties are zero; covariances that say what isn't known")
+        raise CalibrationError("the uncertainties are zero; covariances of the errors")
     # In units of the standard deviations: with metres and radians any matrix would look singular.
     correlation = covariance / np.outer(sigma, sigma)
     try:
@@ -178,7 +178,7 @@ class Verdict:
         elif not self.same and apart.p_value is None:
             verdict = "different: beyond the tolerance"
         else:
-            verdict = f"same (not told apart {level})" if self.same else f"different ({level})"
+            verdict = f"same (not distinguished {level})" if self.same else f"different ({level})"
         return [*lines, *(f"warning: {warning}" for warning in self.warnings), verdict]
 
 

@@ -90,7 +90,8 @@ def open_configured(config: Config | SecondConfig, link: Link | None = None) -> 
 
 
 COLOURED_LEVELS = 1.0
-"""Mean range of an 8-bit image's channels from which it is of a colour camera: a codec adds less to grey."""
+"""Mean difference between the largest and the smallest channel of an 8-bit image's pixels, in grey levels, above which
+it is a colour image: a codec makes less of a grey one."""
 
 
 def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:

@@ -272,7 +272,7 @@ def measure_again(
 ) -> tuple[Calibrated, tuple[str, ...]]:
     """The hand/eye calibration from images (files, folders), to compare with the ``first`` one: on the plate if there
     is a ``target``, otherwise as the configuration's monitor measures it.  And warnings about it.
-    ``other_target``: it may have the pattern of the one that the calibrations were made with in another size.
+    ``other_target``: the target may have the pattern of the calibrations' target in another size.
     """
     config = _same_config(first, config_file)
     if target is not None and not other_target:

@@ -37,9 +37,9 @@ from gripmon.model.units import in_degrees, in_mm
 Level = Literal["OK", "WARN", "FAIL"]
 
 _USUAL_SPREAD = 2.0
-"""Ratio of the bound of one frame in twenty to the predicted one (no unit; docs/integrity.md)."""
+"""Ratio of the bound to the predicted one that one frame in twenty reaches (no unit; docs/integrity.md)."""
 _NOT_SQUARE = 0.02
-"""Ratio of two focal lengths beside 1 that no calibration of a sensor with square pixels is off by (no unit)."""
+"""Largest difference of fx / fy from 1 in a calibration of a sensor with square pixels (no unit)."""
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
 _CONNECT_S = 2.0
 
@@ -74,7 +74,7 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """A checked configuration: for a wrist camera a ``forecast``, for a second camera plain values (m, rad, px, ns),
     and the surroundings.
     """
@@ -98,17 +98,17 @@ class Checked:
         return [each for each in found if each is not None]
 
 
-def check_file(path: Path) -> Checked:
+def check_file(path: Path) -> CheckResult:
     """Check a configuration file of a wrist camera or a second camera.  Raises :class:`ConfigError`, and
     :class:`NoResultError` if a laser calibration or recorded frames can't be used.
     """
     if not is_second(path):
         config = load_config(path)
-        return Checked(forecast(config), None, _look_around(config))
+        return CheckResult(forecast(config), None, _look_around(config))
     second = load_second(path)
     around, watch = _look_around(second), second.settings.laser.watch
     expected = expectation(str(second.calibration_path), second.calibration, watch)
-    return Checked(None, {**_second_values(second), "foreseen": expected}, around)
+    return CheckResult(None, {**_second_values(second), "foreseen": expected}, around)
 
 
 def _look_around(config: Config | SecondConfig) -> Surroundings:
@@ -177,11 +177,11 @@ def _of_second(report: dict[str, Any]) -> list[Finding]:
     size = f"{calibration['width_px']} x {calibration['height_px']} px"
     limits = f"a warning from {1e3 * watch['warn_m']:g} mm, an error from {1e3 * watch['limit_m']:g} mm"
     table = pulses["table"]
-    heard = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
+    origin = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
     return [
         Finding("OK", "calibration", f"{size}, {spots}"),
         Finding("OK", "watch", limits),
-        Finding("OK", "pulses", heard),
+        Finding("OK", "pulses", origin),
     ]
 
 
@@ -267,10 +267,10 @@ def _promise(report: Forecast) -> Finding | None:
     close = _USUAL_SPREAD * share > 1.0
     level: Level = "WARN" if close else "OK"
     text = f"good to {good}, close to {limit}" if close else f"a transform is good to {good}, within {limit}"
-    untold = report.protection_if_bevelled
-    if untold is not None and (untold.position_m > limit_m or untold.rotation_rad > limit_rad):
+    bevelled = report.protection_if_bevelled
+    if bevelled is not None and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
         level = "WARN"
-        may = f"{_millimetres(untold.position_m)} and {_degrees(untold.rotation_rad)}"
+        may = f"{_millimetres(bevelled.position_m)} and {_degrees(bevelled.rotation_rad)}"
         text += f", if all edges are as sharp as the gripper file says; to {may} with bevels of "
         text += f"{_millimetres(UNTOLD_BEVEL_M)}: teach them (gripmon teach), or state them (bevel_m)"
     if close:

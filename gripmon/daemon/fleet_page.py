@@ -45,7 +45,7 @@ class Order(Request, frozen=True):
     revision: int = -1
 
 
-class Answered(msgspec.Struct, frozen=True):
+class CommandOutcome(msgspec.Struct, frozen=True):
     """The monitor's own reply; ``done`` is false if it refused and changed nothing."""
 
     done: bool
@@ -76,7 +76,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     more_alerts: int = 0
 
 
-class Shown(msgspec.Struct, frozen=True, kw_only=True):
+class FleetView(msgspec.Struct, frozen=True, kw_only=True):
     """The page: ``fault`` of the network, number of monitors per condition, and the worst ones; ``hidden``: how many
     more match.
     """
@@ -125,12 +125,12 @@ class FleetSite:
         """The action of a command."""
         return (Order, self.carry_out) if path == "order" else None
 
-    def shown(self, find: str = "") -> Shown:
+    def shown(self, find: str = "") -> FleetView:
         """Monitors whose name contains ``find``, the worst first."""
         monitors = self._fleet.monitors()
         found = sorted((each for each in monitors if find.lower() in str(each.name).lower()), key=trouble)
         fault = [f"{self._fleet.unreadable} messages can't be read"] if self._fleet.unreadable else []
-        return Shown(
+        return FleetView(
             version=__version__,
             stamp_ns=time.time_ns(),
             fault="; ".join(filter(None, [self._fleet.fault(), *fault])),
@@ -139,7 +139,7 @@ class FleetSite:
             hidden=max(0, len(found) - CARDS_MOST),
         )
 
-    def carry_out(self, order: Order) -> Answered:
+    def carry_out(self, order: Order) -> CommandOutcome:
         """Send the command.  Raises :class:`BadRequest` if the result is unknown or the monitor isn't there."""
         name = self._known(MonitorName(order.robot, order.camera), order.monitor_id).name
         if order.name != "undo" and not order.argument:
@@ -149,9 +149,9 @@ class FleetSite:
             now = self._ask(name, CommandName.STATE, "", order.monitor_id)[0]
             if now.revision != order.revision:
                 text = f"revision {now.revision} is in force by now, not {order.revision}; look at it first"
-                return Answered(False, text)
+                return CommandOutcome(False, text)
         reply, _ = self._ask(name, CommandName(order.name), order.argument, order.monitor_id)
-        return Answered(reply.done, _short(reply.text))
+        return CommandOutcome(reply.done, _short(reply.text))
 
     def picture(self, name: MonitorName, monitor_id: str) -> Picture:
         """Its picture, at most 8 s old.  Raises :class:`BadRequest`, which says why there is none."""

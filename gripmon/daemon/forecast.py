@@ -131,7 +131,7 @@ def rig_of(config: Config) -> Rig:
 
 
 def rig_once_taught(config: Config) -> Rig:
-    """The same, where nobody has taught the edges yet as if someone had."""
+    """As :func:`rig_of`; edges that aren't taught yet are treated as if they were."""
     rig = rig_of(config)
     return rig._replace(gripper=as_if_taught(rig.gripper)) if rig.taught is None else rig
 
@@ -170,8 +170,8 @@ def _if_bevelled(config: Config) -> Bounds | None:
     from_images = any(Path(each.file).suffix.lower() in IMAGE_SUFFIXES for each in made_of)
     if rig.taught is not None or from_images or rig.settings.model_sigma_m == 0.0:
         return None
-    worn = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
-    return _bounds(forecast_frame(worn, config.cam_T_grip, config.jaw_opening_m).protection)
+    bevelled = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
+    return _bounds(forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).protection)
 
 
 def _bounds(protection: Protection) -> Bounds:
@@ -273,13 +273,13 @@ def _jaw_accuracy(jaw: UnknownOpening, lever_m: float, reported_sigma_m: float) 
 
 def _drift(config: Config, expected: AccuracyForecast) -> DriftForecast:
     settings = config.settings.monitor.drift
-    foresight = foresee(expected.covariance, settings)
-    delays: Any = {f"{m:g}": tuple(foresight.delay_frames(m, axis) for axis in range(3)) for m in _STEPS_M}
+    detectable = foresee(expected.covariance, settings)
+    delays: Any = {f"{m:g}": tuple(detectable.delay_frames(m, axis) for axis in range(3)) for m in _STEPS_M}
     return DriftForecast(
         settings.false_alarms_per_day,
         settings.frames_per_s,
         CORRELATION_FRAMES,
-        PoseValues.of(foresight.smallest),
+        PoseValues.of(detectable.smallest),
         delays,
     )
 

@@ -10,8 +10,8 @@ from msgspec import Meta
 from gripmon.model.records import Array
 
 Vector = tuple[float, float, float]
-Both = tuple[float | None, float | None]
-"""Amounts to the negative and to the positive side; None: farther than the range that was searched."""
+TwoSided = tuple[float | None, float | None]
+"""Amounts in negative and in positive direction; None: beyond the range that was searched."""
 
 
 class PoseValues(msgspec.Struct, frozen=True):
@@ -193,8 +193,8 @@ class CameraFreedom(msgspec.Struct, frozen=True):
     then.
     """
 
-    shift_m: dict[str, Both]
-    turn_rad: dict[str, Both]
+    shift_m: dict[str, TwoSided]
+    turn_rad: dict[str, TwoSided]
     shift_reason: dict[str, tuple[str | None, str | None]]
     turn_reason: dict[str, tuple[str | None, str | None]]
     sought_m: float

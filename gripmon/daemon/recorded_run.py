@@ -25,7 +25,8 @@ from gripmon.record.recorder import Recorder, make_scene
 from gripmon.record.write import open_recorder
 
 RECORDING_PATIENCE_S = 30.0
-"""Input that can wait is faster than any camera: it waits this long for the recording before a frame is dropped (s)."""
+"""How long a source that can wait, and is read faster than any camera, waits for the recording before a frame is
+dropped (s)."""
 
 
 class RecordedRun:

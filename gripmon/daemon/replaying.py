@@ -51,7 +51,7 @@ _log = logging.getLogger(__name__)
 _LATENCY_BIN = 0.02  # natural logarithm
 
 
-class Past(NamedTuple):
+class RecordedInputs(NamedTuple):
     """What affected a monitor besides its frames."""
 
     state: MonitorState | None = None
@@ -60,14 +60,14 @@ class Past(NamedTuple):
     """In order; each came after the frame that it names."""
 
 
-NOTHING_BEFORE = Past()
+NOTHING_BEFORE = RecordedInputs()
 
 
 def replay(
     source: str | Path | Source,
     config: Config,
     recorder: Recorder | None = None,
-    past: Past = NOTHING_BEFORE,
+    past: RecordedInputs = NOTHING_BEFORE,
     warn: Callable[[str], None] = _log.warning,
 ) -> Iterator[FrameRecord]:
     """Process every frame of a source that isn't live: one record each, in order; the same input gives the same
@@ -126,7 +126,7 @@ class Counts:
         self.usable = 0
         self._verdicts: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()  # why nothing was measured, by the text before the colon
-        self._said: dict[str, str] = {}  # the first reason of each kind, whole
+        self._examples: dict[str, str] = {}  # the first reason of each kind, whole
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
@@ -137,7 +137,7 @@ class Counts:
         if record.reason and not record.measured:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
-            self._said.setdefault(kind, record.reason)
+            self._examples.setdefault(kind, record.reason)
         self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
 
     def summary(self) -> str:
@@ -147,10 +147,10 @@ class Counts:
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
         text = f"{self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
         if failed := self._reasons["internal error"]:
-            text += f"; {failed} failed ({self._said['internal error']})"
+            text += f"; {failed} failed ({self._examples['internal error']})"
         if not self.usable:
             reason = max(self._reasons, key=self._reasons.__getitem__, default="")
-            text += f"; no frame could be used ({self._said.get(reason, 'no measurement')})"
+            text += f"; no frame could be used ({self._examples.get(reason, 'no measurement')})"
         return text
 
     def _median_ms(self) -> float:
@@ -184,7 +184,7 @@ class FrameReplay:
     def records(self, step: Callable[[], None]) -> Iterator[FrameRecord]:
         """One record per frame; ``step`` is called after each."""
         recorded = self._recorded
-        past = NOTHING_BEFORE if recorded is None else Past(recorded.state, recorded.source.commands)
+        past = NOTHING_BEFORE if recorded is None else RecordedInputs(recorded.state, recorded.source.commands)
         for record in replay(self._source, self._config, self._recorder, past, self._warn):
             yield record
             self._counts.add(record)

@@ -13,7 +13,7 @@ import msgspec
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
-from gripmon.daemon.watch import Judged
+from gripmon.daemon.watch import FrameOutcome
 from gripmon.io.publish.inputs import ZenohPulses
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.matching import ReportedPulse, Shown
@@ -125,12 +125,12 @@ class SecondCamera(Loop):
             for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
                 self._alert(alert, state, frame.stamp_ns)
 
-    def _judged(self, refused: str, failure: str) -> Judged:
+    def _judged(self, refused: str, failure: str) -> FrameOutcome:
         """The judgement of this frame."""
         if failure:
-            return Judged(State.LOST, Verdict.UNKNOWN, usable=not refused, reason=failure)
+            return FrameOutcome(State.LOST, Verdict.UNKNOWN, usable=not refused, reason=failure)
         gap = self._pulsed.displacement
-        return Judged(
+        return FrameOutcome(
             self._pulsed.state,
             self._pulsed.verdict,
             usable=not refused,
@@ -217,7 +217,7 @@ class SecondCamera(Loop):
         state = MonitorState((), alerts=self._open_alerts) if whole else None
         return CommandReply(name, done, text, *self._in_force, state)
 
-    def _frame_record(self, frame: Frame, judged: Judged) -> FrameRecord:
+    def _frame_record(self, frame: Frame, judged: FrameOutcome) -> FrameRecord:
         """The record of a frame for a snapshot."""
         reference_id, revision = self._in_force
         return FrameRecord(

@@ -50,14 +50,14 @@ _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-_RESTS_FOR = 3.0
-"""After a command the next one waits this many times its duration: a quarter of the time is for commands."""
+_COMMAND_PAUSE_RATIO = 3.0
+"""The next command waits this many times the duration of the last: commands take at most a quarter of the time."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
 class Parts(TypedDict, total=False):
-    """Keywords of every :class:`Loop`: what it works with and for."""
+    """Keyword arguments of every :class:`Loop`."""
 
     source: Required[Source]
     publisher: Required[Publisher]
@@ -204,14 +204,14 @@ class Loop(ABC):
         return not self._watch.gives_up
 
     def _handle_command(self) -> None:
-        """Carry out one pending command, if any, but not so many that they delay frames."""
+        """Carry out one pending command, if any, unless the last one was too recent: commands must not delay frames."""
         begun_s = time.monotonic()
         asked = None if self._commands is None or begun_s < self._next_command_s else self._commands.poll()
         if asked is None:
             return
         self._carry_out_and_answer(asked)
         now_s = time.monotonic()
-        self._next_command_s = now_s + _RESTS_FOR * (now_s - begun_s)
+        self._next_command_s = now_s + _COMMAND_PAUSE_RATIO * (now_s - begun_s)
 
     def _carry_out_and_answer(self, asked: PendingCommand) -> None:
         command, answer = asked.command, None

@@ -17,7 +17,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.records import Array
 from gripmon.teach.mounts import (
     Grid,
-    Measurable,
+    MeasurableMount,
     Mount,
     Trial,
     field_of_view_rad,
@@ -240,7 +240,7 @@ _OF_MEASURABLE = (
 )  # fmt: skip
 
 
-def _measurable_values(found: Measurable) -> dict[str, Any]:
+def _measurable_values(found: MeasurableMount) -> dict[str, Any]:
     bound = found.promise.protection
     return {
         "sigma": _pose_values(found.frame.sigma),

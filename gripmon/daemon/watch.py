@@ -30,7 +30,7 @@ _UPDATE_S = 10.0
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 _OTHERS, _DROPS = "others", "drops"
 
-OVER_S = 10.0
+DROP_WINDOW_S = 10.0
 """Dropped frames are counted over this time; the first slow seconds after a start don't matter."""
 
 _LOOK_EVERY_S = 1.0
@@ -84,7 +84,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 1.8
 
 
-class Judged(NamedTuple):
+class FrameOutcome(NamedTuple):
     """What is kept of a frame.  ``usable``: it was measured; ``refused``: its image could not be used; ``reason``: what
     is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
@@ -99,7 +99,7 @@ class Judged(NamedTuple):
     protection_m: float | None = None
 
 
-_NOTHING = Judged(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
+_NOTHING = FrameOutcome(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
 
 
 class Watch:
@@ -129,7 +129,7 @@ class Watch:
         """A frame was judged; returns the alerts that are due besides the record's own."""
         return self.judged(_of_record(record), now_s)
 
-    def judged(self, frame: Judged, now_s: float) -> list[Alert]:
+    def judged(self, frame: FrameOutcome, now_s: float) -> list[Alert]:
         """The same for a frame of either kind of camera."""
         alerts = self._end_of_silence(now_s)
         self.frames += 1
@@ -207,7 +207,7 @@ class Watch:
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
-    def last(self) -> Judged:
+    def last(self) -> FrameOutcome:
         """What is kept of the last frame while its state and verdict still hold; otherwise one without values."""
         if (self.state, self.verdict) == (self._judged.state, self._judged.verdict):
             return self._judged
@@ -250,9 +250,9 @@ def _kind(message: str) -> str:
     return FIGURES.sub("", ":".join(message.split(":")[:2]))
 
 
-def _of_record(record: FrameRecord) -> Judged:
+def _of_record(record: FrameRecord) -> FrameOutcome:
     counts = record.verdict is not Verdict.UNKNOWN
-    return Judged(
+    return FrameOutcome(
         record.state,
         record.verdict,
         usable=record.source is not Origin.HELD,
@@ -265,7 +265,7 @@ def _of_record(record: FrameRecord) -> Judged:
 
 
 def is_refused(record: FrameRecord) -> bool:
-    """Whether the frame was refused, which every corner then says."""
+    """Whether the frame was refused: then every corner has that reason."""
     return bool(record.corners) and record.corners[0].reason is CornerFault.FRAME_REFUSED
 
 
@@ -284,12 +284,12 @@ class Drops:
         if counts and now_s - counts[-1][0] < _LOOK_EVERY_S:
             return self._text
         counts.append((now_s, handled, dropped))
-        while len(counts) > 1 and now_s - counts[1][0] >= OVER_S:
+        while len(counts) > 1 and now_s - counts[1][0] >= DROP_WINDOW_S:
             counts.popleft()
         since_s, handled_before, dropped_before = counts[0]
         elapsed_s = now_s - since_s
         few, lost = handled - handled_before, dropped - dropped_before
-        if elapsed_s >= OVER_S:
+        if elapsed_s >= DROP_WINDOW_S:
             share = lost / max(1, few + lost)
             allowed = self._allowed / 2.0 if self._text else self._allowed
             self._text = _in_words(few / elapsed_s, (few + lost) / elapsed_s, share) if share > allowed else ""
@@ -299,6 +299,6 @@ class Drops:
 def _in_words(handled_per_s: float, came_per_s: float, share: float) -> str:
     remedy = "lower the camera's rate (source.fps, or its driver's) to that, give smaller images, or free the processor"
     return (
-        f"{100.0 * share:.0f} % of the frames were dropped in {OVER_S:g} s: {came_per_s:.3g} a second arrived, the "
-        f"monitor had time for {handled_per_s:.3g}; {remedy} of other work"
+        f"{100.0 * share:.0f} % of the frames were dropped in {DROP_WINDOW_S:g} s: {came_per_s:.3g} a second arrived, "
+        f"the monitor had time for {handled_per_s:.3g}; {remedy} of other work"
     )

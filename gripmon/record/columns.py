@@ -292,7 +292,7 @@ class Writer:
         raise NotImplementedError
 
     def repeat(self) -> None:
-        """Write with the next row again what is otherwise only written on change."""
+        """With the next row, write again what is otherwise only written on change."""
         self._events.repeat()
 
     def finish(self) -> None:

@@ -46,8 +46,8 @@ _TRACK = "rig/corrected"
 _TRACK_ROWS_A_CHUNK = 65536
 
 
-class _Beside(Sender):
-    """Sends what was recorded, below the path ``recorded``."""
+class _RecordedSender(Sender):
+    """Sends below the path ``recorded``."""
 
     def static(self, path: str, *archetypes: rr.AsComponents) -> None:
         super().static(f"{RECORDED}/{path}", *archetypes)
@@ -77,8 +77,8 @@ class ComparedRecorder(Recorder):
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
         stream.send_blueprint(_layout(scene), make_active=True, make_default=True)
         self._writer = RowWriter(stream, scene, 1)
-        beside = _Beside(stream)
-        self._curves, self._status = CurveWriter(beside, self._writer.corner_ids), EventWriter(beside, RECORDED)
+        send = _RecordedSender(stream)
+        self._curves, self._status = CurveWriter(send, self._writer.corner_ids), EventWriter(send, RECORDED)
         _name_both(Sender(stream))
         self._rows: list[Row] = []
         self._rows_then: list[Row] = []
@@ -86,7 +86,7 @@ class ComparedRecorder(Recorder):
         self._commands_then = list(source.commands)
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """One frame with its record now; the record of then comes from the source."""
+        """One frame with its new record; the recorded one comes from the source."""
         then, shot = self._source.record, self._source.shot
         assert then is not None, "every replayed frame has a record"
         picture: Picture | None = None

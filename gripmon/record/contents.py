@@ -88,7 +88,7 @@ _UNKNOWN: dict[type[msgspec.Struct], dict[str, Any]] = {
 def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
     """A record, and in a few words what was ignored (empty if it is as this version writes it).
 
-    Raises ValueError, in one line, for text that is no such record in any version.
+    Raises ValueError, in one line, for text that isn't such a record in any version.
     """
     schema = schema_name(kind)
     try:
@@ -98,17 +98,17 @@ def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
     try:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except _DECODING_ERRORS as error:
-        raise ValueError(f"is no {schema}: {error}") from None
+        raise ValueError(f"isn't a {schema}: {error}") from None
     written = fields.get("schema", schema)
     if not isinstance(written, str) or written.partition("/")[0] != schema.partition("/")[0]:
-        raise ValueError(f"is no {schema} but {written!r:.80}")
+        raise ValueError(f"isn't a {schema} but {written!r:.80}")
     fields["schema"] = schema
     if kind is FrameRecord and fields.get("verdict") not in set(Verdict):
         fields["verdict"] = Verdict.UNKNOWN
     try:
         record = msgspec.convert(_UNKNOWN.get(kind, {}) | fields, type=kind)
     except _DECODING_ERRORS as error:
-        raise ValueError(f"is no {schema} that can be understood: {error}") from None
+        raise ValueError(f"isn't a {schema} that can be understood: {error}") from None
     return record, f"is {written}, this version reads {schema}" if written != schema else reason
 
 

@@ -82,7 +82,7 @@ _FRAMES: list[_Column] = [
     *[(f"sigma_{axis}_m", _DOUBLE, "m", f"standard deviation of the TCP along the camera's {axis}") for axis in _AXES],
     ("protection_m", _DOUBLE, "m", "protection level: bound on the TCP's position error"),
     ("protection_rad", _DOUBLE, "rad", "bound on the angle of the rotation error"),
-    ("integrity_risk", _DOUBLE, "1", "probability a frame that the error exceeds a bound"),
+    ("integrity_risk", _DOUBLE, "1", "probability per frame that the error exceeds a bound"),
     ("d_m", _DOUBLE, "m", "length of the camera's displacement against the reference"),
     ("delta_rad", _DOUBLE, "rad", "turn of the camera against the reference"),
     *_pose_columns("cam_T_grip", "maps gripper to camera coordinates"),

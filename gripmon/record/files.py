@@ -44,8 +44,8 @@ _PIN_AROUND_S = 5.0  # pinned before and after an alert at least, even if no ima
 _FILES_REMEMBERED = 64
 _PICTURES_A_CHUNK = 16
 _ALERTS_KEPT = 64  # while nothing can be written: the next file then explains it
-# A little more space than the minimum is needed to resume, or recording would start and stop at every flush.
-_FREE_AGAIN = 1.02
+# Free space needed to resume, over the minimum: otherwise recording would start and stop at every flush.
+_RESUME_FREE_FACTOR = 1.02
 
 
 def make_writer(stream: rr.RecordingStream, scene: Scene, file_number: int) -> Writer:
@@ -215,7 +215,9 @@ class FileSeries:
         return len(self._rows) > self._settings.queue_frames or picture_bytes > self._settings.ring_bytes
 
     def _maintain(self, file: _File) -> None:
-        """Pin the file if an alert touches it, and begin the next one if this is full, old, or over budget."""
+        """Pin the file if an alert touches it; begin the next one if this is full, old, or over budget, or pause if the
+        disk is full.
+        """
         settings = self._settings
         if self._touches(file):
             self._pins.pin(file.path, tuple(self._alerts))
@@ -248,7 +250,7 @@ class FileSeries:
         return ""
 
     def _end(self) -> None:
-        """Write the footer and end the file, unless its disk has failed, for which rerun would wait forever.  What is
+        """Write the footer and end the file, unless its disk has failed: rerun would wait for it forever.  What is
         queued stays for the next file.
         """
         stream, file = self._stream, self._file
@@ -284,7 +286,7 @@ class FileSeries:
         """Open the next file and write what every file needs: the layout, static data, the reference."""
         with contextlib.suppress(OSError):  # reported below
             self._directory.mkdir(parents=True, exist_ok=True)  # it may have been removed
-        missing = space_missing(self._directory, self._settings.min_free_bytes, _FREE_AGAIN)
+        missing = space_missing(self._directory, self._settings.min_free_bytes, _RESUME_FREE_FACTOR)
         missing = missing or self._room_missing()
         number = 0 if missing else self._next_number()
         if missing or number == 0:

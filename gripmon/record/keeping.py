@@ -198,7 +198,7 @@ class DiskBudget:
         return 0 < self._budget_bytes < self._others_bytes + current_bytes
 
     def make_room(self, pinned: Callable[[Path], bool], current: Path | None = None) -> str:
-        """Delete recordings as needed, never ``current``; returns why there still is no room, empty if there is.
+        """Delete recordings as needed, never ``current``; returns why there is still no room, empty if there is.
 
         Without ``current``, before a file begins, a tenth of the budget is freed.  Raises OSError if the directory
         can't be read.
@@ -326,5 +326,5 @@ def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whol
 
 
 def _cause(failure: str | None) -> str:
-    """The last part, without the path before it, which the user has not named."""
+    """The last part of a failure's text, without the temporary path before it."""
     return " ".join((failure or "it was not finished").rpartition(": ")[2].split())

@@ -34,7 +34,6 @@ EDGE_POINT_SIGMA_PX = 0.05
 CLUTTER_PX = 0.1
 """Assumed shift of a stretch of an edge by the background, in addition, for the protection level.  It gives the bound
 of the usual frame in front of clutter; one frame in twenty has up to four times as much (tools/bench integrity).
-the usual frame in front of clutter; one frame in twenty has up to four times as much (tools/bench integrity).
 """
 
 
@@ -60,7 +59,7 @@ class UnknownOpening:
 
 @dataclass(frozen=True, slots=True)
 class AccuracyForecast:
-    """Expected of one frame in which all visible edges are measured; vectors are (position, rotation), m and rad.
+    """Expected accuracy of a frame that measures all visible edges; vectors are (position, rotation), m and rad.
 
     ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
     ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
@@ -153,7 +152,7 @@ def as_if_taught(gripper: Gripper) -> Gripper:
 
 
 def as_if_measured(rig: Rig) -> dict[str, Rig]:
-    """The same, with each of the things known that a person can measure, by words for it."""
+    """Variants of the rig, each with one more quantity known that a person can measure; the key describes it."""
     model, taught = rig.gripper.model, rig.taught
     known = {}
     if taught is None:
@@ -191,7 +190,9 @@ def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) 
 
 
 class ForecastMeter(FingertipMeter):
-    """Reads no image: has an edge point, where predicted, on every search line that no other finger hides."""
+    """Measures without an image: assumes an edge point, at its predicted position, on every search line that no other
+    finger hides.
+    """
 
     def forecast(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
         """The measurement from edge points alone at a pose and an opening."""
@@ -220,8 +221,8 @@ class ForecastMeter(FingertipMeter):
 @dataclass(frozen=True, slots=True)
 class Promise:
     """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
-    whether transforms of a view can be valid, before there is any image.  ``remedies``: where they can't, each thing
-    after which they could.
+    whether transforms of a view can be valid, before there is any image.  ``remedies``: if they can't, what would make
+    them valid, each by itself.
     """
 
     protection: Protection

@@ -212,7 +212,7 @@ def taught_model(
         content = data.get(picture.path) or Path(picture.path).read_bytes()
         digest = hashlib.sha256(content).hexdigest()
         images.append(TaughtImage(file=picture.path, sha256=digest, jaw_opening_m=picture.jaw_opening_m))
-    lens, model, stands = identity(camera, gripper, reference.reference_id, from_record(reference.cam_T_grip))
+    lens, model, stated_reference = identity(camera, gripper, reference.reference_id, from_record(reference.cam_T_grip))
     return TaughtModel(
         provenance=Provenance(
             gripmon=__version__,
@@ -223,7 +223,7 @@ def taught_model(
         ),
         camera=lens,
         gripper=model,
-        reference=stands,
+        reference=stated_reference,
         edge_settings=settings.corners.edges,
         edges=taught.edges,
         corners=taught.corners,

@@ -23,7 +23,7 @@ from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import Measurement
 
 BY_HAND_PX = 1.0
-"""Standard deviation of a corner that a person set by hand, where it wasn't measured or instead of the measured one."""
+"""Standard deviation of a corner set by hand that replaces a measured one, or one that couldn't be measured."""
 
 MADE_TO_M = 2e-5
 """Manufacturing tolerance of a fingertip's corners against the gripper file (each coordinate, standard deviation)."""
@@ -193,9 +193,9 @@ ROUGH_SHARE = 0.006
 """Standard deviation of a corner set by hand, as a part of the image's width."""
 
 _TILT_RAD = 0.4  # a wrist camera looks at the fingertips from beside the gripper
-_FILLS = 0.4  # part of the image that the gripper's corners span in that view
+_GRIPPER_SPAN = 0.4  # part of the image that the gripper's corners span in that view
 _ROUNDS = 40
-_TURNS = 4
+_START_TURNS = 4
 _SAME_RAD, _SAME_SHARE = 0.02, 0.01
 
 
@@ -208,7 +208,7 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PlacedPose:
     """A pose that corners set by hand and the prior allow: ``covariance`` (6, 6); ``cost``, the weighted sum of squared
     residuals; ``left_px``, for each corner the distance from where it was set to where the pose projects it, infinite
     where the lens can't map it.
@@ -231,7 +231,7 @@ def usual_view(camera: Camera, gripper: Gripper, jaw_opening_m: float | None) ->
     """
     corners_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     extent_m = float(np.ptp(corners_m, axis=0).max())
-    depth_m = extent_m * camera.fx_px / (_FILLS * camera.width_px)
+    depth_m = extent_m * camera.fx_px / (_GRIPPER_SPAN * camera.width_px)
     cam_T_grip = make_transform(exp_rotation(np.array([_TILT_RAD, 0.0, 0.0])), np.array([0.0, 0.0, depth_m]))
     sigma = [0.3 * depth_m, 0.3 * depth_m, 0.4 * depth_m, 0.4, 0.4, 2.0]
     return Prior(cam_T_grip, np.diag(np.square(sigma)))
@@ -244,7 +244,7 @@ def rough_sigma_px(camera: Camera) -> float:
 
 def place(
     camera: Camera, gripper: Gripper, jaw_opening_m: float | None, put_px: Mapping[str, Array], prior: Prior
-) -> list[Placed]:
+) -> list[PlacedPose]:
     """Poses that explain where corners were set, ``put_px`` (name: (2,)), the most likely first; several where corners
     in one plane allow two.
 
@@ -258,7 +258,7 @@ def place(
     points = gripper.corner_points[np.array([gripper.corner_ids.index(name) for name in names], dtype=np.intp)]
     points_m = gripper.points_grip_m(jaw_opening_m)[points].reshape(-1, 3)
     weight = (0.5 * (camera.fx_px + camera.fy_px) / rough_sigma_px(camera)) ** 2
-    found: list[Placed] = []
+    found: list[PlacedPose] = []
     for start in _starts(points_m, xy, prior, weight):
         settled = _settle(start, points_m, xy, weight, prior)
         if settled is None or any(_same(settled[0], other.cam_T_grip) for other in found):
@@ -266,18 +266,18 @@ def place(
         cam_T_grip, covariance, cost = settled
         seen_px = camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         away = np.nan_to_num(np.linalg.norm(seen_px - uv_px[known], axis=1), nan=np.inf).tolist()
-        found.append(Placed(cam_T_grip, covariance, cost, dict(zip(names, away, strict=True))))
+        found.append(PlacedPose(cam_T_grip, covariance, cost, dict(zip(names, away, strict=True))))
     found.sort(key=lambda pose: pose.cost)
-    return found or [Placed(prior.cam_T_grip, prior.covariance, 0.0, {})]
+    return found or [PlacedPose(prior.cam_T_grip, prior.covariance, 0.0, {})]
 
 
 def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator[Array]:
     """Starting poses: the prior, the prior turned about the optical axis, and OpenCV's closed forms."""
     yield prior.cam_T_grip
     if len(xy) > 1 and math.sqrt(prior.covariance[5, 5]) > 1.0:
-        for quarter in range(1, _TURNS):
+        for quarter in range(1, _START_TURNS):
             turned = prior.cam_T_grip.copy()
-            turned[:3, :3] = exp_rotation(np.array([0.0, 0.0, 2.0 * math.pi * quarter / _TURNS])) @ turned[:3, :3]
+            turned[:3, :3] = exp_rotation(np.array([0.0, 0.0, 2.0 * math.pi * quarter / _START_TURNS])) @ turned[:3, :3]
             yield turned
     try:
         found = solutions(points_m, xy, np.broadcast_to(np.eye(2) / weight, (len(xy), 2, 2)))

@@ -29,7 +29,7 @@ curvature jumps, and a cubic spline misses that by up to 0.05 px; five points of
 STRAIGHT_FROM_PX = 4.0 * KNOTS_PX
 """Length above which a piece of a curve bends at its ends at most."""
 _FEWEST_BETWEEN_KNOTS = 3
-_UNSEEN = 0.1
+_UNSEEN_WEIGHT = 0.1
 _ROUNDS = 3
 
 
@@ -121,7 +121,7 @@ def _spline(at: Array, s: Array, shown: Array, usable: NDArray[np.bool_], ends: 
         knots.pop()
     t = np.concatenate([np.zeros(4), knots[1:], np.full(4, at[-1])])
     places, points = np.concatenate([[0.0], s[1:-1], [at[-1]]]), np.vstack([ends[:1], shown[1:-1], ends[1:]])
-    worth = np.where(usable[1:-1], 1.0, _UNSEEN)
+    worth = np.where(usable[1:-1], 1.0, _UNSEEN_WEIGHT)
     robust = np.ones(len(worth))
     for _ in range(_ROUNDS):
         # The ends are known as well as the straight edges on which they lie, so they get a high weight.

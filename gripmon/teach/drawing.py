@@ -55,7 +55,7 @@ class Canvas:
 
 
 def write(picture: Image, text: str, at: tuple[int, int], colour: Colour, size: float) -> None:
-    """Write text with a dark outline of equal weight, as thicker letters are wider.  OpenCV's font has only ASCII."""
+    """Write text with a dark outline, made of shifted copies: OpenCV's thicker letters are also wider.  ASCII only."""
     plain = text.encode("ascii", "replace").decode()
     for right, down in (*itertools.product((-1, 0, 1), repeat=2), (0, 0)):
         paint = colour if right == down == 0 else (0, 0, 0)
@@ -186,7 +186,7 @@ _SIZE = 0.8
 
 def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image:
     """The image, BGR and enlarged, with the plate's points (green, red if left out), the gripper's corners by name
-    (yellow), and arrows from where the calibration predicts each of them to where it was measured, enlarged by the
+    (yellow), and lines from where the calibration predicts each of them towards where it was measured, enlarged by the
     factor in the caption; the gripper's axes at the TCP.
     """
     zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, _LARGEST_ZOOM))

@@ -1,5 +1,5 @@
 """From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that
-refuse images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
+refuse images that can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
 
 Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images has three parts: its share of what is common
 to all edges (a small error of the reference or of the reported opening; bevels, which move every outline inside of the
@@ -23,8 +23,8 @@ from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.records import Array
-from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, Pooled, find_line, pool, slopes
-from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
+from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
 from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
@@ -47,9 +47,9 @@ BACKGROUND_SHARE = 0.3
 the bevel is blurred into the background (bevels of the simulator in front of grey levels of 60 to 230)."""
 
 _SMALLEST_DEPTH_M = 1e-6
-_NOTHING_M = 1.0  # standard deviation of the offset of an edge that isn't seen: only what all edges share remains
+_UNSEEN_SIGMA_M = 1.0  # of the offset of an edge that isn't seen: only what all edges share remains
 
-_SHRINKAGE = 2  # number of images of each edge that the usual scatter of all edges is worth
+_SHRINKAGE = 2  # weight of the usual scatter of all edges, as a number of additional images of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class EdgeLines:
     Without a line (``line`` None, no images) it is an outline in view of which too little is seen.
     """
 
-    sampled: Sampled
+    sampled: SampledEdge
     line: Line | None
     images: tuple[int, ...]
     ends_px: Array
@@ -107,7 +107,7 @@ class _Measured:
         rows = np.concatenate([np.array([edge.sampled.rows for edge in edges]), inset], axis=2)
         return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows)
 
-    def pooled(self, motion_covariance: Array) -> Pooled:
+    def pooled(self, motion_covariance: Array) -> PooledOffsets:
         """Pool all edges, with a prior (7, 7) of pose and opening."""
         prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
         return pool(
@@ -120,7 +120,7 @@ class _Measured:
         return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
 
 
-def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
+def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> PooledOffsets:
     """Error of the reference and the opening (``common``, the first 7) from the outlines, with a prior (7, 7) about
     zero.
 
@@ -176,8 +176,8 @@ def _nanometres(ends_m: Array) -> tuple[float, float]:
 
 
 def _changing_m(measured: _Measured, shape_m: Array) -> Array:
-    """Standard deviation (e, 2) by which an offset changes from image to image, beyond the scatter of its points: for a
-    single frame no average reduces it.
+    """Standard deviation (e, 2) by which an offset changes from image to image, beyond the scatter of its points: no
+    average reduces it for a single frame.  With one image, of an outline: :data:`BACKGROUND_SHARE` of its own offset.
     """
     out = np.zeros_like(shape_m)
     for i, (edge, ends_m) in enumerate(zip(measured.edges, measured.ends_m, strict=True)):
@@ -200,7 +200,7 @@ def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array
     noise = []
     for scale, ends, within in zip(per_m, ends_m, within_px2, strict=True):
         if not len(ends):
-            noise.append(np.full(2, _NOTHING_M**2))
+            noise.append(np.full(2, _UNSEEN_SIGMA_M**2))
             continue
         own_px2 = np.square(scale * (ends - ends.mean(axis=0))).sum(axis=0)
         scatter_px2 = (own_px2 + _SHRINKAGE * usual_px2) / (len(ends) - 1 + _SHRINKAGE)
@@ -233,13 +233,14 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
 
 
 REFERENCE_SIGMAS = 3.0
-"""Standard deviations of the reference and of the reported opening that are allowed in addition to a bevel."""
+"""Number of standard deviations of the reference and of the reported opening allowed in addition to a bevel."""
 
 JAW_SIGMAS = 5.0
-"""Standard deviations by which the measured opening may differ from the reported one, as in the monitor."""
+"""Standard deviations by which the measured opening may differ from the reported one, as in
+:mod:`gripmon.track.jaw`."""
 
 NOTED_PX = 1.0
-"""Offset of the reference above which a note is given: in a view turned by 3° a twentieth of it becomes an error."""
+"""Offset of the reference above which there is a note: in a view turned by 3° a twentieth of it becomes an error."""
 
 TAUGHT_SHARE = 0.5
 """Least part of the outlines in view, by search lines, that must be seen: with less, something hides the gripper."""

@@ -24,16 +24,16 @@ LONG_PX = 30.0
 PARALLEL_RAD = math.radians(0.6)
 """Largest angle by which a long edge may miss the vanishing point: twice what 30 px resolve."""
 FEWEST_PARALLEL = 3
-MAJORITY = 0.5
+PARALLEL_LENGTH_SHARE = 0.5
 """Least part of the total length of candidate edges that must run along the fingers, as in the monitor's search for
 their ends."""
 ALONG_RAD = math.radians(50.0)
-"""Largest angle between an edge's image and the direction to the tip: perspective turns edges along a finger so far."""
-STEEPEST = 0.25
+"""Largest angle between the image of an edge along a finger and the direction to its tip: perspective turns it."""
+LEAST_PLANE_COSINE = 0.25
 """Cosine between line of sight and fingers below which the contact plane is too oblique to place corners on it."""
-AT_ONCE = 0.75
-"""Least part of the turn, within the length of a cut corner, that a corner makes at once.  On the tightest curve that
-isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
+CORNER_TURN_SHARE = 0.75
+"""Least part of the turn, within the length of a cut corner, that a corner makes at its first vertex.  On the
+tightest curve that isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
 _ROUNDS = 4
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
@@ -57,7 +57,7 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedOutlines:
     """Outlines in space, the TCP at unit depth.  ``points`` of each finger (v, 3) in the camera frame, NaN where
     unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
@@ -74,21 +74,22 @@ class Placed:
     by_motion: bool = False
 
 
-def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> Placed:
+def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> PlacedOutlines:
     """The fingers in space, from their perspective; or, with ``rotation`` (3, 3) and ``tcp`` (3,) at unit depth, as a
     calibration has them.
     """
     given = None if rotation is None else rotation[:, 2]
     direction, sigma = (given, 0.0) if given is not None else finger_direction(fingers)
     centre = tip_centre(fingers)
-    if direction is not None and abs(float(direction @ _ray(centre)) / float(np.linalg.norm(_ray(centre)))) < STEEPEST:
+    ray = _ray(centre)
+    if direction is not None and abs(float(direction @ ray) / float(np.linalg.norm(ray))) < LEAST_PLANE_COSINE:
         direction = None
     if direction is None or sigma > FLAT_SIGMA_RAD:
         return _flat(fingers, centre, rotation, tcp)
     runs = [_tip_and_sides(finger, direction) for finger in fingers]
     if any(not tip for tip, _ in runs):
         return _flat(fingers, centre, rotation, tcp)
-    plane_at = _ray(centre) if tcp is None else tcp
+    plane_at = ray if tcp is None else tcp
     turns = [_smooth_turns(finger, tip, sides) for finger, (tip, sides) in zip(fingers, runs, strict=True)]
     points = [
         _in_space(finger, tip, sides, direction, plane_at, turn)
@@ -106,7 +107,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         tuple(piece for piece in finger.pieces if np.isfinite(p[list(piece)]).all())
         for finger, p in zip(fingers, points, strict=True)
     )
-    return Placed(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
+    return PlacedOutlines(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
 
 
 def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
@@ -133,7 +134,7 @@ def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
                 continue
             on = _missed(meet, middle, way) < PARALLEL_RAD
             score = float(worth[on].sum())
-            enough = np.count_nonzero(on) >= FEWEST_PARALLEL and score > MAJORITY * float(worth.sum())
+            enough = np.count_nonzero(on) >= FEWEST_PARALLEL and score > PARALLEL_LENGTH_SHARE * float(worth.sum())
             if enough and (best is None or score > best[0]):
                 best = score, on
     if best is None:
@@ -268,7 +269,7 @@ def leaves_smoothly(finger: Outline, tip: set[int], start: int, behind: int) -> 
         ahead = finger.xy[to] - finger.xy[at]
         turns.append(math.atan2(way[0] * ahead[1] - way[1] * ahead[0], float(way @ ahead)))
         way, at, travelled_px = ahead, to, travelled_px + length_px
-    return bool(turns) and abs(turns[0]) < AT_ONCE * abs(sum(turns))
+    return bool(turns) and abs(turns[0]) < CORNER_TURN_SHARE * abs(sum(turns))
 
 
 def _into_plane_of_sides(points: Array, tip: list[int], turns: Sequence[int], direction: Array, height: float) -> None:
@@ -287,7 +288,7 @@ def nearest_on_ray(ray: Array, start: Array, direction: Array) -> Array:
     return np.asarray(ray * (float(normal @ start) / float(normal @ ray)))
 
 
-def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp: Array | None) -> Placed:
+def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp: Array | None) -> PlacedOutlines:
     """All fingers in one plane through the TCP that faces the camera."""
     facing = _ray(centre if tcp is None else tcp[:2] / tcp[2])
     facing = facing / np.linalg.norm(facing)
@@ -304,7 +305,7 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, facing)
         sigma = np.array([FLAT_SIGMA_RAD, FLAT_SIGMA_RAD, 0.0])
-    return Placed(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, True, sigma)
+    return PlacedOutlines(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, True, sigma)
 
 
 def innermost(tips: Sequence[Array]) -> list[Array]:
@@ -318,7 +319,7 @@ def innermost(tips: Sequence[Array]) -> list[Array]:
     for _ in range(_ROUNDS):
         across = inner[1] - inner[0]
         far = [p @ across / float(np.linalg.norm(across)) for p in points]
-        # Vertices within a tenth of the gap of the innermost one: the paper's rectangle has two on each finger.
+        # Vertices within a tenth of the gap of the innermost one: corners in a rectangle have two on each finger.
         gap = abs(float(far[1].min() - far[0].max()))
         near = far[0] > far[0].max() - 0.1 * gap, far[1] < far[1].min() + 0.1 * gap
         inner = [p[chosen].mean(axis=0) for p, chosen in zip(points, near, strict=True)]

@@ -24,9 +24,9 @@ from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
-from gripmon.teach.finger_depth import Placed, place
+from gripmon.teach.finger_depth import PlacedOutlines, place
 from gripmon.teach.image_drawing import draw_outlines
-from gripmon.teach.image_model import Seen, as_gaps, build_model, finger_outlines, tip_width
+from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines, tip_width
 from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, check_opened, motion_of
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
@@ -45,8 +45,8 @@ Pose = tuple[Array, Array]
 class GripperFromImages:
     """``gripper`` and its pose: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the TCP
     then rotation, camera axes.  ``opening_m``: at which the coordinates hold; ``outline_sigma_px``: median standard
-    deviation of the outline's vertices from their scatter over the images; ``left_out``: images that weren't used, and
-    why; ``notes``: what is unknown or was assumed.
+    deviation of the outline's vertices from their scatter over the images, and ``images``, the number of these, both at
+    this opening; ``left_out``: images that weren't used, and why; ``notes``: what is unknown or was assumed.
     """
 
     gripper: Gripper
@@ -135,8 +135,8 @@ def gripper_from_images(
 ) -> GripperFromImages:
     """A gripper and its reference from ten to some hundred ``images`` in front of changing backgrounds.
 
-    ``openings_m``: the jaw's opening in each image (None: images of one opening are found from the images); every
-    opening that is to be used needs at least ten images.  The scale comes from ``distance_m`` (of the fingertips from
+    ``openings_m``: the jaw's opening in each image (None: images of one opening are recognised by themselves); an
+    opening with fewer than ten images isn't used.  The scale comes from ``distance_m`` (of the fingertips from
     the camera, along the optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference``
     calibration, or from several openings.
 
@@ -174,7 +174,7 @@ def gripper_from_images(
             f"openings: the gap between the fingertips, as the images show it, {1e3 * min(opening_m, *moved):.2f} to "
             f"{1e3 * max(opening_m, *moved):.2f} mm; the jaws may report another number"
         )
-    described = Seen(made, seen, outlines, placed, moved, *scale, opening_m)
+    described = MeasuredGripper(made, seen, outlines, placed, moved, *scale, opening_m)
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
     except GripperError as error:
@@ -185,7 +185,7 @@ def gripper_from_images(
     else:
         assert reference is not None
         cam_T_grip, covariance = reference
-    notes += _said(placed, scale, reference, left_out, len(taken))
+    notes += _assumptions(placed, scale, reference, left_out, len(taken))
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
     used = len(seen.matte.kept)
@@ -288,7 +288,7 @@ def _groups(
 
 
 def _motions(
-    camera: Camera, seen: OpeningSeen, placed: Placed, around: Mapping[float, OpeningSeen], notes: list[str]
+    camera: Camera, seen: OpeningSeen, placed: PlacedOutlines, around: Mapping[float, OpeningSeen], notes: list[str]
 ) -> dict[float, Sequence[FingerMoved]]:
     """How each finger moved to each other opening; openings where a finger isn't found are left out, with a note."""
     out: dict[float, Sequence[FingerMoved]] = {}
@@ -306,7 +306,7 @@ def _motions(
 
 
 def _scale(
-    placed: Placed,
+    placed: PlacedOutlines,
     distance_m: Length | None,
     finger_width_m: Length | None,
     reference: Pose | None,
@@ -339,7 +339,7 @@ def _scale(
     return depth, depth * max(float(np.sum(weights)) ** -0.5, 0.5 * scatter)
 
 
-def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) -> Array:
+def _covariance(fx_px: float, placed: PlacedOutlines, scale: Length, seen: OpeningSeen) -> Array:
     """Covariance (6, 6): from the distance along the line of sight, the outline's scatter across it, and the axes'
     directions.
     """
@@ -353,7 +353,9 @@ def _covariance(fx_px: float, placed: Placed, scale: Length, seen: OpeningSeen) 
     return out
 
 
-def _said(placed: Placed, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int) -> list[str]:
+def _assumptions(
+    placed: PlacedOutlines, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int
+) -> list[str]:
     """What is unknown or was assumed, as texts."""
     notes = []
     if reference is None:

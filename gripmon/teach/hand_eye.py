@@ -361,7 +361,8 @@ def measure_tracked(
     taught_edges: TaughtEdges | None = None,
 ) -> tuple[Pose, tuple[str, ...]]:
     """``cam_T_grip`` as the monitor measures it in images of one pose in front of different backgrounds, starting at
-    the ``expected`` pose; and what is doubtful about it.  Images that contradict the others are left out.
+    the ``expected`` pose; and what is doubtful about it.  Images that contradict the others are left out;
+    :class:`CalibrationError` if none can be measured, or no majority agrees.
     """
     taken = _of_camera(images, camera)
     made = make_camera(camera)

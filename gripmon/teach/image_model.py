@@ -15,7 +15,7 @@ from gripmon.model.gripper import EdgeModel, FingerModel, GripperModel, JawModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 from gripmon.teach.curved_edges import smooth_curve
-from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, Placed, leaves_smoothly, nearest_on_ray
+from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, PlacedOutlines, leaves_smoothly, nearest_on_ray
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
@@ -24,17 +24,18 @@ from gripmon.track.edges.roles import PARALLEL_COSINE
 SHORTEST_EDGE_PX = 8.0
 MEETS_PX = 2.0
 """Largest distance, besides its own scatter, by which the line of an inner edge may miss the outline's corner that it
-runs to: on a bevel of 0.25 mm, 100 mm away, it lies this far beside it."""
+runs to: with a bevel of 0.25 mm, 100 mm away, it misses it by as much."""
 LARGEST_GAP = 0.5
-"""Largest gap between such an edge and its corner, over its length: there its line is known as well as along itself."""
+"""Largest gap between such an edge and its corner, over its length: there its line is less than twice as uncertain as
+at its end."""
 LONG_SIDE = 0.5
 """Least length of a finger's side over its longest side; shorter pieces belong to the curve at its end."""
 LONGEST_SHARE = 0.25
-"""Largest part of a side before a curve that counts with the curve."""
+"""Largest part of a straight side that is fitted with the curve that continues it."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class MeasuredGripper:
     """What images show of a gripper.  ``depth_m`` of the TCP, with the standard deviation ``depth_sigma_m``; ``moved``:
     by opening, each finger's motion.
     """
@@ -42,7 +43,7 @@ class Seen:
     camera: Camera
     opening: OpeningSeen
     outlines: Sequence[Outline]
-    placed: Placed
+    placed: PlacedOutlines
     moved: Mapping[float, Sequence[FingerMoved]]
     depth_m: float
     depth_sigma_m: float
@@ -73,7 +74,7 @@ def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
     return out
 
 
-def tip_width(placed: Placed) -> float:
+def tip_width(placed: PlacedOutlines) -> float:
     """Width of a fingertip across the jaws at unit depth: mean over the fingers."""
     widths = [float(np.ptp(across)) for across in _tips_across(placed)]
     if not min(widths) > 0.0:
@@ -82,7 +83,7 @@ def tip_width(placed: Placed) -> float:
 
 
 def as_gaps(
-    placed: Placed, moved: Mapping[float, Sequence[FingerMoved]], depth_m: float
+    placed: PlacedOutlines, moved: Mapping[float, Sequence[FingerMoved]], depth_m: float
 ) -> tuple[float, dict[float, Sequence[FingerMoved]]]:
     """The gap between the fingertips (m) at the first opening, and the motions by the gaps at the other openings."""
     first, *_, last = _tips_across(placed)
@@ -94,7 +95,7 @@ def as_gaps(
     return round(gap * depth_m, 6), by_gap
 
 
-def _tips_across(placed: Placed) -> list[Array]:
+def _tips_across(placed: PlacedOutlines) -> list[Array]:
     """Positions of the vertices of each finger's tip across the jaws, at unit depth."""
     out = []
     for points in placed.points:
@@ -104,7 +105,7 @@ def _tips_across(placed: Placed) -> list[Array]:
     return out
 
 
-def build_model(seen: Seen, name: str, provenance: Provenance | None, notes: list[str]) -> GripperModel:
+def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None, notes: list[str]) -> GripperModel:
     """The gripper file.  Raises :class:`NoResultError`; adds to ``notes`` what was left out."""
     points: dict[str, PointModel] = {}
     edges: dict[str, EdgeModel] = {}
@@ -178,7 +179,7 @@ def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -
 
 
 def _curve_in_space(
-    seen: Seen,
+    seen: MeasuredGripper,
     outline: Outline,
     mask: NDArray[np.bool_],
     places: Array,
@@ -213,7 +214,9 @@ def _curve_in_space(
     return np.asarray(points[1:-1])
 
 
-def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEdge) -> tuple[int, int] | None:
+def _starts_at(
+    seen: MeasuredGripper, outline: Outline, known: Sequence[int], edge: InnerEdge
+) -> tuple[int, int] | None:
     """The vertex among ``known`` that an inner edge runs to, and the edge's end next to it; None if there is none."""
     uv = seen.camera.distort(outline.xy[list(known)])
     way = edge.uv_px[1] - edge.uv_px[0]
@@ -230,7 +233,7 @@ def _starts_at(seen: Seen, outline: Outline, known: Sequence[int], edge: InnerEd
 
 
 def _inner_in_space(
-    seen: Seen, outline: Outline, places: Array, start: tuple[int, int] | None, edge: InnerEdge
+    seen: MeasuredGripper, outline: Outline, places: Array, start: tuple[int, int] | None, edge: InnerEdge
 ) -> Array | None:
     """Both ends (2, 3) at unit depth; None where the depth can't be determined."""
     xy = seen.camera.undistort(edge.uv_px)
@@ -249,7 +252,7 @@ def _inner_in_space(
 
 
 def _add_inner(
-    seen: Seen,
+    seen: MeasuredGripper,
     finger: str,
     number: int,
     ends: Array,
@@ -271,7 +274,7 @@ def _add_inner(
     )
 
 
-def _jaw(seen: Seen) -> tuple[dict[str, FingerModel], JawModel | None]:
+def _jaw(seen: MeasuredGripper) -> tuple[dict[str, FingerModel], JawModel | None]:
     """Motion of the fingers as a table over the openings."""
     names = [outline.name for outline in seen.outlines]
     if seen.opening_m is None or not seen.moved:

@@ -81,7 +81,7 @@ def motion_of(
 
 def check_opened(moved: Mapping[float, Sequence[FingerMoved]], counts: Sequence[int]) -> None:
     """Raise :class:`~gripmon.model.errors.NoResultError` if sets of images (``counts`` images each), each with other
-    static parts, don't show one gripper at several openings: then its fingers would move against each other.
+    static parts, don't show one gripper at several openings, whose fingers would move against each other.
     """
     if len(moved) + 1 < len(counts):
         raise sets_refused(counts)

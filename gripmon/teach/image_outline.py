@@ -1,4 +1,6 @@
-"""From images of one jaw opening to outlines of fingers; images that moved, are blurred or contradict are left out."""
+"""From images of one jaw opening to outlines of fingers; images that show motion or blur, or contradict the others, are
+left out.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ MOST_SHIFT_PX = 0.5
 MOST_BLUR_PX = 2.5
 """Largest blur of an outline's transition: beyond it the background's edges merge with the fingers' (see Limits)."""
 LEAST_SHARPNESS = 0.6
-"""Least sharpness of an image's transitions over that of all: blurred to 1.7 times the others' width it is less."""
+"""Least sharpness of an image's transitions over that of all: an image blurred to 1.7 times their width has less."""
 MOST_PARTS = 6
 """Most separate parts of a gripper in view: five fingers and a palm."""
 _FEWEST_STATIONS = 60
@@ -45,7 +47,9 @@ class FingerSeen:
 
 @dataclass(frozen=True)
 class OpeningSeen:
-    """What the images of one opening show.  ``left_out``: by their index, why images aren't used."""
+    """What the images of one opening show.  ``left_out``: index of each image that isn't used, and why; ``blur_px`` of
+    the outline.
+    """
 
     matte: Matte
     fingers: tuple[FingerSeen, ...]
@@ -199,7 +203,7 @@ def _fingers(
 
 
 def _outwards(mask: NDArray[np.bool_]) -> Array:
-    """Direction (2,) in the image from where a part leaves the image to its farthest point."""
+    """Direction (2,) in the image from where a part leaves the image to its farthest points."""
     points = np.argwhere(mask)[:, ::-1].astype(float)
     last = np.array([mask.shape[1] - 1.0, mask.shape[0] - 1.0])
     border = ((points <= 0.0) | (points >= last)).any(axis=1)

@@ -33,8 +33,8 @@ _SAME_PX, _SAME_COS = 3.0, 0.996
 
 @dataclass(frozen=True)
 class InnerEdge:
-    """Its ends (2, 2) in the image, ``folds_px`` (f, 2, 2), the same without a tenth of the images each, the ``step``
-    in grey levels (positive: brighter to the right when going from the first end), ``rms_px`` of its points.
+    """Its ends (2, 2) in the image, ``folds_px`` (f, 2, 2), the same with one tenth of the images left out, the
+    ``step`` in grey levels (positive: brighter to the right when going from the first end), ``rms_px`` of its points.
     """
 
     uv_px: Array

@@ -19,7 +19,7 @@ _START_PX = 1.0  # half width of a line in the search: two lines closer than thi
 _FLOOR_PX = 0.05  # least assumed scatter of edge points: pixels are that coarse
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
-_FEWEST = 6
+_FEWEST_POINTS = 6
 _ROUNDS = 20
 _SETTLED_PX = 1e-4
 
@@ -47,7 +47,7 @@ class Line:
     """An edge's offset at both ends of its sampled part, px, with its covariance (2, 2) from the points' scatter.
 
     ``inlier`` (k,): which points belong to it; ``rms_px``: their scatter; ``seen``: the part of the search lines that
-    show it; ``rival_px``: distance to another line that nearly as many search lines show, None if there is none.
+    show it; ``rival_px``: distance to another line that nearly as many points support, None if there is none.
     """
 
     ends_px: Array
@@ -59,27 +59,27 @@ class Line:
 
 
 def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line | None:
-    """The line that most search lines of all images show within ``reach_px`` of the expected one (2,); None if there is
-    none.
+    """The line that most edge points of all images support within ``reach_px`` of the expected one (2,), px at both
+    ends; None if there is none.
 
-    Of two lines seen equally well, the one closer to the expected line is taken.
+    Of two lines supported equally well, the one closer to the expected line is taken.
     """
-    if len(points.way) < _FEWEST:
+    if len(points.way) < _FEWEST_POINTS:
         return None
     shifts = np.arange(-round(reach_px / _STEP_PX), round(reach_px / _STEP_PX) + 1) * _STEP_PX
     starts = np.array([expected_px + s + 0.5 * t * np.array([-1.0, 1.0]) for s in shifts for t in _TILTS_PX])
     away = np.abs(starts.mean(axis=1) - expected_px.mean())
-    votes = _votes(points, starts)
-    wish = votes * (1.0 - 0.5 * np.square(away / (reach_px + _STEP_PX)))
-    best = int(wish.argmax())
+    support = _support(points, starts)
+    score = support * (1.0 - 0.5 * np.square(away / (reach_px + _STEP_PX)))
+    best = int(score.argmax())
     line = settle_line(points, starts[best])
     if line is None:
         return None
     apart = np.abs(starts.mean(axis=1) - line.ends_px.mean()) > 1.5 * _START_PX
-    rivals = np.flatnonzero(apart & (votes > 0.8 * votes[best]))
+    rivals = np.flatnonzero(apart & (support > 0.8 * support[best]))
     rival_px = None
     if len(rivals):
-        rival_px = float(starts[rivals[votes[rivals].argmax()]].mean() - line.ends_px.mean())
+        rival_px = float(starts[rivals[support[rivals].argmax()]].mean() - line.ends_px.mean())
     return Line(line.ends_px, line.covariance_px2, line.inlier, line.rms_px, line.seen, rival_px)
 
 
@@ -95,7 +95,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
         residual = root * (points.offset_px - design @ ends_px)
         weight = tukey_weights(np.abs(residual), width)
         near = np.abs(residual) < width
-        if np.count_nonzero(near) < _FEWEST:
+        if np.count_nonzero(near) < _FEWEST_POINTS:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
         width = min(TUKEY * scale, _START_PX)
@@ -109,7 +109,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
             break
     residual = root * (points.offset_px - design @ ends_px)
     inlier = np.abs(residual) < width
-    if np.count_nonzero(inlier) < _FEWEST:
+    if np.count_nonzero(inlier) < _FEWEST_POINTS:
         return None
     # Neighbours see the same pixels and the same texture: a whole stretch of them counts as one point.
     rms_px = float(np.sqrt(np.mean(np.square(residual[inlier]))))
@@ -134,7 +134,7 @@ def of_image(points: EdgePoints, image: int) -> EdgePoints:
     )
 
 
-def _votes(points: EdgePoints, starts: Array) -> Array:
+def _support(points: EdgePoints, starts: Array) -> Array:
     """Sum (s,) over all points of a weight that decreases with their distance from each line (s, 2)."""
     lines = starts[:, :1] * (1.0 - points.way) + starts[:, 1:] * points.way
     nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
@@ -142,7 +142,7 @@ def _votes(points: EdgePoints, starts: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Pooled:
+class PooledOffsets:
     """Offsets ``ends_m`` (e, 2) and their covariances (e, 2, 2); ``own_m`` (e, 2), the part that is the edges' own, and
     ``usual_own_m`` (g,), its standard deviation over edges of a kind; ``common`` (m,), the common unknowns, with
     ``common_covariance`` (m, m).
@@ -156,7 +156,9 @@ class Pooled:
     common_covariance: Array
 
 
-def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array) -> Pooled:
+def pool(
+    ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array
+) -> PooledOffsets:
     """Posterior of the offsets ``ends_m`` (e, 2), whose noise has ``covariance_m2`` (e, 2, 2).
 
     ``rows`` (e, 2, m): derivatives, metres of offset by the common unknowns, which have a prior ``prior_covariance``
@@ -190,11 +192,11 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
         own_m2 = new + 1e-18
         if settled:
             break
-    return Pooled(mean, covariance, own, np.sqrt(own_m2), common, common_covariance)
+    return PooledOffsets(mean, covariance, own, np.sqrt(own_m2), common, common_covariance)
 
 
 LARGEST_SLOPE = 5.0
-"""Largest depth per metre of offset: a face seen at less than 11° shows no depth."""
+"""Largest depth per metre of offset: that of a face 11° from the line of sight."""
 
 UNKNOWN_SLOPE = 2.0
 """Standard deviation of the depth per metre of offset where faces don't show it."""
@@ -209,8 +211,8 @@ def slopes(
     """Depth (e,) of an edge's rim per metre of its offset (e,) across the line of sight; NaN where the gripper file has
     no two faces at the edge.
 
-    ``axes`` as from :func:`sight_axes`.  The rim of an outline with equal bevels is the outer one, that of a crease
-    the one on the side to which it is shifted.
+    ``axes`` as from :func:`gripmon.track.edges.taught.sight_axes`.  The rim of an outline with equal bevels is the
+    outer one, that of a crease the one on the side to which it is shifted.
     """
     across, depth = axes
     out = np.full(len(gripper.edge_ids), np.nan)

@@ -1,8 +1,8 @@
 """What stays the same in images in front of changing backgrounds, the gripper, and how certain that is.
 
 Light and exposure change between images, so each is first adjusted to the others' grey levels by a gain and an offset,
-computed from the pixels that change least.  A pixel of the gripper then keeps its grey level but for noise, a pixel of
-the background doesn't.  All statistics over images are robust: a shadow or a hand in a few of them does no harm.
+computed from the pixels that change least.  A pixel of the gripper then keeps its grey level except for noise, a pixel
+of the background doesn't.  All statistics over images are robust: a shadow or a hand in a few of them does no harm.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ def find_matte(
         if np.count_nonzero(~bad) < max(FEWEST_IMAGES, (len(images) + 2) // 2):
             raise NoResultError(
                 f"{len(left_out)} of {len(images)} images contradict the others (each shows less than "
-                f"{100.0 * ALIKE_SHARE:.0f} % of the gripper where the others do); one camera, one gripper, jaws that "
-                "stand, sharp images"
+                f"{100.0 * ALIKE_SHARE:.0f} % of the gripper where the others do); one camera, one gripper, jaws at "
+                "rest, sharp images"
             )
         stack, kept = stack[~bad], kept[~bad]
     sets = _sets(np.ascontiguousarray(stack[:, :: _STEP + 1, :: _STEP + 1]), noise)
@@ -109,9 +109,9 @@ def find_matte(
 
 def sets_refused(counts: Sequence[int]) -> NoResultError:
     """The refusal of sets of images (``counts`` images each) that don't show one gripper."""
-    said = " and ".join(map(str, counts))
+    sizes = " and ".join(map(str, counts))
     return NoResultError(
-        f"the images fall into {len(counts)} sets, of {said}, in which different parts stay the same; images of one "
+        f"the images fall into {len(counts)} sets, of {sizes}, in which different parts stay the same; images of one "
         "gripper, a camera fixed to it, jaws at rest, each with another background"
     )
 
@@ -132,8 +132,8 @@ def image_sets(images: Sequence[NDArray[np.float32]], least_noise: float) -> lis
 
 
 def _sets(small: NDArray[np.float32], noise: float) -> list[list[int]]:
-    """The same for images (n, h, w) at common grey levels.  Merges the most similar first, but never two sets of enough
-    images, each of which is static in places where the other one isn't.
+    """As :func:`image_sets`, of images (n, h, w) at common grey levels.  Merges the most similar first, but never two
+    sets of enough images, each of which is static in places where the other one isn't.
     """
     apart = 1.0 - _alikeness(small, noise)
     np.fill_diagonal(apart, 0.0)
@@ -202,7 +202,7 @@ def _statistics(
 def _levelled(
     stack: NDArray[np.float32], least_noise: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], float]:
-    """The same, each pixel by itself."""
+    """As :func:`_statistics`, without its checks; specks and holes of the static part remain."""
     quiet = None
     for _ in range(_ROUNDS):
         _level(stack, quiet)
@@ -267,7 +267,7 @@ def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _robust(stack: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Median and scatter (h, w) over images, by rows to save memory.  The scatter is the root mean square of the
-    smallest nine tenths of the deviations, which detects background that seldom differs better than their median.
+    smallest nine tenths of the deviations; unlike their median it shows background that differs in few images.
     """
     mean, scatter = np.empty_like(stack[0]), np.empty_like(stack[0])
     rows = max(1, int(4e6 / (stack.shape[0] * stack.shape[2])))

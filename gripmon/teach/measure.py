@@ -4,8 +4,8 @@ By definition the gripper in the teaching images is at the reference, its jaws o
 contain everything in which the images differ from the sharp model there: bevels, shading and blur, but also the errors
 of the reference and of the reported opening.  All of it cancels later, as with the method's own reference corners,
 which are measured in the reference image.  A reference or an opening with a larger error than its stated standard
-deviation and a plausible bevel allow is refused: the error would persist, and with it would grow the offsets' part
-along the line of sight, which can't be measured.
+deviation and a plausible bevel allow is refused: the error would persist, and the offsets' part along the line of
+sight, which can't be measured, would grow with it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from gripmon.teach.estimate import (
     estimate_edges,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
-from gripmon.teach.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.views import ImageRefused, SampledEdge, TeachingImage, TeachingRefused, View, Viewer, sampled
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
@@ -44,8 +44,8 @@ SEEN_SHARE = 0.6
 """Least part of an edge's search lines that must show its line, in at least half of the images."""
 
 CLOSED_PX = 0.3
-"""Largest distance of the gripper from the reference when the images are measured with what was taught; it may be
-larger only if that measurement is as uncertain."""
+"""Largest distance of the gripper from the reference when the images are measured with what was taught; a larger one
+passes only if that measurement's covariance explains it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Taught:
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
-        """Of one item per given image, those of the images taught from."""
+        """The items, given one for each image, that belong to the images taught from."""
         return [one for number, one in enumerate(images) if number not in self.left_out]
 
 
@@ -159,7 +159,7 @@ def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[in
     return lines, untaught
 
 
-def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
+def _lines_of(seen: SampledEdge, images: int, search: bool) -> EdgeLines | str:
     """An edge's line in all images together and in each, or the reason why there is none."""
     points, expected_px = seen.points, seen.expected_px
     line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)
@@ -227,7 +227,7 @@ def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[
     return corners
 
 
-_LARGEST_CONDITION = 100.0  # edges that meet at less than about 10° form no corner
+_LARGEST_CONDITION = 100.0  # edges that meet at less than about 11° form no corner
 
 
 def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: str | None) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Base of the page's requests."""
 
 
-class Put(Request, frozen=True):
+class CornersRequest(Request, frozen=True):
     """Corners set by hand in one image; those ``by_hand`` are used as they are.  ``image`` None: the live image."""
 
     corners: Annotated[dict[str, Place], Meta(max_length=1000)]
@@ -43,7 +43,7 @@ class Put(Request, frozen=True):
 class SaveOrder(Request, frozen=True):
     """What to write.  ``replace``: the person has agreed to replace existing files."""
 
-    put: Put
+    put: CornersRequest
     robot: Key
     camera_name: Key
     taught: bool = True
@@ -52,7 +52,7 @@ class SaveOrder(Request, frozen=True):
     replace: bool = False
 
 
-class Nothing(Request, frozen=True):
+class EmptyRequest(Request, frozen=True):
     """A request without parameters."""
 
 

@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import ALONG_RAD, FLAT_SIGMA_RAD, Outline, Placed, innermost
+from gripmon.teach.finger_depth import ALONG_RAD, FLAT_SIGMA_RAD, Outline, PlacedOutlines, innermost
 from gripmon.teach.image_motion import STATIONS, normals, rough_shift_px
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
 from gripmon.teach.silhouette import Stations, in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX
 
-UNLIKE = 0.2
-"""Largest sum of both fingers' motions over their difference: jaws of which one is fixed have 1, tips at different
-depths that move alike a few hundredths."""
+LARGEST_COMMON_MOTION = 0.2
+"""Largest sum of both fingers' motions over their difference: it is 1 if one jaw is fixed, a few hundredths for tips at
+different depths that move equally far."""
 OFF_PLANE = 0.05
 """Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
 away."""
 INDEPENDENT_PX = 4.0
 """Neighbouring edge points have correlated errors: one per this length counts (as where chains are split)."""
-TIP = 0.1
+TIP_SHARE = 0.1
 """Part of a finger's length that is its tip."""
 _TURNS = 8
 _ROUGHLY_PX = 30
@@ -57,7 +57,7 @@ def place_by_motion(
     seen: OpeningSeen,
     around: Sequence[OpeningSeen],
     pose: tuple[Array, Array] | None,
-) -> Placed | None:
+) -> PlacedOutlines | None:
     """Two fingers in space; with ``pose``, the rotation (3, 3) and the TCP (3,) at unit depth, as a calibration has
     them.  None where this can't be determined: not two fingers, or fingers that don't move against each other.
     """
@@ -69,7 +69,7 @@ def place_by_motion(
     ]) / camera.fx_px  # fmt: skip
     tips = rough[:, :, 0]
     half = 0.5 * (tips[:, 1] - tips[:, 0])
-    if (np.linalg.norm(tips.sum(axis=1), axis=1) > UNLIKE * 2.0 * np.linalg.norm(half, axis=1)).any():
+    if (np.linalg.norm(tips.sum(axis=1), axis=1) > LARGEST_COMMON_MOTION * 2.0 * np.linalg.norm(half, axis=1)).any():
         return None
     far = int(np.linalg.norm(half, axis=1).argmax())
     start = np.concatenate([
@@ -98,11 +98,11 @@ def _rays(finger: Outline) -> Array:
 def _tips(finger: Outline) -> NDArray[np.intp]:
     """Vertices of its tip."""
     ahead = finger.xy @ finger.outwards
-    return np.flatnonzero(ahead > ahead.max() - TIP * float(np.ptp(ahead)))
+    return np.flatnonzero(ahead > ahead.max() - TIP_SHARE * float(np.ptp(ahead)))
 
 
 def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
-    """Vector (3,) from the middle of the first finger to that of the other, which looks alike."""
+    """Vector (3,) from the middle of the first finger to that of the other: mirror images have corresponding ones."""
     middles = []
     for finger, of_finger in zip(fingers, q, strict=True):
         points, ends = _rays(finger) / of_finger[:, None], np.reshape(finger.pieces, (-1, 2))
@@ -113,7 +113,7 @@ def _between(fingers: Sequence[Outline], q: Sequence[Array]) -> Array:
 def _solve(
     camera: Camera, fingers: Sequence[Outline], seen: OpeningSeen, around: Sequence[OpeningSeen], half: Array, q: Array
 ) -> _Unknowns | None:
-    """Gauss-Newton with a new measurement in each iteration."""
+    """Gauss-Newton with a new measurement in each iteration; None where too little of a finger is seen."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     count, openings = int(first[-1]), len(around)
     size = count + 3 * len(fingers) + 2 * openings
@@ -232,7 +232,7 @@ def _border(still: NDArray[np.bool_], stations: Stations) -> Array:
     return np.asarray(np.take_along_axis(away, np.abs(away).argmin(axis=1)[:, None], axis=1)[:, 0])
 
 
-def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Array] | None) -> Placed:
+def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Array] | None) -> PlacedOutlines:
     """The result, with axes: x as the jaws move, z along the fingers."""
     first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
     q = [found.q[first[k] : first[k + 1]] for k in range(len(fingers))]
@@ -257,7 +257,7 @@ def _placed(fingers: Sequence[Outline], found: _Unknowns, pose: tuple[Array, Arr
     points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
     slopes = np.sqrt(np.square(found.slope_sigma).mean(axis=0))
     sigma = np.array([slopes[1], slopes[0], 0.0]) if pose is None else np.zeros(3)
-    return Placed(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, False, sigma, by_motion=True)
+    return PlacedOutlines(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, False, sigma, by_motion=True)
 
 
 def _along(finger: Outline, points: Array) -> Array:

@@ -23,7 +23,7 @@ from gripmon.model.records import Array
 from gripmon.model.units import in_mm
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import AccuracyForecast, Promise, forecast_frame
-from gripmon.teach.visibility import Rig, Sight, border, moved_camera, see, sideways_m
+from gripmon.teach.visibility import LandmarkView, Rig, border, moved_camera, see, sideways_m
 
 OPENINGS = 25
 """Number of openings over the jaw's travel at which a mount's view is checked."""
@@ -33,7 +33,7 @@ ACCURACY_OPENINGS = 3
 
 
 class Mount(NamedTuple):
-    """Pose of a camera against the gripper, but for where in the image the TCP is.
+    """Pose of a camera against the gripper, except for where in the image the TCP is.
 
     ``distance_m`` from the camera's centre to the TCP.  ``tilt_rad`` (0 to pi) between the camera's optical axis and
     the gripper's z axis: 0 looks along the fingers.  ``side_rad``: the side of the gripper on which the camera is,
@@ -133,7 +133,7 @@ class Fault(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Measurable:
+class MeasurableMount:
     """Results for a mount from which the monitor can measure at the usual opening; all for that opening unless stated
     otherwise.
 
@@ -170,8 +170,8 @@ class Trial:
     corners: NDArray[np.intp]
     edges: NDArray[np.intp]
     share: float
-    sight: Sight
-    measurable: Measurable | None
+    sight: LandmarkView
+    measurable: MeasurableMount | None
     faults: tuple[Fault, ...]
 
     @property
@@ -235,7 +235,9 @@ def tried(grid: Grid, jaw_opening_m: float | None, travel_m: tuple[float, float]
         yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m, travel_m)
 
 
-def _measurable(rig: Rig, cam_T_grip: Array, usual_m: float, sight: Sight, openings_m: list[float]) -> Measurable:
+def _measurable(
+    rig: Rig, cam_T_grip: Array, usual_m: float, sight: LandmarkView, openings_m: list[float]
+) -> MeasurableMount:
     """The results, with the worst standard deviation over the usual opening and ``openings_m``."""
     policy = rig.settings.policy
     frame, nearest = forecast_frame(rig, cam_T_grip, usual_m), border(rig, sight)
@@ -245,7 +247,7 @@ def _measurable(rig: Rig, cam_T_grip: Array, usual_m: float, sight: Sight, openi
     detectable = foresee(frame.covariance, rig.settings.drift)
     delays = [detectable.delay_frames(policy.warn_m, axis) for axis in range(3)]
     known = [d for d in delays if d is not None]
-    return Measurable(
+    return MeasurableMount(
         frame,
         sigma_m,
         at_m,
@@ -257,7 +259,7 @@ def _measurable(rig: Rig, cam_T_grip: Array, usual_m: float, sight: Sight, openi
     )
 
 
-def _too_little_in_view(openings_m: Array, sights: list[Sight], sight: Sight) -> tuple[Fault, ...]:
+def _too_little_in_view(openings_m: Array, sights: list[LandmarkView], sight: LandmarkView) -> tuple[Fault, ...]:
     failed = [k for k, s in enumerate(sights) if not s.enough]
     if len(failed) == len(sights) and sight.reason is not None:
         return (Fault("nowhere enough in view", f"nowhere enough to measure: {sight.reason}"),)
@@ -286,7 +288,7 @@ def _after_a_shift(rig: Rig, cam_T_grip: Array, openings_m: list[float]) -> tupl
     return ()
 
 
-def _inexact(rig: Rig, found: Measurable, usual_m: float) -> tuple[Fault, ...]:
+def _inexact(rig: Rig, found: MeasurableMount, usual_m: float) -> tuple[Fault, ...]:
     """Whether no measured transform would be valid, or recalibration past the limit would be impossible."""
     faults, settings, gripper = [], rig.settings, rig.gripper
     if not found.promise.reachable:

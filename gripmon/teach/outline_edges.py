@@ -19,7 +19,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
 from gripmon.teach.lines import EdgePoints, Line, settle_line
 from gripmon.teach.outlines import INNERMOST, Outline
-from gripmon.teach.plate_print import PlatePrint, look_at, moves, rough_line, sharpness
+from gripmon.teach.plate_print import PlatePrint, estimate_blur_px, line_offsets, look_at, rough_line
 from gripmon.track.edges.kernel import FEWEST_FREE
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
@@ -42,12 +42,12 @@ SEEN_SHARE = 0.4
 """Least part of its search lines that must show an edge."""
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
-TELLING = 0.1
-"""Least information of a search line in front of a print, over the most that one has; those with less are dropped."""
+LEAST_INFORMATION_SHARE = 0.1
+"""Least information of a search line in front of a print, over the 90 % quantile of all; others are dropped."""
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
-_MOVES = 6
+_LINE_UPDATES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class FoundOutline:
 @dataclass(frozen=True, slots=True)
 class _Base:
     """An edge between two rough ends as the lens shows it: ``uv_px`` (n, 2) and ``normal`` (n, 2), to the right when
-    going from the first end; ``way`` (n,) from 0 to 1 between ``first`` and ``last``, the ends of the sampled part.
+    going from the first end; ``way`` (n,) from 0 to 1 between the ends of the sampled part.
     """
 
     uv_px: Array
@@ -114,7 +114,7 @@ def _check_inside(camera: Camera, outline: Outline) -> None:
 
 
 def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) -> tuple[_Base, float]:
-    """Sample points one pixel apart, without a margin at both ends."""
+    """Sample points one pixel apart, leaving out a margin at both ends; and the search distance for this length."""
     length_px = float(np.linalg.norm(end - start))
     if not length_px >= SHORTEST_PX:
         raise CalibrationError(f"{names}: {length_px:.0f} px apart; at least {SHORTEST_PX:g} px, two different corners")
@@ -188,15 +188,15 @@ def _line_before(
     row = np.arange(len(base.way))
     seen: SeenEdge | None = None
     blur_px = 1.0 if known_px is None else known_px
-    for turn in range(_MOVES):
+    for turn in range(_LINE_UPDATES):
         if known_px is None and turn < 2:
-            blur_px = sharpness(scene, base.way, ends_px)
-        wish = moves(scene, base.way, ends_px, blur_px)
-        telling = wish.worth > TELLING * np.quantile(wish.worth, 0.9)
-        worth = wish.worth[telling] / wish.worth[telling].mean()
+            blur_px = estimate_blur_px(scene, base.way, ends_px)
+        asked = line_offsets(scene, base.way, ends_px, blur_px)
+        used = asked.worth > LEAST_INFORMATION_SHARE * np.quantile(asked.worth, 0.9)
+        worth = asked.worth[used] / asked.worth[used].mean()
         points = EdgePoints(
-            base.way[telling], wish.offset_px[telling], worth, row[telling], np.zeros(int(telling.sum()), np.intp),
-            row[telling], np.array([int(telling.sum())]),
+            base.way[used], asked.offset_px[used], worth, row[used], np.zeros(int(used.sum()), np.intp),
+            row[used], np.array([int(used.sum())]),
         )  # fmt: skip
         line = settle_line(points, ends_px, worth)
         if line is None or np.abs(line.ends_px).max() > reach_px + 1.0:
@@ -223,14 +223,14 @@ def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
     """
     steps = np.arange(-reach_px, reach_px + 0.5 * _GRID_PX, _GRID_PX)
     ends = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    edgels = np.zeros(len(ends))
+    support = np.zeros(len(ends))
     for k in range(0, len(ends), 256):
         part = ends[k : k + 256]
         lines = part[:, :1] * (1.0 - points.way) + part[:, 1:] * points.way
         nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
-        edgels[k : k + 256] = nearness @ worth
+        support[k : k + 256] = nearness @ worth
     away = np.square(ends).mean(axis=1) / reach_px**2
-    best: Array = ends[int((edgels * (1.0 - 0.3 * away)).argmax())]
+    best: Array = ends[int((support * (1.0 - 0.3 * away)).argmax())]
     return best
 
 

@@ -176,7 +176,8 @@ class RoughCorners(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 JAW_SIGMA_M = 2e-4
-_ROUGH_PX = 3.0
+"""Assumed standard deviation of the jaw opening in an image on a plate."""
+_ROUGH_PX = 3.0  # standard deviation of a rough corner
 
 
 def rough_pose(
@@ -187,7 +188,10 @@ def rough_pose(
     jaw_opening_m: float | None,
     contact_m: float,
 ) -> Array:
-    """``cam_T_grip`` (4, 4) from rough corners of a known gripper, good to some pixels.  :class:`CalibrationError`."""
+    """``cam_T_grip`` (4, 4) from rough corners of a known gripper, good to some pixels.
+
+    Raises :class:`CalibrationError`.
+    """
     check_rough(gripper, rough)
     points_m = gripper.points_grip_m(jaw_opening_m)
     known = np.array([points_m[gripper.point_ids.index(name)] for name in rough])

@@ -1,4 +1,4 @@
-"""The page's web server: reachable only from this machine unless told otherwise, and only with the address's token.
+"""The page's web server: reachable only from this machine unless another address is given, and only with the token.
 
 A page of another site in the same browser can also send requests here, or have its name resolve to 127.0.0.1 (DNS
 rebinding).  So every request must name this host, carry the token in its path, and come from this page if the browser
@@ -35,11 +35,11 @@ from gripmon.model.errors import InputError, in_short
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
     BadRequest,
+    CornersRequest,
+    EmptyRequest,
     Failure,
-    Nothing,
     PictureInfo,
     Place,
-    Put,
     Reply,
     Saved,
     SaveOrder,
@@ -173,7 +173,7 @@ class _Http(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that disconnects early is no error to report."""
+        """Log only for debugging: a browser that disconnects early isn't an error."""
         _log.debug("request of %s failed", client_address, exc_info=True)
 
 
@@ -254,13 +254,13 @@ class _Handler(BaseHTTPRequestHandler):
         return found
 
     def _post(self, path: str) -> Served:
-        action = (Nothing, self._end) if path == "done" else self.server.site.post(path)
+        action = (EmptyRequest, self._end) if path == "done" else self.server.site.post(path)
         if action is None:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
         kind, act = action
         return self.server.encode(act(self._body(kind))), "application/json"
 
-    def _end(self, _order: Nothing) -> None:
+    def _end(self, _order: EmptyRequest) -> None:
         """End the process once this request has been answered."""
         self._last = self.close_connection = True
 
@@ -311,8 +311,8 @@ class TeachSite:
     def post(self, path: str) -> Action | None:
         session = self._session
         actions: dict[str, Action] = {
-            "look": (Put, session.look),
-            "take": (Nothing, lambda _: session.take()),
+            "look": (CornersRequest, session.look),
+            "take": (EmptyRequest, lambda _: session.take()),
             "save": (SaveOrder, session.save),
         }
         return actions.get(path)
@@ -365,7 +365,7 @@ class OutlineSession:
             corners_only=True,
         )
 
-    def look(self, put: Put) -> Reply:
+    def look(self, put: CornersRequest) -> Reply:
         """Always :class:`BadRequest`."""
         raise BadRequest("corners don't snap without a gripper file; they are placed and saved")
 

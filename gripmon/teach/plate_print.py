@@ -15,7 +15,7 @@ from gripmon.model.records import Array, Image
 from gripmon.model.targets import Charuco, Chequerboard, Target
 from gripmon.track.edges.profiles import read_profiles
 
-_BESIDE = 0.1
+_LEVEL_OFFSET = 0.1
 """Distance from a corner, in squares, along both axes, at which a square shows its own colour, outside of any mark."""
 _MARK_PX = 12
 """Size of a mark's cells in the rendered board."""
@@ -78,7 +78,7 @@ def plate_print(
     cells = np.rint((xy_m - origin_m) / step_m).astype(np.intp)
     uv_px, grey = [], []
     for right, down in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
-        beside = sighting.plate_m + np.array([right, down, 0.0]) * _BESIDE * step_m
+        beside = sighting.plate_m + np.array([right, down, 0.0]) * _LEVEL_OFFSET * step_m
         uv_px.append(camera.project(beside @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]))
         grey.append(_at(image, uv_px[-1]))
     sign = np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)
@@ -158,8 +158,8 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Moves:
-    """``offset_px`` (n,), each search line's position of the line, and ``worth`` (n,), its relative information."""
+class LineOffsets:
+    """``offset_px`` (n,) of the edge on each search line, and its relative information ``worth`` (n,)."""
 
     offset_px: Array
     worth: Array
@@ -211,8 +211,8 @@ def rough_line(scene: Scene, way: Array, reach_px: float) -> Array:
     return best
 
 
-def moves(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> Moves:
-    """The correction of the line ``ends_px`` (2,) that each search line asks for."""
+def line_offsets(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> LineOffsets:
+    """Where each search line shows the edge, linearised about the line ``ends_px`` (2,)."""
     line = ends_px[0] * (1.0 - way) + ends_px[1] * way
     fit = _fit(scene, way, line, blur_px)
     step = (_predicted(scene, line + 0.25, blur_px) - _predicted(scene, line - 0.25, blur_px)) / 0.5
@@ -222,10 +222,10 @@ def moves(scene: Scene, way: Array, ends_px: Array, blur_px: float) -> Moves:
     gr, fr = ((weight * a * left).sum(axis=1) for a in (slope, finger))
     worth = np.maximum(gg - gf**2 / ff, 0.0)
     move = (gr - gf / ff * fr) / np.maximum(worth, 1e-6 * max(float(worth.max()), 1e-12))
-    return Moves(line + move, worth)
+    return LineOffsets(line + move, worth)
 
 
-def sharpness(scene: Scene, way: Array, ends_px: Array) -> float:
+def estimate_blur_px(scene: Scene, way: Array, ends_px: Array) -> float:
     """Standard deviation (px) of the blur that explains the image best."""
     line = ends_px[0] * (1.0 - way) + ends_px[1] * way
     left = []

@@ -17,9 +17,9 @@ from gripmon.teach.matte import FEWEST_STILL_SHARE
 
 _STEP_PX = 4
 """Distance between cuts across a part: half the length of the shortest edge."""
-ABOUT_AS_LARGE = 0.85
-"""A cut may take this much less from the largest small part found, so that it runs across both fingers, not along their
-body."""
+LEAST_SIZE_SHARE = 0.85
+"""Least size of the smallest part that a cut leaves, over the largest such size of any cut: with some tolerance the cut
+runs across both fingers, not along their body."""
 _TURN_RAD, _TURN_STEP_RAD = math.radians(30.0), math.radians(3.0)
 """Largest angle between the direction to a part's farthest point and the normal of the cut: 30 degrees for two fingers
 as long as they are apart; a step of 3 degrees is 4 px on a finger 80 px wide."""
@@ -69,7 +69,7 @@ def prongs(mask: NDArray[np.bool_], outwards: Array) -> list[NDArray[np.bool_]]:
                 cuts.append((int(parts[-1].sum()), int(along.sum()), way, level))
     if not cuts:
         return [mask]
-    enough = ABOUT_AS_LARGE * max(smallest for smallest, *_ in cuts)
+    enough = LEAST_SIZE_SHARE * max(smallest for smallest, *_ in cuts)
     _, _, way, level = min((cut for cut in cuts if cut[0] >= enough), key=lambda cut: cut[1])
     ahead = np.indices(mask.shape)[::-1].transpose(1, 2, 0) @ way
     found = _large(mask & (ahead > _STEP_PX * (level + 1.0)))

@@ -48,10 +48,10 @@ from gripmon.teach.measure import Taught, teach
 from gripmon.teach.messages import (
     BadRequest,
     CornerReply,
+    CornersRequest,
     Expectation,
     PictureInfo,
     Place,
-    Put,
     ReferenceReply,
     Reply,
     Saved,
@@ -240,7 +240,7 @@ class TeachSession:
             **vars(self._labels),
         )
 
-    def look(self, put: Put) -> Reply:
+    def look(self, put: CornersRequest) -> Reply:
         """Snap.  Raises :class:`BadRequest`."""
         return reply(self._evaluated(put, self._picture(put.image)))
 
@@ -281,7 +281,7 @@ class TeachSession:
                 return 0.0, ""
             return time.monotonic() - self._seen_s, self._why_dark or "the camera has sent nothing yet"
 
-    def _evaluated(self, put: Put, picture: Picture) -> Evaluation:
+    def _evaluated(self, put: CornersRequest, picture: Picture) -> Evaluation:
         gripper = self._setup.gripper
         fault = corners_fault(put.corners, gripper)
         if fault is not None:

@@ -27,6 +27,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 
 FOLDS = 10
+"""Number of groups of images that the jackknife leaves out in turn."""
 BLURS_PX = tuple(np.arange(0.5, 4.01, 0.1).tolist())
 FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
@@ -52,10 +53,10 @@ class Stations:
 class Transitions:
     """What the images show across an outline.
 
-    ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same without one f-th of the images each;
-    ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the edge
-    than all images do, with the information ``worth`` (n, s), 1/px²; ``sharpness`` (n,) of each image's transitions
-    over that of all.
+    ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
+    out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
+    edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
+    each image's transitions over that of all.
     """
 
     offset_px: Array

@@ -15,7 +15,7 @@ from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image
 from gripmon.monitor.tracker import USUAL_SHARE
-from gripmon.teach.corner_pose import Placed, Prior, Snapped, SnappedCorner, place, rough_sigma_px
+from gripmon.teach.corner_pose import PlacedPose, Prior, Snapped, SnappedCorner, place, rough_sigma_px
 from gripmon.teach.views import NARROW
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 from gripmon.track.edges.settling import ZOOMS, Expected
@@ -34,13 +34,13 @@ MISFIT_SIGMAS = (4.0, 12.0)
 nothing is found, and from which it must be mislabelled.
 """
 
-CLEARLY = 1.25
+MIRRORED_GAIN = 1.25
 """Factor by which mirrored corners must fit better before they are reported as exchanged."""
 
-_SPREAD = 24  # number of poses around that of the corners
-_KEPT = (6, 3)  # how many of them continue to the next finer zoom
+_POSES_AROUND = 24  # number of poses around that of the corners
+_POSES_KEPT = (6, 3)  # how many of them continue to the next finer zoom
 _OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; gain in χ² needed to take another one
-_ALIKE = 0.25  # of the smallest distance between two corners
+_TWIN_MISFIT = 0.25  # largest misfit of mirrored corners, over the smallest distance between two
 
 ON_A_LINE = (
     "the corners lie on a line: the gripper's rotation about it is undetermined; one more corner beside it, or "
@@ -98,7 +98,7 @@ class Snapper:
         return self._measured(found, jaw_opening_m)
 
     def _found(
-        self, image: Image, placed: Sequence[Placed], jaw_opening_m: float, reported: bool
+        self, image: Image, placed: Sequence[PlacedPose], jaw_opening_m: float, reported: bool
     ) -> Measurement | None:
         """The best measurement from any of the poses."""
         best: Measurement | None = None
@@ -146,13 +146,13 @@ class Snapper:
         if self._misfit(placed[0], MISFIT_SIGMAS[0]) is not None:
             return False
         other = self._found(image, placed, opening_m, reported)
-        return other is not None and other.trusted and _worth(other) > CLEARLY * worth
+        return other is not None and other.trusted and _worth(other) > MIRRORED_GAIN * worth
 
     def _measure(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, reported: bool) -> Measurement:
         meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
         return meter.measure(image, cam_T_grip, jaw_opening_m, USUAL_SHARE, NARROW, reported)
 
-    def _misfit(self, placed: Placed, sigmas: float) -> str | None:
+    def _misfit(self, placed: PlacedPose, sigmas: float) -> str | None:
         """The corner that fits the others least, as a text, if it is farther away than ``sigmas``; else None."""
         name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
         if away_px <= sigmas * rough_sigma_px(self.camera):
@@ -181,7 +181,7 @@ class Snapper:
         uv_px = self.camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
 
-    def _rough(self, placed: Placed, opening_m: float, why: str) -> Snapped:
+    def _rough(self, placed: PlacedPose, opening_m: float, why: str) -> Snapped:
         pose = placed.cam_T_grip
         corners = tuple(
             SnappedCorner(name, at, None, None, None, None, REASONS[CornerFault.NO_FIT])
@@ -236,7 +236,7 @@ def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | No
     apart = np.linalg.norm(at[:, None] * [-1.0, 1.0, 1.0] - at, axis=2)
     nearest = apart.argmin(axis=1)
     between = np.linalg.norm(at[:, None] - at, axis=2) + np.where(np.eye(len(at)), np.inf, 0.0)
-    if apart.min(axis=1).max() > _ALIKE * between.min() or (nearest[nearest] != np.arange(len(at))).any():
+    if apart.min(axis=1).max() > _TWIN_MISFIT * between.min() or (nearest[nearest] != np.arange(len(at))).any():
         return None
     names = gripper.corner_ids
     return {name: names[twin] for name, twin in zip(names, nearest.tolist(), strict=True)}
@@ -267,13 +267,13 @@ def _worth(measurement: Measurement) -> float:
 class _Meter(FingertipMeter):
     """Tries many poses, with a coarse zoom first, whose search lines reach farther."""
 
-    def followed(self, image: Image, placed: Placed, jaw_opening_m: float, reported: bool) -> Expected:
+    def followed(self, image: Image, placed: PlacedPose, jaw_opening_m: float, reported: bool) -> Expected:
         """The most promising pose among those that the corners set by hand allow."""
         self._prior = self._prior_reported if reported else self._prior_unreported
         root = np.linalg.cholesky(placed.covariance)
-        poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_SPREAD)]
+        poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_POSES_AROUND)]
         starts = [Expected(pose, jaw_opening_m, jaw_opening_m) for pose in poses if pose[2, 3] > 0.0]
-        for zoom, kept in zip((ZOOMS[2], ZOOMS[1]), _KEPT, strict=True):
+        for zoom, kept in zip((ZOOMS[2], ZOOMS[1]), _POSES_KEPT, strict=True):
             self._zoom = zoom
             places = sorted((self._tried(image, start) for start in starts), key=lambda at: -at.share)
             starts = [at.expected for at in places[:kept]]

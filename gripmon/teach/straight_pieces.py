@@ -20,7 +20,7 @@ from gripmon.teach.silhouette import Stations, from_ideal_px, in_image, measure_
 from gripmon.track.edges.prediction import STRETCH
 
 SHORTEST_PIECE_PX = 6.0
-"""Shortest piece: what remains of 8 px after removing the width of a search line (ROWS) at both ends."""
+"""Shortest piece: what remains of 8 px without half the width of a search line (1 px of 3) at both ends."""
 LEAST_SCATTER_PX = 0.05
 """Least scatter of an edge point: no image gives it better, whatever the points themselves show."""
 CORNER_SAG_PX = 0.6
@@ -46,9 +46,9 @@ _MOST_POINTS = 1500
 @dataclass(frozen=True)
 class Chain:
     """Consecutive vertices ``uv_px`` (v, 2) in the image, ``closed`` or from end to end.  ``folds_px`` (f, v, 2): the
-    same without a tenth of the images each; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px`` (pieces,)
-    scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left in the
-    image.
+    same with one tenth of the images left out; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px``
+    (pieces,) scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left
+    in the image.
     """
 
     uv_px: Array
@@ -72,7 +72,7 @@ class Chain:
 
 
 def jackknife_sigma(folds: Array) -> Array:
-    """Standard deviation from results (f, ...), each computed without one f-th of the images."""
+    """Standard deviation from results (f, ...), each with one f-th of the images left out."""
     count = len(folds)
     return np.asarray(np.sqrt((count - 1) / count * np.square(folds - folds.mean(axis=0)).sum(axis=0)))
 
@@ -327,7 +327,7 @@ def _measured(
 def _stations_on(
     camera: Camera, start: Array, end: Array, outward: Array, margin_px: float, shape: tuple[int, ...]
 ) -> Stations | None:
-    """Stations one pixel apart between two ends, ideal pixels, without a margin."""
+    """Stations one pixel apart between two ends, ideal pixels, leaving out a margin at both."""
     length = float(np.linalg.norm(end - start))
     count = max(int(length - 2.0 * margin_px), 4)
     share = np.linspace(margin_px / length, 1.0 - margin_px / length, count)

@@ -234,7 +234,7 @@ class Viewer:
         )
 
 
-class Sampled(NamedTuple):
+class SampledEdge(NamedTuple):
     """One edge in all images: its edge points, the fractions of the edge between which it was sampled (medians over all
     images), px per metre, the expected line (2,), px, and ``rows`` (2, 7), derivatives at both ends by the unknowns, m.
     """
@@ -246,7 +246,7 @@ class Sampled(NamedTuple):
     rows: Array
 
 
-def sampled(views: Sequence[View], edge: int) -> Sampled | None:
+def sampled(views: Sequence[View], edge: int) -> SampledEdge | None:
     """Everything seen of one edge; None if no image samples it."""
     spans, scales, expected, rows, profiles = [], [], [], [], []
     parts: list[tuple[Any, ...]] = []
@@ -273,4 +273,4 @@ def sampled(views: Sequence[View], edge: int) -> Sampled | None:
     fraction, offset_m, step, profile, image, own = (np.concatenate(part) for part in zip(*parts, strict=True))
     way = (fraction - low) / (high - low)
     points = EdgePoints(way, per_m * offset_m, step, profile, image, own, np.array(profiles))
-    return Sampled(points, (low, high), per_m, per_m * np.mean(expected, axis=0), np.mean(rows, axis=0))
+    return SampledEdge(points, (low, high), per_m, per_m * np.mean(expected, axis=0), np.mean(rows, axis=0))

@@ -42,7 +42,7 @@ class Rig(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class LandmarkView:
     """The view from one pose at one jaw opening: arrays (c,) over the gripper's landmarks, which are its corners if it
     has any.
 
@@ -86,7 +86,7 @@ class Sight:
         return None
 
 
-def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
+def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> LandmarkView:
     """The view of ``rig`` at a pose (4, 4) and an opening (nominal if None)."""
     camera, gripper = rig.camera, rig.gripper
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
@@ -105,7 +105,7 @@ def see(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Sight:
     hidden = behind_another_finger(gripper, points_grip_m, eye_grip_m, targets_m, finger)
     behind, free = ~outside & ~self_hidden & hidden[: len(of_corners)], ~hidden[len(of_corners) :]
     edges = np.count_nonzero(np.bincount(layout.edge[free], minlength=1) >= FEWEST_SAMPLES)
-    return Sight(uv_px, outside, self_hidden, behind, int(edges))
+    return LandmarkView(uv_px, outside, self_hidden, behind, int(edges))
 
 
 def samples_behind(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
@@ -215,7 +215,7 @@ def moved_camera(cam_T_grip: Array, motion: Array) -> Array:
     return make_transform(back @ cam_T_grip[:3, :3], back @ (cam_T_grip[:3, 3] - motion[:3]))
 
 
-def border(rig: Rig, sight: Sight) -> Border | None:
+def border(rig: Rig, sight: LandmarkView) -> Border | None:
     """Where the visible corners come nearest to the image's border; None if no corner is visible."""
     if not sight.corners:
         return None
@@ -250,7 +250,7 @@ def _limit(
     it always does.
     """
 
-    def view(amount: float) -> Sight:
+    def view(amount: float) -> LandmarkView:
         return see(rig, moved_camera(cam_T_grip, amount * axis), jaw_opening_m)
 
     sought = SOUGHT_M if axis[:3].any() else SOUGHT_RAD
@@ -269,7 +269,13 @@ def _limit(
 
 
 def _step(
-    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, amount: float, sight: Sight, step_px: float
+    rig: Rig,
+    cam_T_grip: Array,
+    jaw_opening_m: float | None,
+    axis: Array,
+    amount: float,
+    sight: LandmarkView,
+    step_px: float,
 ) -> float:
     """Next step: it moves the visible corners by ``step_px`` at most."""
     gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
@@ -283,8 +289,8 @@ def _step(
 
 
 def _first_failing(
-    good: float, bad: float, there: Sight, view: Callable[[float], Sight], halvings: int
-) -> tuple[float, Sight]:
+    good: float, bad: float, there: LandmarkView, view: Callable[[float], LandmarkView], halvings: int
+) -> tuple[float, LandmarkView]:
     """Bisect between a value whose view suffices and one whose view, ``there``, doesn't: the failing value found that
     is nearest to the former, and its view.
     """
@@ -327,7 +333,7 @@ def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
     if not gripper.jaw_max_m > gripper.jaw_min_m:
         return None
 
-    def view(opening_m: float) -> Sight:
+    def view(opening_m: float) -> LandmarkView:
         return see(rig, cam_T_grip, opening_m)
 
     openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, count)
@@ -339,7 +345,9 @@ def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
     return JawTravel(max(share, 0.0), gaps, openings_m, corners, edges)
 
 
-def _gaps(openings_m: list[float], sights: list[Sight], view: Callable[[float], Sight]) -> tuple[Gap, ...]:
+def _gaps(
+    openings_m: list[float], sights: list[LandmarkView], view: Callable[[float], LandmarkView]
+) -> tuple[Gap, ...]:
     """The runs of openings without a sufficient view, their ends found by bisection."""
     change = np.flatnonzero(np.diff([1, *(int(sight.enough) for sight in sights), 1]))
     gaps = []

@@ -1,4 +1,4 @@
-"""Files of ``gripmon calibrate`` that a configuration names where it may also have a section: camera and reference."""
+"""Files of ``gripmon calibrate`` that a configuration may name instead of the sections ``camera`` and ``reference``."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Grippe
         wrong = f"is {name}{same}, the configuration has {gripper.name}"
         right = "the hand/eye calibration made with the same gripper file; gripmon calibrate plane makes it again"
         if hand_eye.gripper.sha256 == gripper_digest(gripper, name):
-            wrong, right = f"{wrong}, the same but for its name", f"name: {name} in the gripper file"
+            wrong, right = f"{wrong}, the same except for its name", f"name: {name} in the gripper file"
         return Fault("gripper", wrong, right)
     return None
 

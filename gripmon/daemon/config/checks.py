@@ -1,4 +1,4 @@
-"""Checks that involve several keys, or more than the file: camera and gripper, pairs, sources, the network."""
+"""Checks of several keys together, or beyond the file: the view of the gripper, pairs of limits, sources, network."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 
 NEAREST_M = 0.005
 FARTHEST_M = 5.0
+"""Range of the TCP's depth and distance in front of the camera: beyond it, another unit was meant."""
 FEWEST_CORNERS_IN_VIEW = 3
 _UNIT_TOLERANCE = 0.01
 
@@ -137,7 +138,7 @@ def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_openin
 
 
 def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
-    """Why the gripper is not visible with this calibration; None if it is."""
+    """Why too little of the gripper is visible with this calibration; None if enough is."""
     key = "reference.cam_T_grip"
     depths_m = view.corners_cam_m[:, 2]
     if (depths_m <= 0.0).all():
@@ -165,7 +166,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
 
 
 class _Pair(NamedTuple):
-    """``lower`` and ``upper``: keys of one section; ``why``: the reason that the first must not exceed the second."""
+    """``lower`` and ``upper``: keys of one section; ``why`` the first must not exceed the second."""
 
     section: str
     lower: str

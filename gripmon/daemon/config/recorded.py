@@ -2,8 +2,8 @@
 no other.
 
 Every value is stored, including defaults, so that a later version with other defaults decides the same.  The source of
-images, the network and the location of the state file are omitted: decisions don't depend on them, and they may contain
-passwords.
+images, the network, the location of the state file and the live view are omitted: decisions don't depend on them, and
+some may contain passwords.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Parsed YAML -> typed settings, with errors that a person can act on.
 
 ``msgspec`` does the conversion.  As its errors name neither the entry of a mapping nor what would be right, the first
-fault is searched here along the type, using the descriptions and bounds in the settings.  pydantic is no replacement:
-it names the entry, but not what would be right, and would be a second model of what ``msgspec`` also encodes.
+fault is searched here along the type, using the descriptions and bounds in the settings.  pydantic wouldn't replace
+this: it names the entry, but not what would be right, and would be a second model of what ``msgspec`` also encodes.
 """
 
 from __future__ import annotations

@@ -45,8 +45,7 @@ Configs = tuple[Config, ...]
 def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
     """An episode's stretches; ``fault`` says what is wrong with it.  Never raises.
 
-    Of several ``configs`` the one is used whose gripper the episode shows; if that is none or ambiguous, there is no
-    result.
+    Uses the one of ``configs`` whose gripper the episode shows; there is no result if several or none of them fit.
 
     The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
     starts again from the new reference; if it isn't recalibrated, the configuration's reference stays.  ``lens``:

@@ -54,7 +54,7 @@ def measure_dataset(
     grippers: Sequence[str | Path] = (),
     step: Callable[[int], None] = lambda _total: None,
 ) -> Survey:
-    """Measure every episode of a folder or URL by every one of ``cameras`` (topics, features), and write the table and
+    """Measure every episode of a folder or URL with each of its ``cameras`` (topics, features), and write the table and
     the report to the folder ``out``.  The dataset is only read.
 
     ``config``: the gripper, a camera, a rough reference, and in its source how the jaw opening follows from the state.

@@ -29,7 +29,7 @@ _GREEN = (80, 220, 60)
 _READY = "ready to be taken"
 
 
-class Captured(msgspec.Struct, frozen=True, kw_only=True):
+class CaptureState(msgspec.Struct, frozen=True, kw_only=True):
     """``note``: what happened to the newest image; ``ended``: a folder or video has no more images; ``shown`` counts
     the live images; ``itself``: images are taken automatically."""
 
@@ -47,8 +47,8 @@ class Capture:
     """Writes images of a source to ``folder``: ``000.png``, ``001.png`` …, with their time stamps and jaw openings.
 
     From a live camera an image is taken automatically when it is sharp, nothing in it has moved since the previous
-    frame, something has moved since the last image taken, and the ``target``, if any, is detected.  All images of a
-    folder or a video are taken that are sharp and show the target.
+    frame, something has moved since the last image taken, and the ``target``, if any, is detected.  Of a folder
+    or a video every image is taken that is sharp and shows the target.
     """
 
     def __init__(self, folder: Path, target: Target | None) -> None:
@@ -89,7 +89,7 @@ class Capture:
             self._thread.join(10.0)
 
     def by_itself(self, on: bool) -> None:
-        """Take images automatically from now on, or no longer; of a folder the image shown is the first."""
+        """Take images automatically from now on, or no longer; also the image shown, if it can be taken."""
         with self._lock:
             if on and not self._itself and self._note == _READY and self._newest is not None:
                 self._note = f"taken: {self._keep(*self._newest)}"
@@ -141,13 +141,13 @@ class Capture:
             cv2.circle(shown, (u, v), max(2, shown.shape[1] // 250), _GREEN, -1, cv2.LINE_AA)
         return encoded(shown, ".jpg")
 
-    def state(self) -> Captured:
+    def state(self) -> CaptureState:
         """For the page."""
         source, views = self._source, None
         if self._target is not None:
             views = self._coverage()
         with self._lock:
-            return Captured(
+            return CaptureState(
                 images=self.images(), running=source is not None, itself=self._itself,
                 live=source is not None and source.live, ended=self._ended, shown=self._shown, note=self._note,
                 coverage=views,
@@ -155,12 +155,12 @@ class Capture:
 
     def notes(self) -> Iterator[str]:
         """What happens to the images, each change once, until the source ends or the coverage is complete."""
-        said = ""
+        last = ""
         while self._thread is not None and self._thread.is_alive():
             self._thread.join(0.1)
-            if self._note != said:
-                said = self._note
-                yield said
+            if self._note != last:
+                last = self._note
+                yield last
             views = self._coverage() if self._target is not None else None
             if self._source is not None and self._source.live and views is not None and not views.wants:
                 return

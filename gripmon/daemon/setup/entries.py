@@ -64,7 +64,9 @@ def other_size(values: Values) -> OtherSizeError | None:
 
 
 def other_target(values: Values) -> str:
-    """What is confirmed then, else empty.  It names both targets, so that it confirms nothing about others."""
+    """The statement to confirm if the sizes differ, else empty.  It names both targets, so that it confirms nothing
+    about others.
+    """
     if other_size(values) is None:
         return ""
     lens, stands = made_with(Path(LENS)), name_of(target_in(values))
@@ -72,5 +74,5 @@ def other_target(values: Values) -> str:
 
 
 def confirmed(values: Values) -> bool:
-    """Whether a person has said that these are two targets."""
+    """Whether a person has confirmed that these are two targets."""
     return bool(values["other_target"]) and values["other_target"] == other_target(values)

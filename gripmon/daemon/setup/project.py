@@ -36,7 +36,7 @@ from gripmon.model.targets import OtherSizeError, name_of, parse_target
 from gripmon.teach.messages import encoded
 
 SETUP, VIEW = "setup.yaml", "view.jpg"
-_FIRST_FRAME_S = 20
+_FIRST_FRAME_READS = 20
 """Number of reads, half a second each, within which the first image must arrive: network cameras take ten seconds to
 connect.
 """
@@ -44,8 +44,8 @@ Progress = Literal["done", "stale", "ready", "waits", "skipped"]
 
 
 class StepState(msgspec.Struct, frozen=True, kw_only=True):
-    """``progress`` "stale": an input is newer than the result; ``note``: why the step isn't done, in words; ``first``:
-    the step whose result it waits for.
+    """``progress`` "stale": an input is newer than the result, or it was made with another target; ``note``: why the
+    step isn't done, or the number of its images; ``first``: the step whose result it waits for.
     """
 
     name: str
@@ -57,7 +57,7 @@ class StepState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Project:
-    """The project in a ``folder``, which is created if missing, and is this process's working directory.
+    """The project in a ``folder``, which is created if missing and must be this process's working directory.
 
     Raises :class:`~gripmon.model.errors.InputError` if it can't be used.
     """
@@ -125,7 +125,7 @@ class Project:
         return [Line("nothing to do")] if words is None else self._command(words)
 
     def do_here(self, name: str, note: Callable[[str], object]) -> list[Line]:
-        """The same at a terminal: images are taken automatically, and ``note`` is called with the result for each."""
+        """As :meth:`do`, at a terminal: images are taken automatically; ``note`` is called with the result for each."""
         step = BY_NAME.get(name)
         if step is None:
             names = ", ".join(BY_NAME)
@@ -177,7 +177,7 @@ class Project:
     def _progress(self, step: Step, files: tuple[str, ...], *, needs_doing: bool) -> tuple[Progress, str]:
         inferred = step.name == "gripper" and self.values["gripper"] == entries.INFERRED
         if inferred or step.name in ("camera", "target"):
-            done = self._accepted.get(step.name) == self._said(step)
+            done = self._accepted.get(step.name) == self._answers(step)
             return ("done", "the step Hand and eye makes its file" if inferred else "") if done else ("ready", "")
         if not needs_doing:
             by = "intrinsics_by" if step.name == "plate" else "reference_by"
@@ -226,11 +226,11 @@ class Project:
         makers = [each for each in STEPS if name in written(each, self.values)]
         return name, makers[-1 if inferred else 0]
 
-    def _said(self, step: Step) -> str:
+    def _answers(self, step: Step) -> str:
         return "|".join(self.values[field.name] for field in step.fields)
 
     def _accept(self, name: str) -> None:
-        self._accepted[name] = self._said(BY_NAME[name])
+        self._accepted[name] = self._answers(BY_NAME[name])
         self._write()
 
     def _write(self) -> None:
@@ -252,7 +252,7 @@ class Project:
         source = self.open_camera("camera")
         why = "no image arrived"
         try:
-            for _ in range(_FIRST_FRAME_S):
+            for _ in range(_FIRST_FRAME_READS):
                 frame = source.read()
                 if frame is None:
                     break
@@ -325,9 +325,9 @@ class Project:
                 raise other
             return None
         path = Path(self.values["reference_file"])
-        text, said = reference_text(path)
+        text, summary = reference_text(path)
         write_atomically(self.folder / "hand_eye.yaml", text)
-        return [Line(said, "OK")]
+        return [Line(summary, "OK")]
 
     def _lens(self) -> list[Line] | None:
         if self.values["intrinsics_by"] != entries.FROM_FILE:

@@ -32,9 +32,10 @@ _PICTURE_PX = 1000
 _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor has this name", 130: "stopped"}
 
 
-class Seen(msgspec.Struct, frozen=True, kw_only=True):
-    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply; ``shown`` counts the pictures; ``lines``
-    of its log, the newest last; ``ended``: how it ended, None while it runs or if it was never started.
+class MonitorView(msgspec.Struct, frozen=True, kw_only=True):
+    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply, and ``bound`` on its position's error, as a
+    text; ``shown`` counts the pictures; ``lines`` of its log, the newest last; ``ended``: how it ended, None while it
+    runs or if it was never started.
     """
 
     running: bool
@@ -95,12 +96,12 @@ class MonitorProcess:
         for thread in self._threads:
             thread.join(_ANSWER_S + 1.0)
 
-    def seen(self) -> Seen:
+    def seen(self) -> MonitorView:
         """For the page."""
         process, record = self._process, self._record
         code = None if process is None else process.poll()
         bound = None if record is None else record.protection
-        return Seen(
+        return MonitorView(
             running=process is not None and code is None,
             ended=None if code is None else _ENDED.get(code, f"ended with exit code {code}"),
             verdict=None if record is None else record.verdict.value,

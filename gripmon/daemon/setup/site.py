@@ -12,31 +12,31 @@ from msgspec import Meta
 
 from gripmon import __version__
 from gripmon.daemon.setup import entries, steps
-from gripmon.daemon.setup.capture import Capture, Captured
+from gripmon.daemon.setup.capture import Capture, CaptureState
 from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.project import VIEW, Project, StepState
-from gripmon.daemon.setup.running import MonitorProcess, Seen
+from gripmon.daemon.setup.running import MonitorProcess, MonitorView
 from gripmon.daemon.setup.steps import STEPS, grippers
 from gripmon.daemon.teaching import outline_session, page_session, read_inputs
 from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.targets import OtherSizeError
-from gripmon.teach.messages import BadRequest, Nothing, Request
+from gripmon.teach.messages import BadRequest, EmptyRequest, Request
 from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite, web_files
 from gripmon.teach.session import TeachSession
 
 _Name = Annotated[str, Meta(max_length=40)]
-_Said = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
+_Answers = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
 _PICTURES = {
     VIEW: "image/jpeg", "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png",
     "target.pdf": "application/pdf",
 }  # fmt: skip
 
 
-class Do(Request, frozen=True):
+class StepRequest(Request, frozen=True):
     """Carry out a step with the values of its fields."""
 
     step: _Name
-    values: _Said = msgspec.field(default_factory=dict)
+    values: _Answers = msgspec.field(default_factory=dict)
 
 
 class CaptureOrder(Request, frozen=True):
@@ -44,7 +44,7 @@ class CaptureOrder(Request, frozen=True):
 
     step: _Name
     action: Literal["start", "stop", "by_itself", "by_hand", "take", "next", "drop"]
-    values: _Said = msgspec.field(default_factory=dict)
+    values: _Answers = msgspec.field(default_factory=dict)
     name: Annotated[str, Meta(max_length=200)] = ""
 
 
@@ -84,8 +84,8 @@ class SetupState(msgspec.Struct, frozen=True, kw_only=True):
     busy: str | None
     steps: tuple[StepCard, ...]
     capturing: str | None
-    capture: Captured | None
-    monitor: Seen
+    capture: CaptureState | None
+    monitor: MonitorView
 
 
 class SetupSite:
@@ -129,15 +129,15 @@ class SetupSite:
     def post(self, path: str) -> Action | None:
         page = self._page
         if path == "page/done":
-            return Nothing, lambda _: self._close_page()
+            return EmptyRequest, lambda _: self._close_page()
         if path.startswith("page/"):
             return None if page is None else page[0].post(path.removeprefix("page/"))
         actions: dict[str, Action] = {
-            "do": (Do, self._do),
+            "do": (StepRequest, self._do),
             "capture": (CaptureOrder, self._captured),
-            "open": (Do, self._open),
-            "start": (Nothing, lambda _: self._start()),
-            "stop": (Nothing, lambda _: self._monitor.stop()),
+            "open": (StepRequest, self._open),
+            "start": (EmptyRequest, lambda _: self._start()),
+            "stop": (EmptyRequest, lambda _: self._monitor.stop()),
         }
         return actions.get(path)
 
@@ -171,7 +171,7 @@ class SetupSite:
         )  # fmt: skip
 
     def _picture(self, step: steps.Step) -> str | None:
-        """With the time at which it was written, so that the browser asks for each anew."""
+        """Its address, with the time at which it was written, so that the browser loads every new one."""
         if step.picture is None:
             return None
         with contextlib.suppress(FileNotFoundError):
@@ -185,14 +185,14 @@ class SetupSite:
         return (*field.choices, *grippers())
 
     def _box(self, field: steps.Field) -> str | None:
-        """Empty where nothing is to be confirmed, or no target is known yet."""
+        """Text of the field's box; None for another field, empty if there is nothing to confirm or no target yet."""
         if field.asks is None:
             return None
         with contextlib.suppress(InputError):
             return field.asks(self._project.values)
         return ""
 
-    def _do(self, order: Do) -> None:
+    def _do(self, order: StepRequest) -> None:
         """Start a step; the state shows when and how it ends."""
         # Of the steps that take images only "standing" can be done without a camera.
         self._named(order.step, "form", *(("capture",) if order.step == "standing" else ()))
@@ -260,7 +260,7 @@ class SetupSite:
             raise BadRequest(str(error)) from None
         self._capture = step, capture
 
-    def _open(self, order: Do) -> dict[str, str]:
+    def _open(self, order: StepRequest) -> dict[str, str]:
         """Open a teaching page; return its address."""
         self._named(order.step, "page")
         self._keep(order.values)

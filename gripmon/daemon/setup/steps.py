@@ -35,7 +35,7 @@ from gripmon.model.targets import CircleGrid, name_of
 
 Kind = Literal["form", "capture", "page", "run"]
 DEFAULT_TARGET = name_of(CircleGrid(12, 10, 0.008, 0.004))
-"""Mostly light, so that dark fingers are visible before it, and small enough for A5."""
+"""Mostly light, so that dark fingers are visible in front of it, and small enough for A5."""
 _WITHOUT = "when teaching, less accurately"
 
 

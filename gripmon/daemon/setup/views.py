@@ -35,8 +35,9 @@ SIDES = ("right", "down", "left", "up")
 FEWEST_SIDES = 3
 """Minimum number of the four sides: tilts about one axis alone determine only one of fx and fy."""
 _FEATURES = 150
-_QUICK = 0.9
-"""Quantile of the features' motions: the background may move in a part of the image while the gripper stands still."""
+_MOTION_QUANTILE = 0.9
+"""Quantile of the features' motions that counts: the background may move in a part of the image while the gripper
+stands still."""
 
 
 class Coverage(msgspec.Struct, frozen=True):
@@ -107,7 +108,7 @@ def moved(before: Image, now: Image) -> float | None:
     if 2 * np.count_nonzero(good) < len(good):
         return None
     steps = np.linalg.norm(np.asarray(end)[good] - start[good], axis=-1)
-    return float(np.quantile(steps, _QUICK))
+    return float(np.quantile(steps, _MOTION_QUANTILE))
 
 
 def coverage(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Coverage:

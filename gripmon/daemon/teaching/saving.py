@@ -25,7 +25,7 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import ReferenceRecord
 from gripmon.teach.api import Picture, taught_model, to_yaml
-from gripmon.teach.messages import Put, Saved, SaveOrder, SavingRefused
+from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
@@ -65,7 +65,7 @@ class FileSaving:
         )
 
     def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
-        """As :class:`gripmon.teach.page.Saving`."""
+        """As :class:`gripmon.teach.session.Saving`."""
         paths = self._paths
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
@@ -97,7 +97,7 @@ class FileSaving:
         return Saved(written=written, notes=tuple(notes), next=follows)
 
     def _names_it_already(self, order: SaveOrder) -> bool:
-        """Whether a given configuration needs no change, which would only be to name the taught model."""
+        """Whether the given configuration stays as it is: it names a taught model already, or none is saved."""
         config = self._inputs.config
         return config is not None and (config.taught_path is not None or not order.taught)
 
@@ -244,7 +244,7 @@ def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[b
     found = setup.evaluate(picture.image, corners, (), picture.jaw_opening_m)
     if found.snapped.refused is not None:
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
-    put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
+    put = CornersRequest(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
 
     def save(replace: bool) -> Saved:
         order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=replace)

@@ -28,7 +28,7 @@ from gripmon.teach.session import Evaluation
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
 _JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or ros2_joint_state"
-_AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
+_DEFAULT_SECTIONS = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
 
 
 def config_text(
@@ -159,6 +159,6 @@ def _defaults() -> str:
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
     ]
     for field in msgspec.structs.fields(Settings):
-        if field.name in _AS_THEY_ARE:
+        if field.name in _DEFAULT_SECTIONS:
             lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
     return "\n".join(lines)

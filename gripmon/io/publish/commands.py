@@ -153,7 +153,7 @@ class ZenohCommands:
         key = str(query.key_expr)
         try:
             error = self._queue(query, key)
-        except Exception as fault:  # noqa: BLE001  as just said
+        except Exception as fault:  # noqa: BLE001  see above
             _log.debug("command on %s", key, exc_info=fault)
             error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
         if error is not None:

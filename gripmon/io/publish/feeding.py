@@ -135,5 +135,6 @@ def raw_encoding(image: Image) -> str:
     """The name of an array's pixel format; ValueError for an array that has none."""
     encoding = _RAW.get((image.ndim, image.dtype.name))
     if encoding is None or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"no image: shape {image.shape}, {image.dtype}; H x W or H x W x 3, uint8 or uint16")
+        right = "H x W or H x W x 3, uint8 or uint16; or H x W, float32"
+        raise ValueError(f"no image: shape {image.shape}, {image.dtype}; {right}")
     return encoding

@@ -32,14 +32,14 @@ MOST_REPORTS = 2048
 """Number of reports kept, for images older than the newest report: two seconds at 1 kHz."""
 
 
-class Reported(NamedTuple):
+class ReportedOpening(NamedTuple):
     """An opening, and when the robot measured it (Unix ns; 0 if unknown)."""
 
     stamp_ns: int
     opening_m: float
 
 
-DecodeOpening = Callable[[bytes], Reported | None]
+DecodeOpening = Callable[[bytes], ReportedOpening | None]
 """Decodes an opening from a payload; None if the message is about something else.  Raises :class:`JawError`."""
 
 
@@ -51,12 +51,12 @@ class StampedOpenings:
     """Reports in order of their stamps, for interpolating the opening at a given time."""
 
     def __init__(self) -> None:
-        self._reports: list[tuple[Reported, float]] = []
+        self._reports: list[tuple[ReportedOpening, float]] = []
 
     def __len__(self) -> int:
         return len(self._reports)
 
-    def add(self, report: Reported, arrival_s: float, max_age_s: float) -> None:
+    def add(self, report: ReportedOpening, arrival_s: float, max_age_s: float) -> None:
         """Keep a report; drop those that arrived more than ``max_age_s`` before it (``arrival_s``: monotonic), and all
         reports if the robot's clock was set back by more than that.
         """
@@ -216,15 +216,15 @@ def _bounded(payload: zenoh.ZBytes) -> bytes:
     return payload.to_bytes()
 
 
-def opening_of_json(payload: bytes) -> Reported:
+def opening_of_json(payload: bytes) -> ReportedOpening:
     """Decode ``{"stamp_ns": …, "opening_m": …}``, or a bare number (m).  Raises :class:`JawError`."""
     try:
         if payload[:64].lstrip()[:1] == b"{":
             reading = from_json(payload, JawReading)
-            return Reported(reading.stamp_ns, reading.opening_m)
+            return ReportedOpening(reading.stamp_ns, reading.opening_m)
         if len(payload) > largest_bytes(JawReading):
             raise JawError(f"{len(payload)} bytes; a number, or at most {largest_bytes(JawReading)} bytes of JSON")
-        return Reported(0, _decode_number(payload))
+        return ReportedOpening(0, _decode_number(payload))
     except MessageRefused as error:
         raise JawError(str(error)) from None
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -234,11 +234,11 @@ def opening_of_json(payload: bytes) -> Reported:
 def opening_of_joints(joints: JointOpening) -> DecodeOpening:
     """Return a decoder of ``sensor_msgs/JointState`` (CDR); it ignores messages that are only about other joints."""
 
-    def decode(payload: bytes) -> Reported | None:
+    def decode(payload: bytes) -> ReportedOpening | None:
         try:
             stamp_ns, positions = decode_joint_state(payload)
             opening_m = joints.opening_m(positions)
-            return None if opening_m is None else Reported(stamp_ns, opening_m)
+            return None if opening_m is None else ReportedOpening(stamp_ns, opening_m)
         except MessageError as error:
             raise JawError(str(error)) from None
 

@@ -64,12 +64,12 @@ class Presence:
         """
         if not self._connected():
             return ()
-        end_s, said = time.monotonic() + timeout_s, False
+        end_s, logged = time.monotonic() + timeout_s, False
         while others := self._look():
             if time.monotonic() >= end_s:
                 return others
-            if not said:
-                said = True
+            if not logged:
+                logged = True
                 _log.warning("%s; waiting up to %g s for it to vanish", in_words(others), timeout_s)
             time.sleep(_LOOK_EVERY_S)
         return ()

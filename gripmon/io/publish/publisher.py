@@ -128,7 +128,7 @@ class ZenohPublisher(_ZenohStates):
 class ZenohSpotPublisher(_ZenohStates):
     """Publishes a second camera's records over a link, which it closes in the end.
 
-    While the link is not open yet, the last state, spots and alerts, the last few, are kept for its opening.
+    While the link is not open yet, the last state and the last few spots and alerts are kept for its opening.
     """
 
     def spot(self, record: SpotRecord) -> None:
@@ -303,7 +303,7 @@ class Publishers(Publisher):
             return
         try:
             put(*values)
-        except Exception as error:  # noqa: BLE001  said here and in the state
+        except Exception as error:  # noqa: BLE001  logged here, and reported in the state
             text = f"{name} fails: {one_line(error)}"
             if self._faults.get((name, what)) != text:
                 _log.error("%s", text)

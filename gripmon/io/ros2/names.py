@@ -22,7 +22,7 @@ MOST_DOMAIN_ID = 232
 
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv)/([A-Z][A-Za-z0-9]*)")
-_UNTOLD_DEPTH = 42  # rmw_zenoh's value for an unset depth, which it omits
+_UNSET_DEPTH = 42  # rmw_zenoh's value for an unset depth, which it omits
 
 EndpointKind = Literal["MP", "MS"]
 
@@ -45,7 +45,7 @@ class Qos:
         """
         reliability = "" if self.reliable else "2"
         durability = "1" if self.transient_local else ""
-        depth = "" if self.depth == _UNTOLD_DEPTH else self.depth
+        depth = "" if self.depth == _UNSET_DEPTH else self.depth
         return f"{reliability}:{durability}:,{depth}:,:,:,,"
 
 
@@ -277,8 +277,8 @@ def layout_of(settings: Ros2Settings, robot: str, camera: str) -> Layout:
 def network_of(publish: PublishSettings, ros2: Ros2Settings) -> PublishSettings:
     """How to join the network: as client of the ROS 2 router, unless ``publish`` has network settings."""
     defaults = PublishSettings()
-    said = any(getattr(publish, key) != getattr(defaults, key) for key in ("mode", "listen", "connect", "zenoh_config"))
-    if not ros2.enabled or ros2.router is None or said:
+    own = any(getattr(publish, key) != getattr(defaults, key) for key in ("mode", "listen", "connect", "zenoh_config"))
+    if not ros2.enabled or ros2.router is None or own:
         return publish
     return msgspec.structs.replace(publish, mode="client", connect=(ros2.router,))
 

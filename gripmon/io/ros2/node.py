@@ -58,7 +58,7 @@ def typestore() -> Typestore:
     Raises :class:`Ros2Missing`.
     """
     try:
-        import xxhash  # noqa: F401  both come with the same extra: said at the start, not at the first node
+        import xxhash  # noqa: F401  both come with the same extra: reported at the start, not at the first node
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise Ros2Missing(f"needs the package {error.name}; pip install -e '.[ros2]' in gripmon's checkout") from error
@@ -79,7 +79,7 @@ def prepare(*type_names: str) -> None:
 
 
 _ids = itertools.count()
-"""Nodes, publishers and subscriptions of a session share one row of numbers; ours are unique in the process."""
+"""Nodes, publishers and subscriptions of a session share one sequence of numbers; ours are unique in the process."""
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
@@ -193,8 +193,8 @@ class Listeners:
                 if domain_id not in self._nodes:
                     self._nodes[domain_id] = Node(session, domain_id, self._name)
                 self._nodes[domain_id].declare("MS", topic, type_name, _SENSOR_DATA)
-        except Exception as error:  # noqa: BLE001  who listens hears nevertheless
-            _log.warning("ROS 2 won't know that %s is listened to: %s", topic, error)
+        except Exception as error:  # noqa: BLE001  the subscribers work nevertheless
+            _log.warning("ROS 2 tools won't list the subscription to %s: %s", topic, error)
             self._leave()
 
     def _leave(self) -> None:
@@ -333,5 +333,5 @@ def _decoded(type_name: str, payload: bytes, most_bytes: int) -> Any:
 
 def _stamp_ns(type_name: str, stamp: Any) -> int:
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
-        raise MessageError(type_name, "header.stamp", f"{stamp.sec} s and {stamp.nanosec} ns is no time")
+        raise MessageError(type_name, "header.stamp", f"{stamp.sec} s and {stamp.nanosec} ns isn't a time")
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)

@@ -122,8 +122,8 @@ def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
 
 def summary_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> str:
     """One line of text."""
-    said = [f"{state.state}, transform {state.verdict}", state.message, *(alert.text for alert in alerts)]
-    return "; ".join(part for part in said if part)
+    parts = [f"{state.state}, transform {state.verdict}", state.message, *(alert.text for alert in alerts)]
+    return "; ".join(part for part in parts if part)
 
 
 def values_of(
@@ -303,7 +303,7 @@ class Ros2Publisher(Publisher):
                 node.publisher(layout.pose_topic, POSE, priority=priority),
                 node.publisher(layout.diagnostics_topic, DIAGNOSTICS),
             )
-        except Exception as error:  # noqa: BLE001  said with the next record
+        except Exception as error:  # noqa: BLE001  reported with the next record
             self._fault = f"the ROS 2 node could not be declared: {error}"
             _log.debug("%s", self._fault, exc_info=error)
             if node is not None:

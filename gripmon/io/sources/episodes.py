@@ -125,8 +125,8 @@ def _list(names: Sequence[str]) -> str:
 
 
 def _version(files: list[dict[str, Any]]) -> str:
-    said = [[one.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")] for one in files]
-    return str(hash_of(said))
+    properties = [[one.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")] for one in files]
+    return str(hash_of(properties))
 
 
 def hash_of(value: Any) -> str:

@@ -97,7 +97,7 @@ def open_dataset(path: str) -> LeRobotDataset:
     except (KeyError, ValueError, TypeError) as error:
         if isinstance(error, SourceError):
             raise
-        raise SourceError(f"path: {path} is no LeRobot dataset ({one_line(error):.200}); a whole one") from None
+        raise SourceError(f"path: {path} isn't a LeRobot dataset ({one_line(error):.200}); a complete one") from None
     return LeRobotDataset(path, info, {int(row["episode_index"]): row for row in episodes})
 
 

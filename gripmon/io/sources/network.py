@@ -112,9 +112,9 @@ class PayloadDecoder:
     def _kind(self, payload: bytes, encoding: str, note: FrameNote) -> Literal["raw", "jpeg", "png"]:
         if self._format in ("raw", "jpeg", "png"):
             return self._format
-        said = encoding.partition(";")[0]
-        if said in ("image/jpeg", "image/png"):
-            return "jpeg" if said == "image/jpeg" else "png"
+        media_type = encoding.partition(";")[0]
+        if media_type in ("image/jpeg", "image/png"):
+            return "jpeg" if media_type == "image/jpeg" else "png"
         if note.width is None and payload.startswith(JPEG):
             return "jpeg"
         if note.width is None and payload.startswith(PNG):
@@ -198,7 +198,7 @@ class NetworkCamera:
         while (arrival := self._take(deadline_s)) is not None:
             try:
                 content = self._content(arrival.sample)
-            except Exception as error:  # noqa: BLE001  whatever a stranger sends, it must not end the monitor
+            except Exception as error:  # noqa: BLE001  malformed input from anyone must not end the monitor
                 if not isinstance(error, PayloadError):
                     _log.debug("a payload on %s", self.key, exc_info=error)
                 fault = str(error) or type(error).__name__
@@ -295,8 +295,8 @@ class NetworkCamera:
 
     def _why_silent(self) -> str:
         network = self._link.fault()
-        said = f"{self.key} is silent" if self._last_arrival_s is not None else f"nothing on {self.key} yet"
-        return f"{said} ({network})" if network else said
+        silence = f"{self.key} is silent" if self._last_arrival_s is not None else f"nothing on {self.key} yet"
+        return f"{silence} ({network})" if network else silence
 
 
 def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:

@@ -188,7 +188,7 @@ class _Renderer:
             name=f"gripmon-simulator-{schedule.first}",
             daemon=True,
         )
-        _start_deaf_to_signals(self._process)
+        _start_with_signals_blocked(self._process)
         announce.close()
         commands.close()
 
@@ -250,7 +250,7 @@ class _Ring:
         return image if self._marks[slot] == index else None
 
 
-def _start_deaf_to_signals(process: Any) -> None:
+def _start_with_signals_blocked(process: Any) -> None:
     """Ctrl-C reaches the whole process group, but only the parent may end a renderer."""
     resource_tracker.ensure_running()  # starting it later would undo the mask
     former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))

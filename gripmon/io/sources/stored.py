@@ -59,7 +59,7 @@ def there(path: str) -> bool:
     try:
         system, inside = file_system(path)
         return bool(system.exists(inside))
-    except Exception:  # noqa: BLE001  each store has its own; whoever opens it is told
+    except Exception:  # noqa: BLE001  each store has its own; opening it reports why
         return False
 
 

@@ -19,7 +19,7 @@ from gripmon.io.wire.session import (
     in_short,
     load_file,
     open_session,
-    said,
+    value_of,
     zenoh_config,
 )
 
@@ -55,7 +55,7 @@ class Link:
         self._next_look_s = 0.0
         config = zenoh_config(settings, relative_to)
         self._opening_s = 1e-3 * float(config.get_json("transport/unicast/open_timeout"))
-        self._is_client = said(config, "mode") == "client"
+        self._is_client = value_of(config, "mode") == "client"
         self._endpoints = endpoints(config, "connect")
         if self._is_client:
             self._fault = "no Zenoh session yet"
@@ -136,7 +136,7 @@ class Link:
             for each in declare:
                 try:
                     each(session)
-                except Exception as error:  # noqa: BLE001  one that can't be declared is no reason to drop the others
+                except Exception as error:  # noqa: BLE001  one that can't be declared must not affect the others
                     _log.error("something could not be declared on the Zenoh session: %s", error)
             self._session, self._fault = session, ""
             self._next_look_s = time.monotonic() + _LOOK_EVERY_S
@@ -207,9 +207,9 @@ class Router:
         import zenoh
 
         config = load_file(path, default_mode="router")
-        if (mode := said(config, "mode")) != "router":
+        if (mode := value_of(config, "mode")) != "router":
             raise ZenohFileError(f"{path}: mode: {mode} doesn't route; router")
-        self.listens_on = _endpoints(said(config, "listen/endpoints"))
+        self.listens_on = _endpoints(value_of(config, "listen/endpoints"))
         if not self.listens_on:
             raise ZenohFileError(f'{path}: listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]')
         if fault := endpoints_fault(config):
@@ -302,9 +302,9 @@ class Malformed:
                 self._reason = self._examples[self._kinds.most_common(1)[0][0]]
             is_new = kind not in self._logged
             self._logged.add(kind)
-            said = f"malformed {self._what} on {self._key}: {_for_people(reason)}"
+            message = f"malformed {self._what} on {self._key}: {_for_people(reason)}"
         if is_new:
-            _log.warning("%s (said once)", said)
+            _log.warning("%s (logged once)", message)
 
     def _kind(self, reason: str) -> str:
         """The kind of a reason: its text without figures, or "any other" if there are too many kinds."""

@@ -35,7 +35,7 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
     if settings.zenoh_config is not None:
         for key in ("mode", "listen", "connect", "multicast_scouting"):
             if getattr(settings, key) != getattr(defaults, key):
-                raise PublishError(key, "has no effect beside publish.zenoh_config; say it in that file")
+                raise PublishError(key, "has no effect beside publish.zenoh_config; set it in that file")
         path = relative_to / settings.zenoh_config
         try:
             config = load_file(path)
@@ -98,7 +98,7 @@ def joining(settings: PublishSettings, relative_to: Path = Path()) -> Joining:
     """The result of :func:`zenoh_config`, without a session.  Raises :class:`PublishError`."""
     config = zenoh_config(settings, relative_to)
     file = None if settings.zenoh_config is None else str(relative_to / settings.zenoh_config)
-    return Joining(str(said(config, "mode")), endpoints(config, "listen"), endpoints(config, "connect"), file)
+    return Joining(str(value_of(config, "mode")), endpoints(config, "listen"), endpoints(config, "connect"), file)
 
 
 def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:
@@ -208,7 +208,7 @@ def check_name(role: str, name: str) -> str:
 def check_key(key: str) -> str:
     """The key; raises ValueError if it is invalid or a pattern, which might match several monitors' keys."""
     if not re.match(KEY_PATTERN, key):
-        raise ValueError(f"key {key!r} is none; names with / between them, none empty, without * $ # ? or blanks")
+        raise ValueError(f"key {key!r} isn't a key; names with / between them, none empty, without * $ # ? or blanks")
     return key
 
 
@@ -260,17 +260,17 @@ def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
             right = "one of Zenoh's, as those in configs/zenoh are"
             raise ZenohFileError(f"{path}: this is gripmon's configuration, not Zenoh's; {right}") from error
         raise ZenohFileError(f"{path}: {in_short(error)}") from error
-    if said(config, "mode") is None:
+    if value_of(config, "mode") is None:
         config.insert_json5("mode", _json(default_mode))
-    if said(config, "listen/endpoints") == said(zenoh.Config(), "listen/endpoints"):
+    if value_of(config, "listen/endpoints") == value_of(zenoh.Config(), "listen/endpoints"):
         config.insert_json5("listen/endpoints", "[]")
-    if said(config, "scouting/multicast/enabled") is None:
+    if value_of(config, "scouting/multicast/enabled") is None:
         config.insert_json5("scouting/multicast/enabled", "false")
     _find_tls_files(config, path)
     return config
 
 
-def said(config: zenoh.Config, key: str) -> object:
+def value_of(config: zenoh.Config, key: str) -> object:
     """The value of a key, as plain Python values."""
     return msgspec.json.decode(config.get_json(key))
 
@@ -284,7 +284,7 @@ def _is_gripmons(path: Path) -> bool:
 def _find_tls_files(config: zenoh.Config, path: Path) -> None:
     for name in _TLS_FILES:
         key = f"{_TLS}/{name}"
-        value = said(config, key)
+        value = value_of(config, key)
         if not isinstance(value, str):
             continue
         file = path.parent / value
@@ -331,8 +331,8 @@ def in_short(error: zenoh.ZError) -> str:
     for form in (_PARSER, _SCANNER, _MESSAGE):
         if found := form.fullmatch(text):
             place = f"line {found['line']}, column {found['column']}: " if found["line"] else ""
-            said = re.sub(r"expected struct \w+", "a mapping was expected", found["text"].replace('\\"', '"'))
-            return place + " ".join(said.split())
+            message = re.sub(r"expected struct \w+", "a mapping was expected", found["text"].replace('\\"', '"'))
+            return place + " ".join(message.split())
     if found := _UNREACHED.search(text):
         return _unreached(found["ends"])
     return " ".join(text.split())
@@ -357,9 +357,9 @@ _LARGEST_PORT = 65535
 
 def endpoints(config: zenoh.Config, which: str) -> tuple[str, ...]:
     """The endpoints that a session of this configuration has, of ``listen`` or ``connect``."""
-    listed = said(config, f"{which}/endpoints")
+    listed = value_of(config, f"{which}/endpoints")
     if isinstance(listed, dict):  # a list for each mode
-        listed = listed.get(said(config, "mode") or "peer")
+        listed = listed.get(value_of(config, "mode") or "peer")
     # Zenoh also allows an object here: {"endpoints": [...], "policy": ...}; only Zenoh interprets it.
     return tuple(each for each in listed if isinstance(each, str)) if isinstance(listed, list) else ()
 
@@ -400,4 +400,4 @@ def endpoints_fault(config: zenoh.Config) -> tuple[str, str] | None:
 def _has_certificate(config: zenoh.Config) -> bool:
     names = ("listen_private_key", "listen_certificate")
     # The last two forms hold the thing itself instead of a file's name.
-    return all(any(said(config, f"{_TLS}/{name}{form}") for form in ("", "_base64")) for name in names)
+    return all(any(value_of(config, f"{_TLS}/{name}{form}") for form in ("", "_base64")) for name in names)

@@ -29,9 +29,9 @@ from gripmon.teach.cad.written import gripper_text, model_of
 
 FORMATS = (*MESHES, ".urdf", ".cao")
 LONGEST_M = 0.3
-"""A finger that is longer than that is an arm, or in another unit."""
+"""Largest length of a finger: a longer one is an arm, or in another unit."""
 SHORTEST_M = 0.005
-"""One that is shorter spans some tens of pixels before a wrist camera at most, or is in another unit: that is said."""
+"""A finger shorter than this spans a few tens of pixels at most, or is in another unit: it gets a note."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def gripper_from_cad(
     of two fingers move by half of the opening each; a URDF has its own motion (``joint``: its name, if several are
     possible).  ``jaw_opening_m`` is what a robot reports for the fingers as drawn; the distance of the tips if None.
     ``length_m``: the length of the fingers to use, from the tips.  ``bevel_m``: width of the bevels on real edges that
-    are sharp in the CAD; 0 only for edges sharper than 0.02 mm, since what isn't stated is in no bound.
+    are sharp in the CAD; 0 only for edges sharper than 0.02 mm, since protection levels include only what is stated.
 
     Convex fingers with flat faces are valid for every view.  Others need ``camera`` and ``cam_T_grip`` (4, 4), and are
     made for that view.  :class:`~gripmon.model.errors.InputError` says what can't be used, and what can.
@@ -180,11 +180,11 @@ def _check(frame: str, approach: str | None, unit: str | None, length_m: float |
             f"{length_m:g}: is measured from the tips backwards, along z; not with the CAD's own frame", "length"
         )
     if length_m is not None and not 0.0 < length_m <= LONGEST_M:
-        raise InputError(f"{length_m:g} m: is no length of a finger; metres, as 0.04", "length")
+        raise InputError(f"{length_m:g} m: is not a finger's length; metres, such as 0.04", "length")
     if unit is not None and unit not in UNITS_M:
         raise InputError(f"'{unit}' is not a unit; one of {', '.join(UNITS_M)}", "unit")
     if not 0.0 <= bevel_m <= WIDEST_BEVEL_M:
-        raise InputError(f"{bevel_m:g} m: is no width of a bevel; 0 to {WIDEST_BEVEL_M:g} m", "bevel")
+        raise InputError(f"{bevel_m:g} m: is not a bevel's width; 0 to {WIDEST_BEVEL_M:g} m", "bevel")
 
 
 def _read(files: Sequence[str | PathLike[str]], unit: str | None, joint: str | None, progress: Progress) -> Parts:

@@ -22,7 +22,8 @@ Key = tuple[int, int, int]
 class Pieces:
     """Straight pieces of lines: ends ``points_m`` (n, 2, 3) with ``keys`` (n pairs, equal where two pieces meet);
     ``crease`` (n,): whether the body is seen on both sides; ``centre_m`` (n, 2, 3): centre of the rounding at each end,
-    NaN on a sharp edge; ``wanders`` (n,): whether it is the outline of a round part, which moves with the view.
+    NaN on a sharp edge; ``wanders`` (n,): whether it is the outline of a round part, which moves over it as the view
+    changes.
     """
 
     points_m: Array

@@ -18,7 +18,7 @@ CELLS = 2
 """Cells per pixel."""
 
 HIDDEN_M = 1e-4
-"""Distance behind a surface from which something is hidden by it."""
+"""A point farther than this behind a surface is hidden by it."""
 
 _NEAREST_M = 1e-3
 _OUTSIDE = 0.25  # margin kept on each side, over the image's size
@@ -74,7 +74,9 @@ class DepthMap:
         self._farthest = np.min(shifts, axis=0)
 
     def visible(self, points_grip_m: Array) -> NDArray[np.bool_]:
-        """Mask (n,) of visible points on the surfaces: not all of the nine cells around have something in front."""
+        """Mask (n,) of the points (n, 3) that are visible: those without a surface in front in some of the nine cells
+        around.  False outside of the view.
+        """
         px, depth = self._view.project(points_grip_m)
         cells = np.rint(np.nan_to_num(self._cells(px), nan=-1e6)).astype(int)
         rows, columns = self._inverse.shape

@@ -13,7 +13,7 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.surface import Surface
 
 TIP_M = 1e-4
-"""Corners this far behind the foremost one are at the tip, too: the tolerance of a gripper model for equal z."""
+"""Corners up to this far behind the foremost one are at the tip, too: a gripper model's tolerance for equal z."""
 
 AXES = {sign + name: scale * np.eye(3)[k] for k, name in enumerate("xyz") for sign, scale in (("+", 1.0), ("-", -1.0))}
 SNAP_COSINE = 0.985
@@ -55,9 +55,10 @@ def approach_of(fingers: Sequence[Surface], around: Sequence[Surface]) -> str:
 
 def inner_tip(surface: Surface, grip_R_cad: Array, towards: float) -> tuple[Array, int]:
     """The mean (3,) of a fingertip's two innermost corners, gripper axes, and the number of corners used; ``towards``
-    is the sign of x towards the other finger, 0 for a single finger.
+    is the sign of x towards the other finger, 0 for a single finger: then the middle of all corners at its tip.
 
-    Without sharp corners: the innermost x, the mean y and the foremost z of the foremost millimetre.
+    With fewer than two corners at the tip: of its foremost millimetre the innermost x (of a single finger the middle),
+    the middle y and the foremost z.
     """
     sharp = np.unique(surface.edges[surface.sharp])
     places = surface.points_m @ grip_R_cad.T

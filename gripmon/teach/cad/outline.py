@@ -27,20 +27,21 @@ STEP_PX = 0.5
 """Distance of the points at which a curve is sampled."""
 
 STRAIGHT_PX = 0.03
-"""Largest distance from its chord of a straight part, over at least :data:`LONG_PX`: a circle of 2400 px has it."""
+"""Largest distance of a straight part from its chord, which is at least :data:`LONG_PX` long: a circle of 2400 px
+radius deviates by as much."""
 
 LONG_PX = 24.0
 
 VIA_PX = 6.0
-"""Distance of the points through which a curve is laid: a cubic spline then differs from a circle of 16 px by 0.001 px.
-"""
+"""Distance of the points through which a curve passes: a cubic spline then differs from a circle of 16 px radius by
+0.001 px."""
 
 SHADED_PX = 0.1
 """Standard deviation of the observed outline of a round part, since its shade changes towards it.  In pictures of tips
 of 2 to 8 mm, rendered with a lamp from the side, outlines were 0.05 to 0.17 px off."""
 
 SHORTEST_PX = 8.0
-"""Shortest single edge: what the monitor samples at least.  A shorter one only joins two others: a bridge."""
+"""Shortest edge that the monitor samples.  A shorter one is kept only where it joins two others: a bridge."""
 
 SHORTEST_M = 1e-4  # of a gripper file's edges
 
@@ -48,7 +49,7 @@ TURN_RAD = 0.524
 """Turn (30 degrees) within a few pixels above which a curve has a corner there."""
 
 LARGEST_GAP_PX = 8.0
-"""The part of two edges near their corner that the monitor doesn't sample; a tighter curve between them is ignored."""
+"""Largest gap over which two straight edges are extended to a corner: the monitor doesn't sample so close to one."""
 
 MOST_VIA = 62  # of a gripper file
 _AROUND_PX = 3.0

@@ -48,7 +48,7 @@ class _Joint:
 
 
 @dataclass(frozen=True, slots=True)
-class Moving:
+class LinkGroup:
     """A group of links that move together: ``body`` in the base's frame at the middle of the joint's range, ``path_m``
     (s, 3) its shifts from there, and ``turns_rad``, its largest turn over the range.
     """
@@ -62,7 +62,7 @@ class Moving:
 class Linkage:
     """A URDF gripper: the bodies that the joint moves, the fixed one (``base``), and the driving ``joint``."""
 
-    moving: list[Moving]
+    moving: list[LinkGroup]
     base: Body | None
     joint: str
     notes: list[str] = field(default_factory=list)
@@ -177,7 +177,8 @@ class _Reader:
 
 
 def read_urdf(path: Path, joint: str | None) -> Linkage:
-    """Read a URDF's gripper, moved by ``joint`` (None: the only one that moves something and follows no other).
+    """Read a URDF's gripper, moved by ``joint``.  None: by the only joint that moves and mimics no other, or by two
+    such joints of one kind and range on one link, together.
 
     Raises :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which one opens the jaws.
     """
@@ -206,14 +207,14 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
             continue
         turned = Rotation.from_matrix(way[:, :3, :3]) * Rotation.from_matrix(way[STEPS // 2, :3, :3]).inv()
         turns_rad = float(turned.magnitude().max())
-        moving.append(Moving(body, way[:, :3, 3] - way[STEPS // 2, :3, 3], turns_rad))
+        moving.append(LinkGroup(body, way[:, :3, 3] - way[STEPS // 2, :3, 3], turns_rad))
     if not moving:
         raise reader.refuse(f"joint '{driving.name}'", "moves no link that has a geometry; the joint of the jaws")
     return Linkage(moving, base, driving.name)
 
 
 def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_Joint, dict[str, float]]:
-    """The jaws' joint, and each driving joint's value over its value: two equal ones move together."""
+    """The jaws' joint, and the joints driven with it, by name: the ratio of their values to its value."""
     free = [j for j in joints if j.kind != "fixed" and j.mimic is None]
     if name is not None:
         chosen = [j for j in free if j.name == name]

@@ -78,7 +78,7 @@ def _lines(model: GripperModel, notes: Sequence[str]) -> Iterator[str]:
     yield f"# Gripper '{model.name}', made from CAD by gripmon gripper from-cad."
     for note in notes:
         yield f"# {note}"
-    yield "# Gripper frame, metres: origin at the TCP, x across the jaws, z out of it; or as is said above."
+    yield "# Gripper frame, metres: origin at the TCP, x across the jaws, z out of it, unless a note above differs."
     yield f"name: {_flow(model.name)}  # any text; appears in recordings"
     if model.jaw is not None:
         yield "jaw:"
@@ -90,11 +90,11 @@ def _lines(model: GripperModel, notes: Sequence[str]) -> Iterator[str]:
         motion = {} if finger.motion is None else {"motion": finger.motion}
         yield f"  {_flow(name)}: {_flow(motion)}"
     yield "points:  # x, y, z (m) at the nominal opening; `corner: true`: measured as a fingertip corner"
-    yield "  # `round`: on the outline of what is round about an axis, over which it wanders as the view changes"
+    yield "  # `round`: on the outline of a part that is round about an axis; it moves over it as the view changes"
     for name, point in model.points.items():
         yield f"  {_flow(name)}: {_flow(_without_defaults(point))}"
     yield "edges:  # between two points, straight, or curved through the points `via`; `kind`: where faces don't say,"
-    yield "  # `bevel_m`: width of a bevel or rounding, in which an untaught edge shows anywhere (m, default 0)"
+    yield "  # `bevel_m`: width of a bevel or rounding; an untaught edge may appear anywhere in it (m, default 0)"
     for name, edge in model.edges.items():
         yield f"  {_flow(name)}: {_flow(_without_defaults(edge))}"
     if model.faces:
