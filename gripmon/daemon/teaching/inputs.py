@@ -29,9 +29,10 @@ from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, Source
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
+from gripmon.model.images import image_in
 from gripmon.model.records import ReferenceRecord, Transform, to_json
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.api import Picture, read_any, read_picture
+from gripmon.teach.api import Picture, read_picture
 from gripmon.teach.corner_pose import CameraError, corners_fault
 from gripmon.teach.outlines import RoughCorners
 from gripmon.teach.page_server import OutlineSession
@@ -136,7 +137,7 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
 def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
-    shown, target = read_any(image), None
+    shown, target = image_in(image), None
     if camera is not None:
         with contextlib.suppress(ConfigError):  # read_lens reports what is wrong
             target = read_yaml(camera).get("target")

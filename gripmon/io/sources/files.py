@@ -116,6 +116,13 @@ def read_table(path: Path) -> dict[str, TableRow]:
         raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
 
 
+def opening_beside(path: Path) -> float | None:
+    """An image's jaw opening (m) in the ``timestamps.csv`` beside it, None if unknown.  Raises :class:`SourceError`."""
+    table = path.parent / TIMESTAMPS_NAME
+    row = read_table(table).get(path.name) if table.exists() else None
+    return None if row is None else row.jaw_opening_m
+
+
 def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
     header = tuple(cell.strip() for cell in next(lines, []))
     if header not in (COLUMNS[:2], COLUMNS):
