@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from gripmon.io.sources.base import SourceError, Stored
-from gripmon.model.images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
-from gripmon.model.images import natural_key as natural_key
-from gripmon.model.images import read_image as read_image
-from gripmon.model.images import regular_bytes
+from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image, regular_bytes
 from gripmon.model.records import Frame
 from gripmon.model.records.values import NS_PER_S
 
