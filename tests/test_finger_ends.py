@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import msgspec
@@ -19,6 +20,10 @@ from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.edges.roles import along_fingers
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+
+from benchmarks.outline_seen import outline_seen
 
 PLAIN = plain_scenario()
 CUBE = Path(__file__).parent.parent / "configs" / "grippers" / "visp_cube.yaml"
@@ -97,7 +102,7 @@ def test_a_bar_before_the_tips_with_its_rim_parallel_to_them_proves_nothing(
 ):
     """Wherever along the fingers they are expected: one of these places has the tips on the bar's rim."""
     scenario = bar_before_the_tips(z_m, size_z_m, level_dn)
-    assert simulator(scenario).outline_seen(0).tips.max() < 0.7, "it hides them"
+    assert outline_seen(simulator(scenario), 0).tips.max() < 0.7, "it hides them"
     for slide_m in np.linspace(-0.03, 0.012, 15).tolist():
         _, ends = looked_at(scenario, slide_m)
         assert not ends.sure and ends.seen.max() < 2

@@ -72,7 +72,7 @@ class Bench:
         self.settings = DaemonSettings(**{"state_period_s": NEVER, "stale_after_s": NEVER, **settings})  # type: ignore[arg-type]
         self.network, self.recording = SpotListener(), SpotListener()
         self.pulsed = PulsedWatch(
-            read_laser(Path("test"), cell().folder / "laser.yaml"), SpotWatchSettings(), PulseSettings(margin_s=0.02)
+            read_laser(cell().folder / "laser.yaml"), SpotWatchSettings(), PulseSettings(margin_s=0.02)
         )
         self._rng = np.random.default_rng(3)
         self._seq = 0

@@ -554,7 +554,7 @@ def _started_and_stopped(site: SetupSite, folder: Path) -> None:
     _sent(site, "stop", EmptyRequest())
     assert (site.state().monitor.running, site.state().monitor.ended) == (False, "stopped")
     (folder / "config.yaml").write_text("robot: [\n")
-    with pytest.raises(BadRequest, match=r"config\.yaml"):
+    with pytest.raises(InputError, match=r"config\.yaml"):
         _sent(site, "start", EmptyRequest())
 
 

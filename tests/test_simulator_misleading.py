@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -19,6 +22,10 @@ from gripmon.simulate.scenario import (
     Prop,
     Shadow,
 )
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+
+from benchmarks.outline_seen import outline_seen
 
 
 def fingers(**changes: object):
@@ -110,21 +117,21 @@ def test_a_bar_behind_the_tips_ends_at_its_offset_and_hides_nothing() -> None:
     low, high = pixel(sim, (0.0, 0.005, 0.015)), pixel(sim, (0.0, -0.005, 0.015))
     assert min(low[1], high[1]) - 1.0 <= at[1] <= max(low[1], high[1]) + 1.0
     assert Hidden.OBJECT not in sim.truth(0).hidden
-    seen = sim.outline_seen(0)
+    seen = outline_seen(sim, 0)
     np.testing.assert_allclose([seen.tips, seen.edges], 1.0)
 
 
 def test_a_bar_before_the_tips_hides_them_while_it_is_there() -> None:
     bar = Prop(size_m=(0.2, 0.02, 0.04), centre_m=(0.0, -0.025, -0.018), start_s=1.0, end_s=3.0)
     sim = simulator(plain_scenario(props=(bar,), fps=1.0))
-    assert sim.outline_seen(0).tips.min() == 1.0 and sim.outline_seen(2).tips.max() == 0.0
+    assert outline_seen(sim, 0).tips.min() == 1.0 and outline_seen(sim, 2).tips.max() == 0.0
     assert Hidden.OBJECT in sim.truth(2).hidden and Hidden.OBJECT not in sim.truth(3).hidden
     assert np.array_equal(sim.light(0), sim.light(4)) and not np.array_equal(sim.light(0), sim.light(2))
 
 
 def test_one_finger_hidden_by_a_box_leaves_the_other() -> None:
     box = Prop(size_m=(0.03, 0.02, 0.05), centre_m=(-0.025, -0.025, -0.018))
-    seen = simulator(plain_scenario(props=(box,))).outline_seen(0)
+    seen = outline_seen(simulator(plain_scenario(props=(box,))), 0)
     assert seen.tips[0] < 0.2 and seen.tips[1] == 1.0
 
 
@@ -168,8 +175,8 @@ def test_a_sharp_shadow_stands_where_it_was_put() -> None:
 
 def test_covers_count_in_what_is_seen_of_the_outline() -> None:
     sim = simulator(plain_scenario(covers=(Cover(start_s=0.5, end_s=9.0, move_s=0.2),), fps=1.0))
-    assert sim.outline_seen(0).tips.min() == 1.0
-    assert sim.outline_seen(4).tips.max() == 0.0 and sim.outline_seen(4).edges.max() == 0.0
+    assert outline_seen(sim, 0).tips.min() == 1.0
+    assert outline_seen(sim, 4).tips.max() == 0.0 and outline_seen(sim, 4).edges.max() == 0.0
 
 
 def test_what_is_off_leaves_pictures_as_they_were() -> None:

@@ -23,7 +23,7 @@ from gripmon.io.sources import (
     open_source,
     settings_for_path,
 )
-from gripmon.io.sources.files import natural_key
+from gripmon.model.images import natural_key
 from gripmon.model.records import Frame
 
 

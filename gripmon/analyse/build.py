@@ -29,8 +29,8 @@ from gripmon.analyse.events import MOTIONS, alert_events, histories_of, pauses_o
 from gripmon.analyse.motions import change_points_of, motions_of, robust_sigma, unreported
 from gripmon.analyse.summary import headline, paragraph
 from gripmon.analyse.track import SECOND_NS, Clock, Track, curves_of, displacement, make_track, straightened
-from gripmon.model.geometry import from_record, perturbation_between
-from gripmon.model.records import AlertKind, Array, ReferenceRecord, StateRecord, Verdict
+from gripmon.model.geometry import from_record, perturbation_between, to_vector
+from gripmon.model.records import AlertKind, ReferenceRecord, StateRecord, Verdict
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
@@ -257,12 +257,7 @@ def _noise(table: FrameTable, track: Track) -> Noise | None:
         return None
     sigma = robust_sigma(track.against_first[pairs + 1] - track.against_first[pairs]) / np.sqrt(2.0)
     claimed = np.median(track.sigma[pairs], axis=0)
-    return Noise(_vector(sigma[:3]), _vector(sigma[3:]), _vector(claimed[:3]), _vector(claimed[3:]), len(pairs))
-
-
-def _vector(values: Array) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
+    return Noise(to_vector(sigma[:3]), to_vector(sigma[3:]), to_vector(claimed[:3]), to_vector(claimed[3:]), len(pairs))
 
 
 def _shares(names: Sequence[str], codes: NDArray[np.int8]) -> tuple[Share, ...]:

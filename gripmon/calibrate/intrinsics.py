@@ -59,11 +59,10 @@ def calibrate(
     ``fy_px`` to ``fx_px``.  ``near``: a camera of this model to start from, if one is known.
 
     Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
-    no convergence, a focal length held without a value, or an implausible lens.
+    no convergence, or an implausible lens.
     """
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
-    _check_held(fixed)
     names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
@@ -264,15 +263,6 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
     if best is None:
         raise failure or CalibrationError(DEGENERATE)
     return best
-
-
-def _check_held(fixed: Fixed) -> None:
-    """Raise :class:`CalibrationError` for focal lengths that are to be held without a value."""
-    if "aspect" in fixed and fixed.get("fy_px") is not None:
-        raise CalibrationError("fy_px can't be held at a value of its own with square pixels; fx_px, or without aspect")
-    for name in ("fx_px", "fy_px"):
-        if name in fixed and fixed[name] is None and not (name == "fy_px" and "aspect" in fixed):
-            raise CalibrationError(f"{name} is to be held, but not said at what; {name}=VALUE (px)")
 
 
 def _start(lens_model: LensModel, focal_px: float, fixed: Fixed) -> Array:

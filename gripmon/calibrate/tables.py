@@ -19,7 +19,7 @@ from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.formats import as_number, read_mapping
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, input_errors
 from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
 from gripmon.model.images import check_size, image_in
 from gripmon.model.progress import Progress, quiet
@@ -266,12 +266,10 @@ def read_arm_poses(
     if found.covariances and len(found.covariances) < len(found.arm):
         raise InputError(f"{tables[0]}: some rows have cam_ columns, others images; one or the other")
     arm, targets = np.stack(found.arm), np.stack(found.target)
-    try:
+    with input_errors(str(tables[0])):
         check_scale(arm)
         check_target_scale(targets)
         _check_once(arm, targets, found.names)
-    except ValueError as error:
-        raise InputError(f"{tables[0]}: {error}") from None
     covariance, common = (np.stack(each) if each else None for each in (found.covariances, found.common))
     return ArmPoses(tuple(found.names), arm, targets, covariance, common, tuple(found.images), tuple(found.unseen))
 

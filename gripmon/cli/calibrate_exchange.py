@@ -6,7 +6,8 @@ import argparse
 import re
 import sys
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, input_errors, note
+from gripmon.cli.common import REQUIRED, Arguments, Command, note
+from gripmon.model.errors import input_errors
 
 CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")

@@ -6,8 +6,8 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, input_errors, make_directory, writing
-from gripmon.model.errors import InputError
+from gripmon.cli.common import REQUIRED, Arguments, Command, make_directory, writing
+from gripmon.model.errors import InputError, input_errors
 
 if TYPE_CHECKING:
     from gripmon.io.wire.certificates import Issued

@@ -109,7 +109,7 @@ def _check_laser(arguments: Arguments) -> int:
     settings, path = _watch_settings(arguments), arguments.laser
     if not path.is_file():
         raise InputError(f"--laser {path}: there is no such file; a file of gripmon calibrate laser")
-    calibration = read_laser(path, path)
+    calibration = read_laser(path)
     if not arguments.config:
         report = expectation(str(path), calibration, settings)
         _print_json(report) if arguments.json else print("\n".join(check_laser.expectation_lines(report)))

@@ -318,17 +318,6 @@ def check_file(path: Path) -> None:
 
 
 @contextmanager
-def input_errors(what: str) -> Iterator[None]:
-    """Turn a ValueError into wrong usage of ``what``; an InputError stays as it is."""
-    try:
-        yield
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{what}: {error}") from None
-
-
-@contextmanager
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
     """Turn a fault of an output file into an error with exit code 2."""
     try:

@@ -10,12 +10,11 @@ from gripmon.cli.common import (
     REQUIRED,
     Arguments,
     Command,
-    input_errors,
     make_directory,
     positive_number,
 )
 from gripmon.cli.fleet_table import local_time, printable
-from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.errors import InputError, NoResultError, input_errors
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:

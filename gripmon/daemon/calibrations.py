@@ -30,7 +30,7 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.targets import Target, refuse_other_size
 from gripmon.model.units import in_degrees, in_mm
-from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
+from gripmon.teach.hand_eye import calibrate_plane, checked_opening, measure_tracked
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
 
@@ -313,13 +313,5 @@ def _same_config(first: Calibrated, file: Path | None) -> Config:
 
 
 def _opening(first: Calibrated, config: Config, given_m: float | None) -> float | None:
-    gripper = config.gripper
-    if not gripper.has_jaw:
-        if given_m is not None:
-            raise InputError("the gripper has no jaw; leave it out", "jaw_opening_m")
-        return None
-    opening_m = next(m for m in (given_m, first.jaw_opening_m, config.jaw_opening_m) if m is not None)
-    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
-        right = f"the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
-        raise InputError(f"{opening_m:g} m; {right}", "jaw_opening_m")
-    return opening_m
+    known = (given_m, first.jaw_opening_m, config.jaw_opening_m) if config.gripper.has_jaw else (given_m,)
+    return checked_opening(config.gripper, next((opening_m for opening_m in known if opening_m is not None), None))

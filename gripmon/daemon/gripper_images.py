@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.daemon.calibrations import read_calibrated, read_given_camera
-from gripmon.io.sources import SourceError
-from gripmon.io.sources.files import TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, opening_beside
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record
@@ -43,15 +42,7 @@ def images_inputs(images: list[Path], camera: Path, reference: Path | None) -> I
 
 
 def _openings(images: list[Path]) -> list[float | None] | None:
-    tables = {}
-    for folder in dict.fromkeys(path.parent for path in images):
-        if (folder / TIMESTAMPS_NAME).exists():
-            try:
-                tables[folder] = read_table(folder / TIMESTAMPS_NAME)
-            except SourceError as error:
-                raise InputError(str(error)) from None
-    rows = [tables.get(path.parent, {}).get(path.name) for path in images]
-    openings = [None if row is None else row.jaw_opening_m for row in rows]
+    openings = [opening_beside(path) for path in images]
     if all(opening is None for opening in openings):
         return None
     for path, opening in zip(images, openings, strict=True):

@@ -16,11 +16,11 @@ import msgspec
 from gripmon.analyse.comparison import Differences
 from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
-from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.errors import InputError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.compared import ComparedRecorder
 from gripmon.record.keeping import keep_whole
-from gripmon.record.read import RecordedFrames, SeveralRunsError, UnusableError, recording_files
+from gripmon.record.read import RecordedFrames, recording_files
 from gripmon.record.recorder import Recorder, make_scene
 from gripmon.record.write import open_recorder
 
@@ -39,12 +39,7 @@ class RecordedRun:
 
         Raises :class:`InputError`, :class:`NoResultError`.
         """
-        try:
-            self.source: RecordedFrames = RecordedFrames(recording_files(list(paths)))
-        except SeveralRunsError as error:
-            raise InputError(str(error)) from None
-        except UnusableError as error:
-            raise NoResultError(str(error)) from None
+        self.source: RecordedFrames = RecordedFrames(recording_files(list(paths)))
         self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self.recorded_config = self._recorded_config(opened)
         begin = config or self.recorded_config

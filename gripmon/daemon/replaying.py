@@ -31,9 +31,10 @@ from gripmon.io.sources import (
     settings_for_path,
 )
 from gripmon.io.sources import open_source as start
-from gripmon.io.sources.files import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+from gripmon.io.sources.files import TIMESTAMPS_NAME
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError, in_short
+from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.records import (
     Command,
     Frame,

@@ -22,7 +22,7 @@ from gripmon.daemon.config import Config, builtin_config, load_config, load_scen
 from gripmon.daemon.config.yaml_file import lines_of, yaml_value
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, input_errors
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
@@ -86,10 +86,8 @@ def simulate_images(
             raise InputError(f"simulate: {scenario} is single images; neither --seconds nor --fps")
         return _calibration_images(str(scenario), out, config, seed, step)
     made = _scenario(scenario, config, duration_s, fps)
-    try:
+    with input_errors(str(scenario)):
         simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, made, seed)
-    except ValueError as error:
-        raise InputError(f"{scenario}: {error}") from None
     _make_empty(out)
     if scenario == "work":
         return SimulatedImages(out, None, write_sequence(simulator, out, step))
@@ -107,11 +105,9 @@ def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: f
         return load_scenario(path)
     if name not in SCENARIO_NAMES:
         raise InputError(f"simulate: there is no '{name}'; one of {', '.join((*SCENARIO_NAMES, *CALIBRATION_KINDS))}")
-    try:
-        finger, opening_m = config.gripper.finger_ids[0], _rig(config).jaw_opening_m
+    finger, opening_m = config.gripper.finger_ids[0], _rig(config).jaw_opening_m
+    with input_errors("simulate"):
         return make_scenario(str(name), duration_s=duration_s, fps=fps, finger=finger, jaw_opening_m=opening_m)
-    except ValueError as error:
-        raise InputError(f"simulate: {error}") from None
 
 
 def _rig(config: Config) -> Rig:
@@ -123,10 +119,8 @@ def _calibration_images(
 ) -> SimulatedImages:
     _make_empty(out)
     count, done = image_count(kind), itertools.count(1)
-    try:
+    with input_errors(f"simulate {kind}"):
         write_calibration_images(kind, _rig(config), out, seed, lambda: step(next(done), count))
-    except ValueError as error:
-        raise InputError(f"simulate {kind}: {error}") from None
     return SimulatedImages(out, None, count)
 
 

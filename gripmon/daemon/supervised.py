@@ -8,7 +8,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ParamSpec, Required, TypedDict, TypeVar
+from typing import ParamSpec, Required, TypedDict, TypeVar, Unpack
 
 import msgspec
 
@@ -78,38 +78,24 @@ class Loop(ABC):
     verdict_of = "transform"
     """What the verdict is about, for the log."""
 
-    def __init__(
-        self,
-        *,
-        source: Source,
-        publisher: Publisher,
-        recorder: Recorder,
-        settings: DaemonSettings,
-        robot: str,
-        camera: str,
-        stop: StopRequest | None = None,
-        commands: ZenohCommands | None = None,
-        snapshots: Snapshots | None = None,
-        reports: Reports | None = None,
-        notices: Sequence[Alert] = (),
-    ) -> None:
-        self._source = source
-        self._publisher, self._recorder = publisher, recorder
-        self._settings = settings
-        self._robot, self._camera = robot, camera
-        self._commands = commands
-        self._snapshots = snapshots or Snapshots()
+    def __init__(self, **parts: Unpack[Parts]) -> None:
+        self._source = parts["source"]
+        self._publisher, self._recorder = parts["publisher"], parts["recorder"]
+        self._settings = parts["settings"]
+        self._robot, self._camera = parts["robot"], parts["camera"]
+        self._commands = parts.get("commands")
+        self._snapshots = parts.get("snapshots") or Snapshots()
         self._newest: Newest | None = None
-        self._reports = reports or Reports()
-        self._notices = notices
+        self._reports = parts.get("reports") or Reports()
+        self._notices = parts.get("notices", ())
         self._open_alerts: tuple[OpenAlert, ...] = ()  # of the monitor
         self._proposal_id = ""  # id of the new reference that waits for an operator
         self._seq = -1
         self._start_s = time.monotonic()
-        self._watch = Watch(settings, self._start_s)
+        self._watch = Watch(self._settings, self._start_s)
         self._last_state: StateRecord | None = None
         self._next_state_s = self._next_command_s = self._start_s
-        self._stop = stop or StopRequest()
+        self._stop = parts.get("stop") or StopRequest()
         self._service = ServiceManager()
         self._source_broke = False
         self._faults: dict[str, str] = {}  # since the previous frame: what could not be delivered, and why

@@ -28,7 +28,7 @@ from gripmon.laser.setup import LaserCalibration, laser_lines, spots_on_plane
 from gripmon.laser.spots import Spot
 from gripmon.laser.watch import SpotWatch
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, input_errors
 from gripmon.model.geometry import invert
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
@@ -99,10 +99,8 @@ def calibrate_laser(
     """
     samples = samples if isinstance(samples, Samples) else read_samples(samples)
     calibrated = camera.camera if isinstance(camera, CameraCalibration) else camera
-    try:
+    with input_errors("camera"):
         made = make_camera(calibrated)
-    except ValueError as error:
-        raise InputError(f"camera: {error}") from None
     prior = _prior(camera) if isinstance(camera, CameraCalibration) else None
     if prior is None and refine_lens:
         raise InputError(

@@ -14,18 +14,10 @@ from gripmon.calibrate.robot_world import OFFSETS
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
 from gripmon.laser.refinement import PoseNoise, Refined, SpotProblem, refine, with_held_lens
-from gripmon.laser.setup import (
-    NAMES,
-    LaserCalibration,
-    LaserLine,
-    LaserResiduals,
-    LaserSetup,
-    Plane,
-    _vector,
-)
+from gripmon.laser.setup import NAMES, LaserCalibration, LaserLine, LaserResiduals, LaserSetup, Plane
 from gripmon.laser.world import LEAST_NOISE_PX
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import inverse_jacobian, invert, to_record
+from gripmon.model.geometry import inverse_jacobian, invert, to_record, to_vector
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 
@@ -310,12 +302,12 @@ def document(
         camera=refined.camera,
         base_T_cam=to_record(base_T_cam),
         plane=Plane(
-            normal_cam=_vector(setup.normal_cam),
+            normal_cam=to_vector(setup.normal_cam),
             distance_cam_m=setup.distance_m,
-            normal_base=_vector(normal_base),
+            normal_base=to_vector(normal_base),
             distance_base_m=setup.distance_m + float(normal_base @ base_T_cam[:3, 3]),
         ),
-        laser=LaserLine(point_ee_m=_vector(setup.point_ee_m), direction_ee=_vector(setup.direction_ee)),
+        laser=LaserLine(point_ee_m=to_vector(setup.point_ee_m), direction_ee=to_vector(setup.direction_ee)),
         parameters=NAMES,
         sigmas=dict(zip(NAMES, sigmas.tolist(), strict=True)),
         covariance=tuple(covariance.ravel().tolist()),

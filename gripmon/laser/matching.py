@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.calibrate.tables import Row, check_scale, pose_of, rows_of
-from gripmon.model.errors import InputError
+from gripmon.model.errors import input_errors
 from gripmon.model.records import Array, Frame, Image, LaserPulse, PulseFault
 from gripmon.model.records.values import NS_PER_S
 
@@ -341,10 +341,8 @@ def read_pulses(path: Path) -> list[ReportedPulse]:
     Raises :class:`~gripmon.model.errors.InputError`: "file: line: what is wrong; what would be right".
     """
     rows, places = rows_of(path, "a table stamp_ns,until_ns,tx_m,ty_m,tz_m,qx,qy,qz,qw")
-    try:
+    with input_errors(str(path)):
         return of_rows(rows, places)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[ReportedPulse]:

@@ -16,7 +16,7 @@ from gripmon.calibrate.sighting import NotFound
 from gripmon.calibrate.tables import POSITION, QUATERNION, Row, check_scale, numbers_of, pose_of, rows_of
 from gripmon.laser.planning import Plan
 from gripmon.laser.spots import Spot, find_spots, plain_spot
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, input_errors
 from gripmon.model.geometry import quaternion_xyzw
 from gripmon.model.images import check_size, image_in
 from gripmon.model.progress import Progress, quiet
@@ -77,10 +77,8 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     parts = []
     for path in paths:
         rows, places = rows_of(path)
-        try:
+        with input_errors(str(path)):
             parts.append(_from_rows(rows, places, path))
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
     if len(parts) == 1:
         return parts[0]
     grouped = [part.groups is not None for part in parts]

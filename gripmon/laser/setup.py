@@ -196,8 +196,3 @@ def setup_of(calibration: LaserCalibration) -> LaserSetup:
         np.array(calibration.laser.point_ee_m),
         np.array(calibration.laser.direction_ee),
     )
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z

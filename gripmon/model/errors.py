@@ -6,6 +6,9 @@ command line prints that line and exits with the exit code.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class InputError(ValueError):
     """An input is wrong: a file, a table, a value.  The command line exits with this exit code.
@@ -26,6 +29,17 @@ class NoResultError(RuntimeError):
     """The input is sound, but there is no result: no usable frame, or a calibration that is rejected."""
 
     exit_code = 3
+
+
+@contextmanager
+def input_errors(what: str) -> Iterator[None]:
+    """A ValueError in it is an :class:`InputError` about ``what``; an InputError stays as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{what}: {error}") from None
 
 
 def one_line(error: BaseException) -> str:

@@ -147,9 +147,14 @@ def perturbation_between(from_T: Array, to_T: Array) -> Array:
     return out
 
 
+def to_vector(values: Array) -> tuple[float, float, float]:
+    """An array (3,) as plain numbers."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 def to_record(a_T_b: Array) -> Transform:
-    x, y, z = a_T_b[:3, 3].tolist()
-    return Transform((x, y, z), quaternion_xyzw(a_T_b[:3, :3]))
+    return Transform(to_vector(a_T_b[:3, 3]), quaternion_xyzw(a_T_b[:3, :3]))
 
 
 def from_record(transform: Transform) -> Array:

@@ -183,14 +183,6 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
     return ours
 
 
-class UnusableError(Exception):
-    """These files contain nothing to replay; ``str()`` is one line."""
-
-
-class SeveralRunsError(Exception):
-    """The files are of several runs, whose frames have no common order; ``str()`` is one line."""
-
-
 class RecordedFrames:
     """A source for replay: every frame of one run whose image is in these ``.rrd`` files, in the order of ``seq``, each
     with its stamp, name and reported jaw opening.
@@ -202,7 +194,8 @@ class RecordedFrames:
 
     Images are read when they are needed.  ``faults``, one line each: what in the files could not be used;
     ``passed_over`` counts frames that could no longer be read, ``images_damaged`` those whose pixels can't be decoded.
-    Raises :class:`UnusableError` if there is no image at all, and :class:`SeveralRunsError`.
+    Raises :class:`~gripmon.model.errors.NoResultError` if there is no image at all, and
+    :class:`~gripmon.model.errors.InputError` for files of several runs, whose frames have no common order.
     """
 
     live = False
@@ -219,7 +212,7 @@ class RecordedFrames:
         self.commands: tuple[RecordedCommand, ...] = tuple(sorted(run.commands, key=attrgetter("seq", "stamp_ns")))
         if not len(run.image_seqs):
             no_images = f"{self.paths[0]}: holds no images; a recording made with image_rate_hz above 0"
-            raise UnusableError("; ".join([*[no_images] * bool(len(run.frames)), *self.faults]) or no_images)
+            raise NoResultError("; ".join([*[no_images] * bool(len(run.frames)), *self.faults]) or no_images)
         with_image = np.isin(run.frames.seq, run.image_seqs)
         refused = run.frames.seq[run.frames.refused & ~with_image]
         stand_ins = [record.seq for record in run.records(refused) if _stands_in(record)] if len(refused) else []
@@ -274,11 +267,11 @@ def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
     """The run that all files belong to, and what is wrong with them."""
     found = open_recordings(paths)
     if not found.recordings:
-        raise UnusableError("; ".join(found.faults) or "there is no recording; an .rrd file of gripmon's")
+        raise NoResultError("; ".join(found.faults) or "there is no recording; an .rrd file of gripmon's")
     if len(found.recordings) > 1:
         first = ", ".join(str(run.files[0]) for run in found.recordings[:4])
         more = ", …" if len(found.recordings) > 4 else ""
-        raise SeveralRunsError(f"these are files of {len(found.recordings)} runs ({first}{more}); the files of one")
+        raise InputError(f"these are files of {len(found.recordings)} runs ({first}{more}); the files of one")
     (run,) = found.recordings
     return run, (*found.faults, *run.faults)
 

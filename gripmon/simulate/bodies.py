@@ -1,6 +1,5 @@
 """The solids of a scenario and their poses: fingers, the bodies that carry them, the grasped object, covers.  Also the
-truth about a frame, up to rounding: poses, openings, corner pixels, what hides each corner, and how much of each
-finger's outline is visible.
+truth about a frame, up to rounding: poses, openings, corner pixels, and what hides each corner.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.simulate.scenario import Cover, Prop, Scenario
@@ -92,10 +90,6 @@ class Bodies:
             covered |= _behind(outline, points_cam_m)
         return covered
 
-    def is_gripper(self, solid: Solid) -> bool:
-        """Whether a solid is a finger or carries one."""
-        return any(solid is own for own in (*self.fingers, *self.carriers))
-
     def _reason(self, solid: Solid) -> tuple[Hidden, NDArray[np.bool_]]:
         """The reason for what a body hides, and which corners are its own."""
         for k, finger in enumerate(self.fingers):
@@ -168,56 +162,6 @@ def _hand_outline(front: float, half: float, length: float) -> Array:
         corners.append((knuckles, y + radius))
     corners += [(2.0 * length, half), (2.0 * length, -half)]
     return np.array(corners)
-
-
-_POINTS_PER_EDGE = 24
-
-
-@dataclass(frozen=True, slots=True)
-class OutlineSeen:
-    """Visible shares (f,) of each finger's edges: of those of its tip, and of all that are in the image.
-
-    1 if nothing but the gripper itself hides any; edges hidden by the gripper don't count.
-    """
-
-    tips: Array
-    edges: Array
-
-
-class Outline:
-    """Points on the edges of a gripper's model; contours only, so that a wrong model is judged by the true one."""
-
-    def __init__(self, gripper: Gripper) -> None:
-        share = (np.arange(_POINTS_PER_EDGE) + 0.5) / _POINTS_PER_EDGE
-        start, end = gripper.edge_points.T
-        corner = np.zeros(len(gripper.point_finger), dtype=bool)
-        corner[gripper.corner_points] = True
-        self._start, self._end = np.repeat(start, _POINTS_PER_EDGE), np.repeat(end, _POINTS_PER_EDGE)
-        self._share = np.tile(share, len(start))[:, None]
-        self._tip = corner[self._start] & corner[self._end]
-        self._finger = gripper.point_finger[self._start]
-        self._fingers = len(gripper.finger_ids)
-
-    def seen(self, camera: Camera, bodies: Bodies, state: SceneState) -> OutlineSeen:
-        """Visible shares in a scene's state."""
-        grip = state.points_grip_m
-        points = (1.0 - self._share) * grip[self._start] + self._share * grip[self._end]
-        points = points @ state.cam_T_grip[:3, :3].T + state.cam_T_grip[:3, 3]
-        uv = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (uv >= 0.0).all(axis=1) & (uv <= (camera.width_px - 1.0, camera.height_px - 1.0)).all(axis=1)
-        own, other = np.zeros(len(points), dtype=bool), bodies.covered(state, points)
-        for body in bodies.placed(state):
-            if bodies.is_gripper(body.solid):
-                own |= hidden_by(body, points)
-            else:
-                other |= hidden_by(body, points)
-        tips = self._shares(~own & self._tip, ~other & inside)
-        return OutlineSeen(tips, self._shares(~own & inside, ~other))
-
-    def _shares(self, there: NDArray[np.bool_], seen: NDArray[np.bool_]) -> Array:
-        total = np.bincount(self._finger, there, self._fingers)
-        return np.bincount(self._finger, there & seen, self._fingers) / np.maximum(total, 1.0)
 
 
 class Hidden(enum.StrEnum):

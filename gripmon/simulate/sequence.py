@@ -13,11 +13,11 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Frame
 from gripmon.simulate import disturbance
-from gripmon.simulate.bodies import Bodies, FrameTruth, Hidden, Outline, OutlineSeen
+from gripmon.simulate.bodies import Bodies, FrameTruth, Hidden
 from gripmon.simulate.disturbance import SensorModel
 from gripmon.simulate.render import Backdrop, Renderer
 from gripmon.simulate.scenario import Scenario
-from gripmon.simulate.scene import Scene
+from gripmon.simulate.scene import Scene, SceneState
 
 
 class Simulator:
@@ -41,8 +41,7 @@ class Simulator:
         self.camera, self.gripper, self.scenario, self.seed = camera, gripper, scenario, seed
         self.nominal_cam_T_grip = np.array(nominal_cam_T_grip, dtype=float)
         self._scene = Scene(camera, gripper, self.nominal_cam_T_grip, scenario, seed)
-        self._bodies = Bodies(gripper, scenario, self._scene.view_half[1])
-        self._outline = Outline(gripper)
+        self.bodies = Bodies(gripper, scenario, self._scene.view_half[1])
         self._painting: tuple[Renderer, SensorModel] | None = None
 
     @property
@@ -59,11 +58,11 @@ class Simulator:
     def truth(self, index: int) -> FrameTruth:
         """Truth of a frame, without rendering it."""
         time_s = self.time_s(index)
-        scenario, state = self.scenario, self._scene.at(time_s)
+        scenario, state = self.scenario, self.state(index)
         cam_T_grip = state.cam_T_grip
         corners_cam = state.points_grip_m[self.gripper.corner_points] @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
         uv = self.camera.project(corners_cam)
-        hidden = self._bodies.hidden_corners(state, corners_cam)
+        hidden = self.bodies.hidden_corners(state, corners_cam)
         for k in np.flatnonzero(~self._inside(uv)).tolist():
             hidden[k] = Hidden.OUTSIDE
         return FrameTruth(
@@ -84,9 +83,9 @@ class Simulator:
             defocus_px=disturbance.defocus_sigma_px(scenario.defocus, time_s),
         )
 
-    def outline_seen(self, index: int) -> OutlineSeen:
-        """How much of each finger's outline is visible in a frame."""
-        return self._outline.seen(self.camera, self._bodies, self._scene.at(self.time_s(index)))
+    def state(self, index: int) -> SceneState:
+        """Poses of everything in a frame; the shapes are in ``bodies``."""
+        return self._scene.at(self.time_s(index))
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """Image (height, width) of a frame."""
@@ -107,7 +106,7 @@ class Simulator:
         if self._painting is None:
             scenario, nominal = self.scenario, self.nominal_cam_T_grip
             backdrop = self._backdrop
-            renderer = Renderer(self.camera, self._bodies, self._scene, scenario, nominal, self.seed, backdrop)
+            renderer = Renderer(self.camera, self.bodies, self._scene, scenario, nominal, self.seed, backdrop)
             self._painting = renderer, SensorModel(renderer.rays, scenario, self.seed)
         return self._painting
 

@@ -15,14 +15,13 @@ import msgspec
 import yaml
 
 from gripmon import __version__
-from gripmon.io.sources import SourceError
-from gripmon.io.sources.files import TIMESTAMPS_NAME, read_image, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, opening_beside
 from gripmon.judge.inspection import inspect
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.images import image_paths
+from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import MonitorSettings
@@ -158,7 +157,7 @@ def read_picture(
     """Read an image that fits the camera, in full scale, with its jaw opening: the one given, else that in its folder's
     ``timestamps.csv``.  Raises :class:`~gripmon.model.errors.InputError`.
     """
-    image = read_any(path)
+    image = image_in(path)
     frame = in_full_scale(Frame(0, 0, image, None, str(path)), bit_depth)
     refused = inspect(frame, camera, gripper)
     if refused is not None or frame.image is None:
@@ -167,27 +166,12 @@ def read_picture(
     return Picture(path.name, frame.image, _opening(path, gripper, jaw_opening_m), str(path))
 
 
-def read_any(path: Path) -> Image:
-    """Read an image of any camera.  Raises :class:`~gripmon.model.errors.InputError`."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; an image file")
-    image, fault = read_image(path)
-    if image is None:
-        raise InputError(f"{path}: {fault}; an image file")
-    return image
-
-
 def _opening(path: Path, gripper: Gripper, opening_m: float | None) -> float | None:
     if not gripper.has_jaw:
         if opening_m is not None:
             raise InputError("the gripper has no jaw; leave it out", "jaw_opening_m")
         return None
-    if opening_m is None and (path.parent / TIMESTAMPS_NAME).exists():
-        try:
-            row = read_table(path.parent / TIMESTAMPS_NAME).get(path.name)
-        except SourceError as error:
-            raise InputError(str(error)) from None
-        opening_m = None if row is None else row.jaw_opening_m
+    opening_m = opening_beside(path) if opening_m is None else opening_m
     if opening_m is not None and not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
         raise InputError(
             f"{path}: jaw opening {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"

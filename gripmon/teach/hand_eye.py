@@ -264,7 +264,7 @@ def calibrate_plane(
     method = (
         UnknownGripper(given, target)
         if gripper is None
-        else KnownGripper(given, gripper, _checked_opening(gripper, jaw_opening_m), cam_T_grip)
+        else KnownGripper(given, gripper, checked_opening(gripper, jaw_opening_m), cam_T_grip)
     )
     taken = _of_camera(images, given.lens)
     used: list[ImageOnPlate] = []
@@ -293,7 +293,8 @@ def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamer
     return GivenCamera(camera)
 
 
-def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
+def checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
+    """The jaw opening, None: the nominal one; None for a gripper without jaw.  Raises :class:`InputError`."""
     if not gripper.has_jaw:
         if opening_m is not None:
             raise InputError(f"{gripper.name} has no jaw; leave it out", "jaw_opening_m")

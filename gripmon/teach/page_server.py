@@ -78,7 +78,8 @@ _HEADERS = {
 Served = tuple[bytes, str]
 """The content of an answer, and its media type."""
 Action = tuple[type[Any], Callable[[Any], object]]
-"""The type of a request's body, and the function that answers it; its :class:`BadRequest` is sent as one line."""
+"""The type of a request's body, and the function that answers it; its :class:`BadRequest` and
+:class:`gripmon.model.errors.InputError` are sent as one line."""
 
 
 class Site(Protocol):
@@ -203,7 +204,7 @@ class _Handler(BaseHTTPRequestHandler):
             data, kind = act(self._checked_path())
         except _Refused as refused:
             status, data = refused.status, self._failure(str(refused))
-        except BadRequest as refused:
+        except (BadRequest, InputError) as refused:
             status, data = HTTPStatus.BAD_REQUEST, self._failure(str(refused))
         except (ConnectionError, TimeoutError):
             self.close_connection = True

@@ -12,10 +12,10 @@ import yaml
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, read_gripper
-from gripmon.io.sources.files import read_image
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.images import read_image
 from gripmon.model.records import Image
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 

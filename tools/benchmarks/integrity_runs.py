@@ -19,6 +19,7 @@ from benchmarks import rendered
 from benchmarks.integrity_misleading import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
+from benchmarks.outline_seen import outline_seen
 from benchmarks.rendered import Rendered
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy.judging import NO_REFERENCE
@@ -247,7 +248,7 @@ def _just_bumped(scenario: Scenario, time_s: float) -> bool:
 
 
 def _view(scene: IntegrityScene, index: int) -> View:
-    seen = scene.simulator.outline_seen(index)
+    seen = outline_seen(scene.simulator, index)
     if (seen.tips > _WHOLE).all() and (seen.edges > _WHOLE).all():
         return View.FREE
     return _by_tips(int((seen.tips >= TIP_SEEN).sum()))

@@ -5,7 +5,6 @@ Every fault is found here, before anything starts, and reported in one line: :cl
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.daemon.config.checks import (
     View,
+    configured,
     covariance_of,
     jaw_fault,
     joined,
@@ -29,7 +29,7 @@ from gripmon.daemon.config.checks import (
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import builtin_config, read_configuration, read_settings
+from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
 from gripmon.io.ros2.names import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -37,7 +37,7 @@ from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
-from gripmon.model.records import Array, ReferenceRecord, to_json
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import TaughtEdges, TaughtModel
 from gripmon.track.edges.taught import mismatch
 
@@ -150,8 +150,8 @@ def load_config(
     except SettingsError as error:
         raise ConfigError.of(path, error.fault) from None
     camera = _camera(path, settings, calibrated)
-    gripper_path = path.parent / settings.gripper
-    gripper = _gripper(path, gripper_path)
+    gripper_path = named_file(path, "gripper", settings.gripper, "a gripper file")
+    gripper = read_gripper(gripper_path)
     reference = _reference(path, settings, gripper, calibrated)
     config = Config(path, settings, camera, gripper, gripper_path, reference, calibrated=calibrated)
     fault = (
@@ -190,13 +190,6 @@ def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Cam
         raise ConfigError(calibrated.paths.get("camera", path), "", f"camera.{error}") from None
 
 
-def _gripper(path: Path, gripper_path: Path) -> Gripper:
-    if not gripper_path.is_file():
-        right = "a gripper file, its path relative to this file"
-        raise ConfigError(path, "gripper", f"there is no file {gripper_path}", right)
-    return read_gripper(gripper_path)
-
-
 def read_gripper(gripper_path: Path) -> Gripper:
     """Read and check a gripper file.  Raises :class:`ConfigError`."""
     try:
@@ -227,19 +220,14 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
     except SettingsError as error:
         key = error.fault.key if file is path else error.fault.key.removeprefix("reference.")
         raise ConfigError.of(file, error.fault._replace(key=key)) from None
-    transform = to_record(cam_T_grip)
-    name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
-    return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)
+    return configured(to_record(cam_T_grip), covariance, settings.reference.id)
 
 
 def _taught(config: Config) -> TaughtModel | None:
     """The configuration's taught model; refused unless it was taught with the same camera, gripper and settings."""
-    path = config.taught_path
-    if path is None:
+    if config.settings.taught is None:
         return None
-    if not path.is_file():
-        right = "a file of gripmon teach, its path relative to this file"
-        raise ConfigError(config.path, "taught", f"there is no file {path}", right)
+    path = named_file(config.path, "taught", config.settings.taught, "a file of gripmon teach")
     model = read_settings(path, TaughtModel)
     edges = config.settings.monitor.corners.edges
     fault = mismatch(model, config.camera, config.gripper, config.cam_T_grip, edges)

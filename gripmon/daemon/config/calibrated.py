@@ -10,15 +10,13 @@ import msgspec
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import read_document
+from gripmon.daemon.config.yaml_file import named_file, read_document
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
 from gripmon.track.edges.taught import gripper_digest
 
-_WHAT = {
-    "camera": "a file of gripmon calibrate intrinsics",
-    "reference": "a file of gripmon calibrate plane",
-}
+_INTRINSICS, _PLANE = "a file of gripmon calibrate intrinsics", "a file of gripmon calibrate plane"
+_OR = ", or a section"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +31,12 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
     """The configuration's values with file names replaced by their sections.  Raises :class:`ConfigError`."""
     values, paths, hand_eye = dict(values), {}, None
     if isinstance(values.get("camera"), str):
-        paths["camera"] = _file(path, "camera", values["camera"])
+        paths["camera"] = named_file(path, "camera", values["camera"], _INTRINSICS, _OR)
         values["camera"] = _as_read(read_camera(paths["camera"]).camera)
     if isinstance(values.get("reference"), str):
-        paths["reference"] = _file(path, "reference", values["reference"])
+        paths["reference"] = named_file(
+            path, "reference", values["reference"], "a file of gripmon calibrate plane", _OR
+        )
         hand_eye = read_document(paths["reference"], HandEyeCalibration)
         values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
     return values, CalibrationFiles(paths, hand_eye)
@@ -70,11 +70,3 @@ def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Grippe
 def _as_read(value: msgspec.Struct) -> Any:
     """As if read from a file, with lists."""
     return msgspec.json.decode(msgspec.json.encode(value))
-
-
-def _file(path: Path, key: str, name: str) -> Path:
-    there = path.parent / name
-    if not there.is_file():
-        right = f"{_WHAT[key]}, its path relative to this file, or a section"
-        raise ConfigError(path, key, f"there is no file {there}", right)
-    return there

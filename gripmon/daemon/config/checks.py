@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import logging
 import math
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array
+from gripmon.model.records import Array, ReferenceRecord, Transform, to_json
 from gripmon.monitor import MonitorSettings
 
 _log = logging.getLogger(__name__)
@@ -106,6 +107,12 @@ def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
         right = "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)"
         raise SettingsError(Fault("reference.covariance", wrong, right))
     return settings.covariance
+
+
+def configured(cam_T_grip: Transform, covariance: tuple[float, ...], name: str | None = None) -> ReferenceRecord:
+    """A configuration's reference; without a name it is named by its transform."""
+    name = name or f"config-{hashlib.sha256(to_json(cam_T_grip)).hexdigest()[:8]}"
+    return ReferenceRecord(name, 0, 0, "configuration", cam_T_grip, covariance)
 
 
 def monitor_fault(settings: MonitorSettings) -> Fault | None:

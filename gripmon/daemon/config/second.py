@@ -10,7 +10,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.daemon.config.checks import network_fault, source_fault
 from gripmon.daemon.config.settings import SecondSettings
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import read_configuration, read_document, read_settings
+from gripmon.daemon.config.yaml_file import named_file, read_configuration, read_document, read_settings
 from gripmon.io.sources import EpisodeSettings, FolderSettings, SimulatedSettings, VideoSettings
 from gripmon.laser.judgement import SpotWatchSettings
 from gripmon.laser.matching import PulseSettings, ReportedPulse, read_pulses
@@ -20,6 +20,7 @@ from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
 
 SECTION = "laser"
+_LASER_FILE = "a file of gripmon calibrate laser"
 _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")
 
 
@@ -58,8 +59,8 @@ def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
     values = read_configuration(path)
     _refuse_wrist(path, values)
     settings = read_settings(path, SecondSettings, values)
-    calibration_path = path.parent / settings.laser.calibration
-    calibration = read_laser(path, calibration_path)
+    calibration_path = named_file(path, f"{SECTION}.calibration", settings.laser.calibration, _LASER_FILE)
+    calibration = read_laser(calibration_path)
     fault = _fault_between(settings) or network_fault(settings.source, settings.publish)
     if fault is None and check_source:
         fault = source_fault(settings.source, path.parent)
@@ -75,19 +76,15 @@ def load_pulses(config: SecondConfig) -> SecondConfig:
     return config if name is None else replace(config, pulses=_pulses(config.path, name))
 
 
-def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
-    """The laser calibration that a configuration names.  Raises :class:`ConfigError`."""
-    if not calibration_path.is_file():
-        wrong = f"there is no file {calibration_path}"
-        right = "a file of gripmon calibrate laser, its path relative to this file"
-        raise ConfigError(path, "laser.calibration", wrong, right)
-    calibration = read_document(calibration_path, LaserCalibration)
+def read_laser(path: Path) -> LaserCalibration:
+    """A laser calibration.  Raises :class:`ConfigError`."""
+    calibration = read_document(path, LaserCalibration)
     try:
         make_camera(calibration.camera)
         # The consistency of its numbers is checked where they are used.
         PulsedWatch(calibration, SpotWatchSettings(), PulseSettings())
     except (CalibrationError, ValueError) as error:
-        raise ConfigError(calibration_path, "", str(error)) from None
+        raise ConfigError(path, "", str(error)) from None
     return calibration
 
 

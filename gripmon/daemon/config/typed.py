@@ -184,32 +184,20 @@ def _leaf_fault(value: Any, node: mi.Type, key: str, description: str) -> Fault 
     return Fault(key, f"is {_show(value)}", _expected(node, description))
 
 
+_LEAVES: dict[type[mi.Type], Any] = {
+    mi.BoolType: bool, mi.NoneType: None, mi.StrType: str, mi.IntType: int, mi.FloatType: float,
+}  # fmt: skip
+_BOUNDS = ("gt", "ge", "lt", "le", "min_length", "max_length", "pattern")
+
+
 def _fits_leaf(value: Any, node: mi.Type) -> bool:
-    if isinstance(node, mi.BoolType):
-        return isinstance(value, bool)
-    if isinstance(node, mi.NoneType):
-        return value is None
-    if isinstance(node, mi.StrType):
-        bounds = msgspec.Meta(min_length=node.min_length, max_length=node.max_length, pattern=node.pattern)
-        try:
-            msgspec.convert(value, type=Annotated[str, bounds])
-        except msgspec.ValidationError:
-            return False
-        return True
-    if isinstance(node, mi.IntType | mi.FloatType):
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return (isinstance(value, int) or isinstance(node, mi.FloatType)) and _in_bounds(value, node)
-    return True  # msgspec itself checks it afterwards
-
-
-def _in_bounds(value: float, node: mi.IntType | mi.FloatType) -> bool:
-    return (
-        (node.gt is None or value > node.gt)
-        and (node.ge is None or value >= node.ge)
-        and (node.lt is None or value < node.lt)
-        and (node.le is None or value <= node.le)
-    )
+    kind = _LEAVES.get(type(node), Any)  # msgspec itself checks the rest afterwards
+    bounds = msgspec.Meta(**{name: getattr(node, name, None) for name in _BOUNDS})
+    try:
+        msgspec.convert(value, type=Annotated[kind, bounds])
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _expected(node: mi.Type, description: str = "") -> str:

@@ -101,6 +101,15 @@ def read_configuration(path: Path) -> dict[str, Any]:
     return values
 
 
+def named_file(path: Path, key: str, name: str, what: str, instead: str = "") -> Path:
+    """A file that a configuration names, ``what`` there would be right.  :class:`ConfigError` if there is none."""
+    there = path.parent / name
+    if not there.is_file():
+        right = f"{what}, its path relative to this file{instead}"
+        raise ConfigError(path, key, f"there is no file {there}", right)
+    return there
+
+
 def kind_of(values: dict[str, Any]) -> str | None:
     """The type of gripmon file, in words; None if unknown."""
     known = _SCHEMAS.get(str(values.get("schema")).partition("/")[0])

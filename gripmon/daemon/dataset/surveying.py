@@ -17,7 +17,7 @@ from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.dataset.engines import local, ray_cluster
 from gripmon.daemon.dataset.measuring import Configs
 from gripmon.daemon.replaying import as_configured
-from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError
+from gripmon.io.sources import BagSettings, LeRobotSettings
 from gripmon.io.sources.episodes import Episode, find_episodes, hash_of
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError
@@ -76,10 +76,7 @@ def measure_dataset(
     configs = (config, *others)
     if len({one.gripper_path.stem for one in configs}) < len(configs):
         raise InputError("two files of one name, or the configuration's own again; each file once", "gripper")
-    try:
-        episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
-    except SourceError as error:
-        raise InputError(str(error)) from None
+    episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
     annotations = None if annotate is None else Annotations(episodes, str(annotate))
     folder = writable_folder(Path(out))
     with Journal(folder, _fingerprint(configs, lens)) as journal:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from gripmon.model.errors import InputError
+from gripmon.model.errors import input_errors
 from gripmon.model.units import jaw_range_in
 
 Level = Literal["", "OK", "WARN", "FAIL"]
@@ -23,10 +23,8 @@ def jaws(text: str) -> Line:
     """The jaw range of an inferred gripper, in words."""
     if not text:
         return Line("no jaw range is given: the jaws are assumed never to move", "WARN")
-    try:
+    with input_errors("jaws move"):
         low_m, high_m = jaw_range_in(text)
-    except ValueError as error:
-        raise InputError(f"jaws move: {error}") from None
     return Line(f"the jaws move from {1e3 * low_m:g} to {1e3 * high_m:g} mm", "OK")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -199,7 +200,7 @@ class SetupSite:
         with self._lock:
             if self._busy is not None:
                 raise BadRequest(f"the step {self._busy} is still running")
-            self._keep(order.values)
+            self._project.keep(order.values)
             self._busy = order.step
         self._errors.pop(order.step, None)
         self._said.pop(order.step, None)
@@ -223,13 +224,13 @@ class SetupSite:
         self._named(order.step, "capture")
         self._errors.pop(order.step, None)
         if order.values:
-            self._keep(order.values)
+            self._project.keep(order.values)
         if order.action == "start":
             self._start_camera(order.step)
             return
         capture = self._capture
         if capture is None or capture[0] != order.step:
-            capture = self._capture = order.step, self._fresh(order.step)
+            capture = self._capture = order.step, self._project.capture(order.step)
         match order.action:
             case "stop":
                 capture[1].stop()
@@ -242,39 +243,26 @@ class SetupSite:
             case _:
                 capture[1].drop(order.name)
 
-    def _fresh(self, step: str) -> Capture:
-        try:
-            return self._project.capture(step)
-        except InputError as error:
-            raise BadRequest(str(error)) from None
-
     def _start_camera(self, step: str) -> None:
         self._let_go()
         if self._monitor.running:
             raise BadRequest("the monitor uses the camera; stop it first")
-        capture = self._fresh(step)
-        try:
+        capture = self._project.capture(step)
+        with self._shown_at(step):
             capture.start(self._project.open_camera(step))
-        except InputError as error:
-            self._errors[step] = str(error)
-            raise BadRequest(str(error)) from None
         self._capture = step, capture
 
     def _open(self, order: StepRequest) -> dict[str, str]:
         """Open a teaching page; return its address."""
         self._named(order.step, "page")
-        self._keep(order.values)
+        self._project.keep(order.values)
         self._let_go()
         self._close_page()
         state = next(each for each in self._project.states() if each.name == order.step)
         if state.progress == "waits":
             raise BadRequest(state.note)
-        try:
+        with self._shown_at(order.step):
             session = self._session(order.step, state.command)
-        except InputError as error:
-            self._errors[order.step] = str(error)
-            raise BadRequest(str(error)) from None
-        self._errors.pop(order.step, None)
         saves = ("corners",) if order.step == "corners" else ("config", "taught", "corners")
         self._page = TeachSite(session, f"../#{order.step}", saves), session
         return {"url": "page/"}
@@ -304,18 +292,18 @@ class SetupSite:
 
     def _start(self) -> None:
         self._let_go()
-        self._errors.pop("run", None)
-        try:
+        with self._shown_at("run"):
             self._monitor.start()
-        except InputError as error:
-            self._errors["run"] = str(error)
-            raise BadRequest(str(error)) from None
 
-    def _keep(self, values: dict[str, str]) -> None:
+    @contextlib.contextmanager
+    def _shown_at(self, step: str) -> Iterator[None]:
+        """What the person gave wrong, also shown at the step until it is tried again."""
+        self._errors.pop(step, None)
         try:
-            self._project.keep(values)
+            yield
         except InputError as error:
-            raise BadRequest(str(error)) from None
+            self._errors[step] = str(error)
+            raise
 
     @staticmethod
     def _named(name: str, *kinds: str) -> None:

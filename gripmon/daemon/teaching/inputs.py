@@ -6,7 +6,6 @@ All functions raise :class:`~gripmon.model.errors.InputError` for unusable input
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.daemon.calibrations import read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch
-from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
+from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
@@ -29,9 +28,10 @@ from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, Source
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import ReferenceRecord, Transform, to_json
+from gripmon.model.images import check_size, image_in
+from gripmon.model.records import ReferenceRecord, Transform
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.api import Picture, read_any, read_picture
+from gripmon.teach.api import Picture, read_picture
 from gripmon.teach.corner_pose import CameraError, corners_fault
 from gripmon.teach.outlines import RoughCorners
 from gripmon.teach.page_server import OutlineSession
@@ -136,15 +136,12 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
 def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
-    shown, target = read_any(image), None
+    shown, target = image_in(image), None
     if camera is not None:
         with contextlib.suppress(ConfigError):  # read_lens reports what is wrong
             target = read_yaml(camera).get("target")
         lens, _ = read_lens(camera)
-        height, width = shown.shape[:2]
-        if (width, height) != (lens.width_px, lens.height_px):
-            wrong = f"{width} x {height} px; the camera's {lens.width_px} x {lens.height_px} px, as it was calibrated"
-            raise InputError(f"{image}: {wrong}")
+        check_size(str(image), shown, lens.width_px, lens.height_px)
     known = isinstance(target, str)
     words = ["gripmon", "calibrate", "plane", image, "--camera", camera or "camera.yaml"]
     words += ["--target", camera if known else "TARGET", "--infer", "--corners", folder / ROUGH]
@@ -218,17 +215,14 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
         wrong = fault.wrong.replace("the configuration's camera", "the one given")
         wrong = wrong.replace("the configuration has", "the one given is")
         raise InputError(f"{path}: {fault.key}: {wrong}; {fault.right}", "reference")
-    digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
-    name = f"config-{digest}"  # as in the configuration that will name the file
-    return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
+    return made.camera, configured(made.cam_T_grip, made.covariance)
 
 
 def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
     """A file with only a section ``reference``: a robot's own hand/eye calibration."""
     settings = read_settings(path, ReferenceSettings, values)
     transform = Transform(settings.cam_T_grip.translation_m, settings.cam_T_grip.rotation_xyzw)
-    digest = hashlib.sha256(to_json(transform)).hexdigest()[:8]
-    return ReferenceRecord(f"config-{digest}", 0, 0, "configuration", transform, covariance_of(settings))
+    return configured(transform, covariance_of(settings))
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:

@@ -17,7 +17,7 @@ from gripmon.daemon.config import Config, Settings, load_config
 from gripmon.daemon.config.yaml_file import lines_of, yaml_value
 from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.io.sources import FolderSettings, SourceError
-from gripmon.io.sources.files import TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import opening_beside
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
@@ -125,9 +125,7 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
     if inputs.jaw_source in _FROM_ELSEWHERE:
         return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
     openings = [picture.jaw_opening_m for picture in inputs.pictures]
-    table = [(Path(p.path).parent / TIMESTAMPS_NAME).exists() for p in inputs.pictures if p.path is not None]
-    known_by_table = inputs.jaw_source is None and table and all(table)
-    if known_by_table and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+    if inputs.jaw_source is None and openings and None not in openings and _in_table(inputs):
         return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
     lines = [
         "jaw:",
@@ -142,15 +140,9 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
 def _in_table(inputs: Inputs) -> bool:
     """Whether the images' own table has their openings; an opening given for all of them is fixed."""
     try:
-        for picture in inputs.pictures:
-            assert picture.path is not None
-            path = Path(picture.path)
-            row = read_table(path.parent / TIMESTAMPS_NAME).get(path.name)
-            if row is None or row.jaw_opening_m is None or row.jaw_opening_m != picture.jaw_opening_m:
-                return False
+        return all(p.path is not None and opening_beside(Path(p.path)) == p.jaw_opening_m for p in inputs.pictures)
     except SourceError:
         return False
-    return True
 
 
 def _defaults() -> str:

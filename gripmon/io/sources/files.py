@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from gripmon.io.sources.base import SourceError, Stored
-from gripmon.model.images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
-from gripmon.model.images import natural_key as natural_key
-from gripmon.model.images import read_image as read_image
-from gripmon.model.images import regular_bytes
+from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image, regular_bytes
 from gripmon.model.records import Frame
 from gripmon.model.records.values import NS_PER_S
 
@@ -114,6 +111,13 @@ def read_table(path: Path) -> dict[str, TableRow]:
         return _rows(path, lines)
     except csv.Error as error:
         raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
+
+
+def opening_beside(path: Path) -> float | None:
+    """An image's jaw opening (m) in the ``timestamps.csv`` beside it, None if unknown.  Raises :class:`SourceError`."""
+    table = path.parent / TIMESTAMPS_NAME
+    row = read_table(table).get(path.name) if table.exists() else None
+    return None if row is None else row.jaw_opening_m
 
 
 def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:

@@ -57,12 +57,8 @@ class Gripper:
         self.edge_ids = tuple(model.edges)
         self._point_index = {name: i for i, name in enumerate(self.point_ids)}
         finger_index = {name: i for i, name in enumerate(self.finger_ids)}
-        for name, point in model.points.items():
-            if point.finger not in finger_index:
-                raise GripperError(
-                    f"points.{name}.finger: there is no finger '{point.finger}'; one of {', '.join(finger_index)}"
-                )
-        self.point_finger = np.array([finger_index[p.finger] for p in model.points.values()], dtype=np.intp)
+        fingers = [_named(f"points.{n}.finger", "finger", p.finger, finger_index) for n, p in model.points.items()]
+        self.point_finger = np.array(fingers, dtype=np.intp)
         self._nominal_points_m = np.array([p.xyz_m for p in model.points.values()], dtype=float).reshape(-1, 3)
         self._check_places()
         self._rounds = Rounds.of(model.points, self._nominal_points_m)
@@ -201,12 +197,8 @@ class Gripper:
         return np.argsort(np.round(distance_m, 4), kind="stable")
 
     def _ends(self, name: str, edge: EdgeModel) -> tuple[int, int]:
-        for key, point in (("from", edge.start), ("to", edge.end)):
-            if point not in self._point_index:
-                raise GripperError(
-                    f"edges.{name}.{key}: there is no point '{point}'; one of {', '.join(self.point_ids)}"
-                )
-        i, j = self._point_index[edge.start], self._point_index[edge.end]
+        i = _named(f"edges.{name}.from", "point", edge.start, self._point_index)
+        j = _named(f"edges.{name}.to", "point", edge.end, self._point_index)
         if self.point_finger[i] != self.point_finger[j]:
             raise GripperError(f"edges.{name}: its ends lie on two fingers; an edge belongs to one finger")
         if not np.linalg.norm(self._nominal_points_m[i] - self._nominal_points_m[j]) > 1e-4:
@@ -224,23 +216,14 @@ class Gripper:
         return np.vstack([first, via_m, last])
 
     def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> list[FaceLoop]:
-        unknown = [p for p in face.points if p not in self._point_index]
-        if unknown:
-            raise GripperError(
-                f"faces[{index}].points: there is no point '{unknown[0]}'; one of {', '.join(self.point_ids)}"
-            )
-        if face.finger not in finger_index:
-            raise GripperError(
-                f"faces[{index}].finger: there is no finger '{face.finger}'; one of {', '.join(finger_index)}"
-            )
-        loop = np.array([self._point_index[p] for p in face.points], dtype=np.intp)
+        loop = np.array([_named(f"faces[{index}].points", "point", p, self._point_index) for p in face.points])
+        finger = _named(f"faces[{index}].finger", "finger", face.finger, finger_index)
         strange = [p for p in face.points if self.model.points[p].finger != face.finger]
         if strange:
             raise GripperError(
                 f"faces[{index}].points: '{strange[0]}' is not on finger '{face.finger}'; points of that finger"
             )
         corners = self._nominal_points_m[loop]
-        finger = finger_index[face.finger]
         return [FaceLoop(finger, loop[list(flat)]) for flat in self._flat(f"faces[{index}].points", corners)]
 
     def _check_outwards(self) -> None:
@@ -339,6 +322,13 @@ class Gripper:
 
 
 POLARITY = {"any": 0, "right": 1, "left": -1}
+
+
+def _named(key: str, kind: str, name: str, index: Mapping[str, int]) -> int:
+    """The index of a point or finger that is named at ``key``."""
+    if name not in index:
+        raise GripperError(f"{key}: there is no {kind} '{name}'; one of {', '.join(index)}")
+    return index[name]
 
 
 def on_a_line(points_m: Array) -> bool:
