@@ -108,7 +108,7 @@ class Monitor:
         last = None if state is None else state.cam_T_grip
         self._located = last is not None  # here, or before a restart
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
-        self._trust.resume(None if last is None else self._cam_T_grip, self.reference, state)
+        self._trust.resume(None if last is None else self._cam_T_grip, self._renewal.book.in_force, state)
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
             self._analysis.watch.resume(moved=self._policy.drifting)
@@ -136,12 +136,13 @@ class Monitor:
     @property
     def state_revision(self) -> int:
         """Grows with each change of :meth:`state`, except of the last transform and the look."""
-        known = int(self._analysis.of_configured.error is not None) + int(self._trust.unexplained is not None)
+        known = int(self._analysis.of_configured.error is not None) + int(self._trust.question is not None)
         return self._renewal.book.changes + self._policy.alerts.changes + known
 
     def state(self) -> MonitorState:
         """What has to survive a restart."""
-        error, unexplained = self._analysis.of_configured.error, self._trust.unexplained
+        error, question = self._analysis.of_configured.error, self._trust.question
+        answered = None if question is None else question.answered
         return MonitorState(
             self._renewal.book.history,
             self._renewal.book.proposal,
@@ -149,7 +150,8 @@ class Monitor:
             alerts_raised=self._policy.alerts.raised,
             cam_T_grip=to_record(self._trust.last_known(self._cam_T_grip)) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
-            unexplained=msgspec.UNSET if unexplained is None else tuple(unexplained.tolist()),
+            unexplained=msgspec.UNSET if question is None else tuple(question.away.tolist()),
+            explained_from=msgspec.UNSET if answered is None else answered,
             look=self._trust.look_state(self.reference),
         )
 
@@ -197,7 +199,9 @@ class Monitor:
         origin = Origin.UPDATE
         if self._renewal.collect(frame, standing, judgement):
             before, cause = self.reference, evidence.explanation
-            alerts += self._renewal.recalibrate(drift, self._cam_T_grip, cause, self._now_s, frame.stamp_ns)
+            alerts += self._renewal.recalibrate(
+                drift, self._cam_T_grip, cause, self._trust.unexplained, self._now_s, frame.stamp_ns
+            )
             if self.reference is not before:
                 self._begin()
                 drift, origin = drift_between(self._ref_cam_T_grip, self._cam_T_grip), Origin.RECALIBRATION
@@ -286,8 +290,7 @@ class Monitor:
         self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
         self._analysis.rebase(self.reference, configured)
         self._trust.refer(self.reference)
-        if not configured:
-            self._trust.rebase(self.reference)
+        self._trust.rebase(book.in_force)
 
     def _unmeasured(
         self,

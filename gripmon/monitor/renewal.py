@@ -121,10 +121,17 @@ class Renewal:
         )
 
     def recalibrate(
-        self, drift: Drift, cam_T_grip: Array, explanation: Explanation, now_s: float, stamp_ns: int
+        self,
+        drift: Drift,
+        cam_T_grip: Array,
+        explanation: Explanation,
+        unexplained: Array | None,
+        now_s: float,
+        stamp_ns: int,
     ) -> tuple[Alert, ...]:
         """Make the frames since the camera came to rest a reference, or a proposal, or neither; return the alerts.
-        ``cam_T_grip`` (4, 4): where the gripper is now.
+        ``cam_T_grip`` (4, 4): where the gripper is now; ``unexplained`` (6,): how far from its reference the first
+        frames had it, if that is open.
         """
         cause = explanation.probable.cause
         if self.wanted and cause in NO_REFERENCE:
@@ -153,6 +160,12 @@ class Renewal:
         asks = [] if outcome.needs_person is None else [outcome.needs_person]
         if self.book.chosen_by_operator and not asked:
             asks.append("an operator chose the reference in force")
+        if unexplained is not None:
+            asks.append(
+                f"the first frames showed the gripper {1e3 * np.linalg.norm(unexplained[:3]):.2f} mm from where it was "
+                "expected: accept it if the camera was knocked before, not if fingertips, gripper file or reference "
+                "are wrong"
+            )
         if asks:
             self.book.propose(draft)
             parts = [f"{moved}; the new reference {draft.reference_id} waits to be accepted", *asks, explanation.text]

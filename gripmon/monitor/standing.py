@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from gripmon.model.records import Array, Protection
+from gripmon.judge.references import OPERATOR
+from gripmon.model.records import Array, Protection, ReferenceRecord
 from gripmon.monitor.refits import Anchored, Refits
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.look import Fused
@@ -64,3 +66,23 @@ class Standing:
     knocked: bool = False
     unproven: bool = False
     finer: Fused | None = None
+
+
+class Question(NamedTuple):
+    """Whether the mount was knocked before the start, or the gripper file, the taught edges or the reference are wrong:
+    the first frames showed the gripper ``away`` (6,) from where it was expected, m and rad, at a ``revision`` of the
+    reference.  An operator who accepts a new reference, ``answered`` with its revision, says that it was a knock.
+    """
+
+    away: Array
+    revision: int
+    answered: int | None = None
+
+    def open_at(self, revision: int) -> bool:
+        """Whether it is open with the reference of a revision: with those from the answer on it isn't."""
+        return self.answered is None or revision < self.answered
+
+    def with_reference(self, reference: ReferenceRecord) -> Question:
+        """The question once a reference is in force."""
+        answers = reference.accepted_by == OPERATOR and reference.revision > self.revision
+        return self._replace(answered=reference.revision) if self.answered is None and answers else self

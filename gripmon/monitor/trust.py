@@ -21,7 +21,7 @@ from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, Monito
 from gripmon.monitor.finer import FinerLook
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.standing import Standing, Trust
+from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
 from gripmon.track.edges import Measurement
@@ -83,8 +83,15 @@ class Integrity:
 
     @property
     def unexplained(self) -> Array | None:
-        """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't."""
+        """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't, or an
+        operator has said why.
+        """
         return self._weigher.unexplained
+
+    @property
+    def question(self) -> Question | None:
+        """The same, also once it is answered."""
+        return self._weigher.question
 
     @property
     def swing(self) -> Array:
@@ -102,10 +109,12 @@ class Integrity:
 
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
         """Continue after a restart: from the last known pose (4, 4), with the kept look."""
-        self._weigher.rebase(reference, last_T)
         if state is not None and state.unexplained is not msgspec.UNSET:
             # What an earlier run couldn't explain, a restart doesn't either.
-            self._weigher.unexplained = np.array(state.unexplained)
+            answered = None if state.explained_from is msgspec.UNSET else state.explained_from
+            revision = state.references[-1].revision
+            self._weigher.question = Question(np.array(state.unexplained), revision, answered)
+        self._weigher.rebase(reference, last_T)
         if state is not None and state.look is not None:
             try:
                 self._look.restore(state.look, reference.reference_id)
@@ -130,9 +139,10 @@ class Integrity:
         return [] if self._finer is None else self._finer.take_alerts()
 
     def last_known(self, cam_T_grip: Array) -> Array:
-        """The newest pose (4, 4) if it was believed, else the anchor's."""
-        anchor = self._weigher.anchor
-        return cam_T_grip if self._believed or anchor is None else anchor.cam_T_grip
+        """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
+        pose that nothing proved mustn't be what a restart expects.
+        """
+        return cam_T_grip if self._believed and self._weigher.anchor is not None else self._weigher.expected[0]
 
     def rivals(self, ref_cam_T_grip: Array) -> tuple[Array, ...]:
         """Where else the gripper may be: at the anchor, and where the reference has it."""

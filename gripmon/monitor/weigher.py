@@ -32,7 +32,7 @@ from gripmon.monitor.refits import (
     reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.standing import Trust
+from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges, sides
 from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
@@ -97,19 +97,26 @@ class Weigher:
         self.swing: Array = np.zeros(6)
         """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         self.anchor: Anchor | None = None
+        self.question: Question | None = None
+        """By how much the first proven pose differed from the expected one; None if it didn't."""
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
     def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
-        """Expect the gripper at a reference, or at the last known pose (4, 4), until a frame proves a pose.  An
-        unexplained difference from an older reference no longer counts.
+        """Expect the gripper at a reference (the original, if one is restored) or at the last known pose (4, 4), until
+        a frame proves a pose.
         """
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
-        self.unexplained: Array | None = None
-        """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't."""
-        self._reference_T = from_record(reference.cam_T_grip)
+        if self.question is not None:
+            self.question = self.question.with_reference(reference)
+        self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
+
+    @property
+    def unexplained(self) -> Array | None:
+        """(6,) what every bound includes of the open question, m and rad; None for nothing."""
+        return self.question.away if self.question is not None and self.question.open_at(self._revision) else None
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -174,17 +181,15 @@ class Weigher:
             if displaced:
                 away = perturbation_between(self._expected[0], cam_T_grip)
                 protection = larger(protection, self._not_as_expected(away))
-            if self.unexplained is not None:
-                protection = larger(protection, self._not_as_expected(self.unexplained))
-            return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
+            return Trust(
+                self._questioned(protection), proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of
+            )
         # Hypotheses since the anchor, and the most probable one.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
-        protection = protection_of(all_along + since, risk)
-        if self.unexplained is not None:
-            protection = larger(protection, self._not_as_expected(self.unexplained))
+        protection = self._questioned(protection_of(all_along + since, risk))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
@@ -226,7 +231,7 @@ class Weigher:
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
-            self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
+            self.question = Question(perturbation_between(self._expected[0], cam_T_grip), self._revision)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
         else:
@@ -311,6 +316,11 @@ class Weigher:
         """
         bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
         return past_alert_limit(bound, self._policy) is None
+
+    def _questioned(self, protection: Protection) -> Protection:
+        """A bound that includes what the first frames differed by, unless an operator has said why."""
+        away = self.unexplained
+        return protection if away is None else larger(protection, self._not_as_expected(away))
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""

@@ -72,8 +72,12 @@ class MonitorState(msgspec.Struct, frozen=True):
         tuple[float, ...] | msgspec.UnsetType,
         Meta(
             description="6 numbers, m and rad: by how much the first proven transform differed from where the gripper "
-            "was expected; every bound includes it until there is a new reference; absent if it didn't"
+            "was expected; every bound includes it until an operator accepts a new reference; absent if it didn't"
         ),
+    ] = msgspec.UNSET
+    explained_from: Annotated[
+        int | msgspec.UnsetType,
+        Meta(description="revision of the reference that an operator accepted then; absent while there is none"),
     ] = msgspec.UNSET
     look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
         None
