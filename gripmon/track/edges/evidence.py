@@ -22,7 +22,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
 from gripmon.track.edges.prediction import FEWEST_SAMPLES
 from gripmon.track.edges.profiles import Edgels, weigh
-from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
+from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls, prior_information
 from gripmon.track.edges.settling import ZOOMS, Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
@@ -39,12 +39,11 @@ two may give less, such as a shadow, the finger's other side, or something behin
 FINGER_FOUND_SHARE = 0.55
 """Least inlier ratio of a finger there: other things have a straight edge or two as well."""
 
-FEWEST_SHARE = 0.4
-"""Least inlier ratio of a stretch that counts as seen; at least as many inliers as an edge needs."""
+STRETCH_SEEN_SHARE = 0.4
+"""Least inlier ratio of a stretch that counts as seen; it also needs as many inliers as an edge's own line."""
 
-_STEP_PX = 2.0
-_REFINED = 3
-_FIXED = 1e12  # information of an opening that stays
+_STEP_PX = 2.0  # of the grid of shifts that a finger's fit starts from; px of the zoomed image
+_REFINED = 3  # shifts of the grid that are fitted
 
 
 class _Place(NamedTuple):
@@ -152,7 +151,7 @@ class FingerMeter(Settler):
         edgels = replace(edgels, weight=np.where(own[edgels.candidates.sample] == finger, edgels.weight, 0.0))
         best: _Place | None = None
         for start in starts:
-            information = np.full(len(start), _FIXED)
+            information = prior_information(0.0)[: len(start)]  # the opening stays
             information[:6] = FINGER_SIGMA**-2
             fit = fit_irls(edgels, Prior(start, information), start, self._settings.consensus)
             share = np.count_nonzero(fit.supported) / sampled
@@ -307,5 +306,5 @@ def _points(place: _Place) -> NDArray[np.intp]:
     number = prediction.layout.stretch
     profiles = np.bincount(number[prediction.ok], minlength=int(number.max(initial=0)) + 1)
     points = np.bincount(number[candidates.sample[index]], minlength=len(profiles))
-    good = (points >= FEWEST_SAMPLES) & (points >= FEWEST_SHARE * profiles)
+    good = (points >= FEWEST_SAMPLES) & (points >= STRETCH_SEEN_SHARE * profiles)
     return index[good[number[candidates.sample[index]]]]
