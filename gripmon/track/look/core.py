@@ -41,8 +41,8 @@ pixel's scatter is known to 1/sqrt(24) = 0.2.
 """
 
 MANY_VIEWS, RELEARN_S = 100, 0.1
-"""Frames learnt one after the other, what isn't the gripper's averages to a tenth; then so many seconds apart: frames
-of a fast camera show nearly the same, and forgetting takes hours.
+"""Number of frames that are learnt one after the other, so that what isn't the gripper's averages to a tenth; and pause
+between later ones, s: frames of a fast camera show nearly the same, and forgetting takes hours.
 """
 
 LAY_OUT_AGAIN_S = 60.0
@@ -57,10 +57,9 @@ CHANGED_BACKGROUND_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
-"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
-
-ELSEWHERE_M = 2e-3
-"""From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
+"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm.  From the
+second on a patch must look otherwise to count: things that are mistaken for a tip lie farther off than the first.
+"""
 
 CONSTANT_PATCH_LENGTH = 0.7
 """Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
@@ -70,9 +69,6 @@ KEPT_PATCHES = 16
 
 DISAGREEING_FRAME_WEIGHT = 0.125
 """Of a frame in which a known patch disagrees, when it is learnt: mostly something hides it, rarely it has changed."""
-
-SMALLEST_CONTRAST_LEVELS = 1.0
-"""Contrast (root mean square) below which a patch has none, in steps of grey."""
 
 
 def _without_light() -> Array:
@@ -97,7 +93,7 @@ class GripperLook:
         axis = np.asarray(axis_grip, dtype=float)
         steps_m = np.array([sign * way for way in SLIDES_M for sign in (1.0, -1.0)])
         self._slides_grip_m = steps_m[:, None] * (axis / np.linalg.norm(axis))
-        self._far = np.abs(steps_m) >= ELSEWHERE_M - 1e-9
+        self._far = np.abs(steps_m) > SLIDES_M[0]
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.forget()
 
@@ -343,10 +339,12 @@ class GripperLook:
 
 
 def _texture(values: NDArray[np.float32], quantum: float) -> NDArray[np.float32]:
-    """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero without contrast."""
+    """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero where their root mean
+    square is no more than a step of grey, ``quantum``.
+    """
     texture = values @ _TEXTURE
     length = np.sqrt(np.einsum("np,np->n", texture, texture))
-    shows = length > SMALLEST_CONTRAST_LEVELS * quantum * math.sqrt(POINTS)
+    shows = length > quantum * math.sqrt(POINTS)
     np.divide(texture, length[:, None], out=texture, where=shows[:, None])
     texture[~shows] = 0.0
     return texture
