@@ -33,8 +33,7 @@ MODEL_M = 3e-5
 """Standard deviation of the edges' places in a gripper file, m; it counts while there is no baseline."""
 
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
-SETTLED_JAW_M = float(SETTLED_SIGMA[0])
-"""Standard deviations of the pose (m and rad) and the opening (m) that a baseline knows."""
+"""Standard deviations of the pose that a baseline knows, m and rad; the first also of the opening."""
 
 LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
@@ -145,8 +144,8 @@ def _knowledge(
         return Knowledge(pose, JAW_UNREPORTED_SIGMA_M, jaw_reported=False)
     if baseline is None:
         jaw_m = 0.0 if exact else math.hypot(report.sigma_m, report.offset_sigma_m)
-        return Knowledge(reference_sigma, max(jaw_m, SETTLED_JAW_M), jaw_reported=True)
-    jaw_m = SETTLED_JAW_M
+        return Knowledge(reference_sigma, max(jaw_m, float(SETTLED_SIGMA[0])), jaw_reported=True)
+    jaw_m = float(SETTLED_SIGMA[0])
     if baseline.jaw_reported_m is not None and not exact:
         # The part of the report's error that changes is another one some way on.
         way_m = abs(jaw_reported_m - baseline.jaw_reported_m)
