@@ -13,7 +13,7 @@ import pytest
 
 from gripmon.judge.stream import (
     FEWEST_INNER,
-    STOOD_SHARE,
+    STILL_PIXEL_SHARE,
     StreamFault,
     StreamSettings,
     StreamWatch,
@@ -349,7 +349,9 @@ def test_large_parts_that_stand_are_counted_alike_by_numpy(dtype: type):
             before[rng.uniform(size=before.shape) < cut_off] = 0
             sample = np.where(rng.uniform(size=before.shape) < share, before, before + dtype(3))
             inner = (sample > sample.min()) & (sample < sample.max())
-            expected = inner.sum() >= FEWEST_INNER and STOOD_SHARE * inner.sum() <= (inner & (sample == before)).sum()
+            expected = (
+                inner.sum() >= FEWEST_INNER and STILL_PIXEL_SHARE * inner.sum() <= (inner & (sample == before)).sum()
+            )
             assert _stands_in_large_parts(sample, before) == expected
             told.append(bool(expected))
     assert 2 < sum(told) < 11
