@@ -195,8 +195,8 @@ class FingerEnds:
         prediction, candidates = measurement.prediction, measurement.candidates
         # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
-        shift_px = np.repeat(offset_px[:, None] * prediction.normal[probes.sample], len(PROBES_PX), axis=0)
-        shift_px = shift_px.astype(np.float32)
+        of_edge_px = (offset_px[:, None] * prediction.normal[probes.sample]).astype(np.float32)
+        shift_px = np.repeat(of_edge_px, len(PROBES_PX), axis=0)
         maps = probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:]
         profiles = read_profiles(image, *maps, self._settings.response)
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)

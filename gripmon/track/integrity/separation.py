@@ -224,8 +224,9 @@ class Doubts:
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
+        squares, spacing, guide, step = QUANTILES
         position, rotation, number = kernel.levels(
-            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, *QUANTILES
+            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, squares, spacing, guide, step
         )
         return position, rotation, self.name[number] if number >= 0 else ""
 
