@@ -50,7 +50,8 @@ LAY_OUT_AGAIN_S = 60.0
 
 CHANGED_CORRELATION = 0.5
 """Correlation of some pixels with what they showed before, below which they show something else: a patch beside a
-finger another background, a block on it another look.
+finger another background, a block on it another look.  A patch of which two frames correlate by more on average is the
+gripper's: that is the square of the length of the mean of its unit vectors.
 """
 
 CHANGED_BACKGROUND_SHARE = 0.33
@@ -60,9 +61,6 @@ SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
 """Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm.  From the
 second on a patch must look otherwise to count: things that are mistaken for a tip lie farther off than the first.
 """
-
-CONSTANT_PATCH_LENGTH = 0.7
-"""Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
 
 KEPT_PATCHES = 16
 """Most telling ones of a finger that poses are compared with: 512 points on two fingers."""
@@ -302,7 +300,7 @@ class GripperLook:
         length = np.linalg.norm(self._mean, axis=1)
         alike = np.einsum("knp,np->kn", look, self._mean) / np.maximum(length, 1e-12)
         agree = alike > AGREEING_CORRELATION
-        known = (length > CONSTANT_PATCH_LENGTH) & (self._weight > FEWEST_VIEWS / 2)
+        known = (length**2 > CHANGED_CORRELATION) & (self._weight > FEWEST_VIEWS / 2)
         weight = np.where(known & ~agree[0], DISAGREEING_FRAME_WEIGHT, 1.0) * inside[0]
         self._weight = np.maximum(kept * self._weight, np.minimum(self._weight, FEWEST_VIEWS)) + weight
         share = weight / np.maximum(self._weight, 1e-12)
@@ -319,7 +317,7 @@ class GripperLook:
         """The patches of each finger that tell most: always the same where they are, and another view elsewhere."""
         length = np.linalg.norm(self._mean, axis=1)
         chance = self._chance[self._far].max(axis=0)
-        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
+        tells = (length**2 > CHANGED_CORRELATION) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
         worth = np.where(tells, length - chance, -np.inf)
         best = []
         for finger in range(len(self._first)):
