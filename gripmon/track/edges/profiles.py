@@ -20,7 +20,7 @@ from gripmon.track.edges.kernel import FEWEST_AGREEING
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
-_CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)  # the kernel of read_profiles, every half pixel
+_CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)  # the weights of read_profiles, every half pixel
 
 BESIDE_SAMPLES = (4, 10)
 """From where to where beside an edge grey levels are averaged and texture is looked for that may shift it, in samples
