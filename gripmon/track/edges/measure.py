@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
-from gripmon.track.edges.evidence import FingerMeter
+from gripmon.track.edges.evidence import ELSEWHERE_SHARE_RATIO, FingerMeter
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
 from gripmon.track.edges.profiles import unevenness
 from gripmon.track.edges.robust_fit import (
@@ -52,9 +52,6 @@ SATISFYING_SHARE_RATIO = 0.65
 
 TRUSTED_SHARE_RATIO = 0.4
 """Fraction of the usual inlier ratio below which a fit is not believed, whatever the settings allow."""
-
-ELSEWHERE_SHARE_RATIO = 1.3
-"""Least inlier ratio elsewhere over that of a trusted fit where the gripper was expected."""
 
 
 @dataclass(frozen=True, slots=True)
