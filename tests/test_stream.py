@@ -241,6 +241,12 @@ def test_the_usual_rate_is_learnt_from_six_blocks_that_span_two_seconds(fps: flo
     assert watch._rate.usual_ns == pytest.approx(1e9 / fps, rel=1e-6)
 
 
+def test_the_usual_rate_is_learnt_in_the_time_that_shows_another_one():
+    watch = StreamWatch(StreamSettings(rate_s=5.0))
+    assert not any(kinds(watch, frames(0, round(4.9 * FPS)))) and watch._rate.usual_ns is None
+    assert not any(kinds(watch, frames(round(4.9 * FPS), round(0.5 * FPS)))) and watch._rate.usual_ns is not None
+
+
 def test_the_rate_is_that_of_the_last_64_intervals():
     watch = StreamWatch()
     well = frames(0, 100)
