@@ -36,6 +36,8 @@ SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
 """Standard deviations of the pose that a baseline knows, m and rad; the first also of the opening."""
 
 LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
+"""Causes with which the blur may change."""
+
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
 """Standard deviation of the blur while the lens is unchanged, and the range of its changes otherwise, px."""
 
@@ -44,8 +46,10 @@ LOWEST_BLUR_LOG_RATIO = -40.0
 
 ABSENT_PROBABILITY = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 """How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
-several things happened; with every other cause it is a ``STRAY_PROBABILITY``."""
+several things happened."""
+
 STRAY_PROBABILITY = 0.02
+"""The same with every other cause, and with a bent finger that is seen itself."""
 
 BLOCKED_VIEW_PROBABILITY = 0.15
 """Prior probability of a blocked view where a finger isn't seen."""

@@ -136,9 +136,9 @@ STUDENT_FREEDOM = 3.0
 LEAST_SHARE = 1e-9
 """Of an edge's weight, so that an edge that belongs to something else still has an offset."""
 
-_COARSE_PX = 1.0
-_COARSE_ROUNDS, _FINE_ROUNDS = 3, 8
-_CONVERGED_PX = 2e-3
+_COARSE_PX = 1.0  # standard deviation that is added to each piece's own, so that all count alike at first
+_COARSE_ROUNDS, _FINE_ROUNDS = 3, 8  # steps with it; most steps with the weights that residuals give
+_CONVERGED_PX = 2e-3  # largest motion of a piece by a step that ends the fit
 
 
 @dataclass(frozen=True, slots=True)

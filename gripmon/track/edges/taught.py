@@ -33,6 +33,8 @@ from gripmon.model.records import Array, Transform
 from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
+"""Bound on an edge's offset in a file, m: more is another edge, or another unit."""
+
 SAME_POSE = 1e-6
 """Poses are the same if no element of their matrices (m, no unit) differs by more: files hold rounded numbers."""
 

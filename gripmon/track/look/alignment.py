@@ -39,6 +39,7 @@ CLOSE_PX = 0.1
 """Step of the alignment up to which the image isn't read again, px: central differences are a fifth too small."""
 
 READINGS = 3
+"""Times that the image is read in one alignment, at most."""
 
 LEAST_DN = 0.5
 """Scatter below which no pixel is believed, steps of grey: the root mean square of rounding is 0.3."""
