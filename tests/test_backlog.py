@@ -14,7 +14,7 @@ from support.watched import FPS, frames_of, new_monitor, rendered, replaced
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Cause, CauseWeight, Explanation, Frame, Origin, to_json
 from gripmon.monitor import Tracker
-from gripmon.monitor.analysis import CONFIRMED_AFTER_S, EVERY, CauseAnalysis
+from gripmon.monitor.analysis import CONCLUDED_EVERY, CONFIRMED_AFTER_S, CauseAnalysis
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario
@@ -100,13 +100,14 @@ def test_a_further_conclusion_is_urgent_only_while_no_cause_is_known():
     judge = SimpleNamespace(wants_baseline=False, add=lambda _: None, reset=lambda: None, explanation=explanation)
     analysis = CauseAnalysis(judge)
     texts = []
-    for number in range(3 * EVERY + 1):
+    for number in range(3 * CONCLUDED_EVERY + 1):
         now_s = number / 60.0
         analysis.catch_up(now_s)
         frame = Frame(number, number, np.zeros((2, 2), np.uint8), None)
         texts.append(analysis.ask(True, False, frame, lambda kept: None, np.eye(4), now_s).text)
     known = [next(n for n, text in enumerate(texts) if text == each) for each in ("4", "5")]
-    asked = np.array([1, 2]) * EVERY - 1  # of these frames the first conclusion that names a cause, and one more
+    # Of these frames the first conclusion that names a cause, and one more.
+    asked = np.array([1, 2]) * CONCLUDED_EVERY - 1
     assert (known - asked).tolist() == [round(60.0 * RESULT_AFTER_S), round(60.0 * CONFIRMED_AFTER_S)]
 
 

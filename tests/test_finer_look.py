@@ -31,7 +31,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, finer
-from gripmon.monitor.finer import DIFFERENT_S
+from gripmon.monitor.finer import RENEWED_AFTER_S
 from gripmon.monitor.settings import LookSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Creep, FingerLook, Tilt
@@ -401,9 +401,9 @@ def test_a_finger_that_looks_different_for_minutes_is_told_once():
     (learnt_at, first), (at, alert), _ = told
     assert learnt_at < 20 and first.severity is Severity.INFO
     assert f"looks different: finger {simulation.gripper.finger_ids[0]}, since 20" in alert.text
-    assert at >= 20 + DIFFERENT_S / 10.0
+    assert at >= 20 + RENEWED_AFTER_S / 10.0
     painted_ns, found_ns = (simulation.frame(i).stamp_ns for i in (20, at))
-    assert alert.since_ns is not None and painted_ns <= alert.since_ns <= found_ns - 1e9 * DIFFERENT_S
+    assert alert.since_ns is not None and painted_ns <= alert.since_ns <= found_ns - 1e9 * RENEWED_AFTER_S
     notes = [each.look for _, each in told]
     assert [note.version.number for note in notes if note is not msgspec.UNSET] == [1, 1, 2]
     note = alert.look

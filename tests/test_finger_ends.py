@@ -18,8 +18,9 @@ from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
-from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement, MeasurementSettings
 from gripmon.track.edges.roles import along_fingers
+from gripmon.track.edges.settings import EdgeSettings
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
@@ -82,6 +83,12 @@ def test_in_free_view_both_fingers_show_their_ends(scenario: Scenario):
     assert abs(slide_of(found)) < 5e-5
     assert ends.sure and (ends.seen >= 2).all()
     np.testing.assert_array_equal(ends.might, [3, 3])
+
+
+@pytest.mark.parametrize("blur_px", [0.4, 1.1, 1.8])
+def test_the_ends_are_seen_with_any_edge_filter_that_the_search_lines_hold(blur_px: float):
+    using, image = meter(settings=MeasurementSettings(edges=EdgeSettings(blur_px=blur_px))), picture(PLAIN)
+    assert using.ends(image, measure(image, nominal_cam_T_grip(), using=using)).sure
 
 
 def test_one_finger_with_its_end_hidden_proves_nothing_and_the_other_one_is_seen():

@@ -13,7 +13,7 @@ from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump
 from gripmon.track.integrity import Doubts, Separation, kernel, separation
-from gripmon.track.integrity.separation import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
+from gripmon.track.integrity.separation import QUANTILES, Tails
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
 HYPOTHESES, EDGES, FINGERS = 14, 8, 2
@@ -96,7 +96,7 @@ def test_averages_are_those_of_numpy(seed: int):
 
 def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:
     """Of the kernel."""
-    return kernel.levels(prior, away, *tails, risk, 1.02, SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP)
+    return kernel.levels(prior, away, *tails, risk, 1.02, *QUANTILES)
 
 
 @pytest.mark.parametrize("risk", [1e-1, 1e-3, 1e-5, 1e-9, 1e-13])

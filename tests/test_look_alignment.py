@@ -17,7 +17,7 @@ from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import FingerLook, JawScript, Light, LightStep, Shadow, Tilt
 from gripmon.track.look import LookAlignment, LookFusion, LookMotion, alignment, kernel
 from gripmon.track.look.alignment import FEWEST_VIEWS, LINEAR_PX
-from gripmon.track.look.fusion import MEMORY, PER_OPENING
+from gripmon.track.look.fusion import BIAS_BACKGROUNDS, PER_OPENING
 
 LEARNT = 20
 TEXTURED = FingerLook(texture=0.15, carriers=False)
@@ -247,7 +247,7 @@ def test_the_fused_pose_scatters_less_than_either_and_about_the_edges_mean():
     fused = fused_path(np.zeros((1000, 3)), rng, LookFusion(0.03))[200:]
     edges_um = 1e6 * np.sqrt(EDGES.diagonal()[:3])
     assert (1e6 * fused.std(axis=0) < 0.45 * edges_um).all()
-    assert (1e6 * np.abs(fused.mean(axis=0)) < 4.0 * edges_um / np.sqrt(MEMORY)).all()
+    assert (1e6 * np.abs(fused.mean(axis=0)) < 4.0 * edges_um / np.sqrt(BIAS_BACKGROUNDS)).all()
 
 
 def test_no_direction_is_worse_than_the_edges_from_the_first_frame_that_is_measured():

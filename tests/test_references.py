@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gripmon.judge.references import KEPT, CommandRefused, ReferenceBook, chain_fault, state_fault
+from gripmon.judge.references import KEPT_REFERENCES, CommandRefused, ReferenceBook, chain_fault, state_fault
 from gripmon.model.records import Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform
 
 COVARIANCE = np.diag([1e-10, 2e-10, 9e-10, 1e-8, 2e-8, 3e-8])
@@ -222,10 +222,10 @@ def test_whatever_is_asked_the_chain_holds_together_and_can_be_kept(steps: list[
 
 def test_thousands_of_references_keep_the_first_and_the_newest():
     book = ReferenceBook(configured())
-    for i in range(KEPT + 50):
+    for i in range(KEPT_REFERENCES + 50):
         adopt(book, i % 7)
-    assert len(book.history) == KEPT and book.history[0] == configured()
-    assert [r.revision for r in book.history[1:]] == list(range(52, KEPT + 51))
+    assert len(book.history) == KEPT_REFERENCES and book.history[0] == configured()
+    assert [r.revision for r in book.history[1:]] == list(range(52, KEPT_REFERENCES + 51))
     assert chain_fault(book.history) == ""
     gone = book.history[1].parent
     assert gone is not None

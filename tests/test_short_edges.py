@@ -18,7 +18,7 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import prediction_kernel
-from gripmon.track.edges.prediction import BORDER_PX, ROWS, SHORTEST_PX, independent_part, lay_out
+from gripmon.track.edges.prediction import BORDER_PX, ROWS, independent_part, lay_out
 from gripmon.track.edges.profiles import find_candidates, profile_offsets_px, read_profiles
 from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
@@ -52,7 +52,7 @@ TIPS = ["half round", "three facets"]
 def test_the_margin_at_the_ends_of_short_edges_is_halved_at_most(length_px: float, left_px: float):
     uv_px = np.column_stack([np.linspace(20.0, 20.0 + length_px, 65), np.full(65, 30.0)])[None]
     one = np.ones((1, 65), dtype=bool)
-    ranges = prediction_kernel.sampled_ranges(uv_px, one, one[:, 0], MARGIN_PX, SHORTEST_PX)
+    ranges = prediction_kernel.sampled_ranges(uv_px, one, one[:, 0], MARGIN_PX, shortest_px=4.0)
     assert ranges[0, 2] == pytest.approx(left_px, abs=1e-6)
     if left_px:
         assert ranges[0, 0] == pytest.approx(0.5 - 0.5 * left_px / length_px)

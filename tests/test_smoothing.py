@@ -16,7 +16,7 @@ from support.box_models import random_rotation
 from support.by_numpy import smoothing as by_numpy
 
 from gripmon.judge import smoothing
-from gripmon.judge.smoothing import SETTLING, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
+from gripmon.judge.smoothing import SETTLING_FRAMES, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
 
 SETTINGS = SmoothingSettings()
 PERIOD_S = 1.0 / 60.0
@@ -395,7 +395,7 @@ def test_what_is_handed_over_is_not_changed():
     covariance, pose = spread(), TRUE.copy()
     given = covariance.copy()
     average = PoseAverage(SETTINGS)
-    for _ in range(SETTLING + 5):
+    for _ in range(SETTLING_FRAMES + 5):
         average.wander(1.0)
         average.add(pose, covariance)
     np.testing.assert_array_equal(covariance, given)

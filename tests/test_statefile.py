@@ -18,7 +18,7 @@ from support.simulated import BOX_FINGERS
 from support.state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
 from test_references import adopt, broken, configured
 
-from gripmon.judge.references import KEPT, ReferenceBook
+from gripmon.judge.references import KEPT_REFERENCES, ReferenceBook
 from gripmon.judge.statefile import (
     Owner,
     StateFileError,
@@ -331,7 +331,7 @@ def test_the_lock_goes_with_its_process(path: Path):
 
 def test_thousands_of_references_are_kept_whole(path: Path):
     book = ReferenceBook(configured())
-    for i in range(KEPT + 5):
+    for i in range(KEPT_REFERENCES + 5):
         adopt(book, i % 7)
     file = opened(path)
     assert file.write(MonitorState(book.history))

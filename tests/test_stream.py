@@ -13,7 +13,7 @@ import pytest
 
 from gripmon.judge.stream import (
     FEWEST_INNER,
-    STOOD_SHARE,
+    STILL_PIXEL_SHARE,
     StreamFault,
     StreamSettings,
     StreamWatch,
@@ -241,6 +241,12 @@ def test_the_usual_rate_is_learnt_from_six_blocks_that_span_two_seconds(fps: flo
     assert watch._rate.usual_ns == pytest.approx(1e9 / fps, rel=1e-6)
 
 
+def test_the_usual_rate_is_learnt_in_the_time_that_shows_another_one():
+    watch = StreamWatch(StreamSettings(rate_s=5.0))
+    assert not any(kinds(watch, frames(0, round(4.9 * FPS)))) and watch._rate.usual_ns is None
+    assert not any(kinds(watch, frames(round(4.9 * FPS), round(0.5 * FPS)))) and watch._rate.usual_ns is not None
+
+
 def test_the_rate_is_that_of_the_last_64_intervals():
     watch = StreamWatch()
     well = frames(0, 100)
@@ -349,7 +355,9 @@ def test_large_parts_that_stand_are_counted_alike_by_numpy(dtype: type):
             before[rng.uniform(size=before.shape) < cut_off] = 0
             sample = np.where(rng.uniform(size=before.shape) < share, before, before + dtype(3))
             inner = (sample > sample.min()) & (sample < sample.max())
-            expected = inner.sum() >= FEWEST_INNER and STOOD_SHARE * inner.sum() <= (inner & (sample == before)).sum()
+            expected = (
+                inner.sum() >= FEWEST_INNER and STILL_PIXEL_SHARE * inner.sum() <= (inner & (sample == before)).sum()
+            )
             assert _stands_in_large_parts(sample, before) == expected
             told.append(bool(expected))
     assert 2 < sum(told) < 11

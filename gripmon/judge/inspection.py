@@ -13,9 +13,6 @@ _DARK, _FLAT = 0.02, 0.01
 that from the top, flat if its grey levels spread no more than the second.
 """
 
-_FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
-
-
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): 1.0}
 """Largest grey level of the types that images may have."""
 
@@ -55,7 +52,9 @@ def _grey_levels(pixels: Image) -> tuple[Refusal, str] | None:
         return Refusal.WRONG_TYPE, f"float pixels from {low:g} to {high:g}; float images in 0 to 1"
     if high <= _DARK * scale:
         said = f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
-        return Refusal.BLACK, said + (_FEWER_BITS if pixels.dtype == np.uint16 and high > 0.0 else "")
+        if pixels.dtype == np.uint16 and high > 0.0:
+            said += " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
+        return Refusal.BLACK, said
     if low >= (1.0 - _DARK) * scale:
         return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
     if high - low <= _FLAT * scale:

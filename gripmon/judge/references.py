@@ -17,17 +17,11 @@ import numpy as np
 from gripmon.model.geometry import to_record
 from gripmon.model.records import Array, Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform, to_json
 
-KEPT = 1000
+KEPT_REFERENCES = 1000
 """References that are kept: the configured one and the newest.  One takes 1 to 2 kB; undo can't go back further."""
 
-CONFIGURATION, MONITOR, OPERATOR = "configuration", "monitor", "operator"
-"""Who accepted a reference."""
-
-UNDO, RESET = "undo", "reset"
-"""Origins of references that an operator brought back."""
-
 _TOLERANCE = 1e-6  # of a quaternion's length, and of a normalised covariance's symmetry: files hold rounded numbers
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # of a normalised covariance's eigenvalues
 
 
 Keep = Callable[[tuple["ReferenceRecord", ...]], str]
@@ -82,7 +76,7 @@ class ReferenceBook:
 
     @property
     def history(self) -> tuple[ReferenceRecord, ...]:
-        """From the configured reference to the one in force; with more than ``KEPT``, a gap follows the first."""
+        """From the configured reference to the one in force; a gap follows the first where some are no longer kept."""
         return self._references
 
     @property
@@ -98,7 +92,7 @@ class ReferenceBook:
     @property
     def chosen_by_operator(self) -> bool:
         """Whether an operator went back to the reference in force: a monitor shouldn't overrule that on its own."""
-        return self.current.origin in (UNDO, RESET)
+        return self.current.origin in ("undo", "reset")
 
     def draft(
         self,
@@ -115,7 +109,7 @@ class ReferenceBook:
         ``cam_T_grip`` (4, 4), m; ``covariance`` (6, 6), m² and rad²; ``stamp_ns`` of the newest frame behind it.
         """
         flat = tuple(np.asarray(covariance, dtype=float).ravel().tolist())
-        return self._next(to_record(cam_T_grip), flat, stamp_ns, origin, MONITOR, cause=cause, inputs=inputs)
+        return self._next(to_record(cam_T_grip), flat, stamp_ns, origin, "monitor", cause=cause, inputs=inputs)
 
     def adopt(self, draft: ReferenceRecord) -> ReferenceRecord:
         """Put a draft in force on the monitor's own decision.  Raises ValueError for a draft made for another revision,
@@ -132,7 +126,7 @@ class ReferenceBook:
 
     def accept(self, proposal_id: str = "") -> ReferenceRecord:
         """The proposal becomes the reference.  Raises :class:`CommandRefused`."""
-        return self._append(msgspec.structs.replace(self._meant(proposal_id), accepted_by=OPERATOR))
+        return self._append(msgspec.structs.replace(self._meant(proposal_id), accepted_by="operator"))
 
     def reject(self, proposal_id: str = "") -> ReferenceRecord:
         """Drop the proposal and return it.  Raises :class:`CommandRefused`."""
@@ -158,18 +152,18 @@ class ReferenceBook:
                 raise CommandRefused(
                     f"{in_force.parent} is too long ago and no longer kept; reset goes back to the configured reference"
                 )
-        return self._restore(self._original(earlier), UNDO, stamp_ns)
+        return self._restore(self._original(earlier), "undo", stamp_ns)
 
     def reset(self, stamp_ns: int) -> ReferenceRecord:
         """Go back to the configured reference.  Raises :class:`CommandRefused`."""
-        return self._restore(self.configured, RESET, stamp_ns)
+        return self._restore(self.configured, "reset", stamp_ns)
 
     def _restore(self, earlier: ReferenceRecord, origin: str, stamp_ns: int) -> ReferenceRecord:
         if self.in_force.reference_id == earlier.reference_id:
             raise CommandRefused(f"{earlier.reference_id} is in force already, as revision {self.current.revision}")
         return self._append(
             self._next(
-                earlier.cam_T_grip, earlier.covariance, stamp_ns, origin, OPERATOR, restores=earlier.reference_id
+                earlier.cam_T_grip, earlier.covariance, stamp_ns, origin, "operator", restores=earlier.reference_id
             )
         )
 
@@ -204,7 +198,7 @@ class ReferenceBook:
     def _append(self, reference: ReferenceRecord) -> ReferenceRecord:
         """Put a reference in force, stored first: a crash must not lose one in use, nor reuse its revision."""
         references = (*self._references, reference)
-        if len(references) > KEPT:
+        if len(references) > KEPT_REFERENCES:
             references = (references[0], *references[2:])
         if fault := self._keep(references):
             raise CommandRefused(f"{reference.reference_id} is not put in force, as a restart would lose it: {fault}")

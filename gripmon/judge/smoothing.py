@@ -32,32 +32,33 @@ from gripmon.model.records import Array
 GATE_SQUARE = chi_square_limit(1e-6)
 """Gate on the squared normalised innovation: normal errors exceed it once in a million frames."""
 
-SETTLING, SETTLING_GATE = 20, 14.0
-"""Number of frames after a start during which the gate is this narrower value (χ² that 3 % of frames with normal errors
-exceed), and one frame outside it restarts the average: the mount may still be ringing, and a restart costs little."""
+SETTLING_FRAMES, SETTLING_GATE_SQUARE = 20, chi_square_limit(0.03)
+"""Number of frames after a start during which the gate is this narrower value, which 3 % of frames with normal errors
+exceed, and one frame outside it restarts the average: the mount may still be ringing, and a restart costs little."""
 
-SMALLEST_VARIANCE_RATIO = 0.4
+LEAST_KEPT_RATIO = 0.4
 """Least variance of the average, over the variance of what scatters about it.  Some errors change too slowly to be seen
 in quiet time: in front of moving background about a third of the whole error lasts for ten seconds or longer."""
 
-FOLLOW_MEMORY, FOLLOW_FROM = 0.25, 2.5
+FOLLOW_MEMORY, LAG_SCATTER_RATIO = 0.25, 2.5
 """Weight of the newest frame in the running mean of its squared distance from the average; and the multiple of the
 usual scatter above which the average lags: the transform then follows the frames, and the average catches up."""
 SETTLING_LAG = 0.7
-"""While the average settles, the transform follows the frames from this part of the limit: averaging gains little."""
+"""While the average settles, the transform follows the frames from this part of the limit: averaging gains little.
+Without it errors right after a knock are 1 to 4 % larger (tools/bench smoothing)."""
 LAG_VARIANCE_FACTOR = 0.5
 """Variance that a lag adds to the average's, over the square of the lag."""
 
 PRIOR_SCATTER, LEAST_SCATTER, MOST_SCATTER = 0.5, 0.1, 9.0
 """Share of the reported variance that scatters: the value assumed before it is learnt; the least value that a lag is
 compared with; and the largest value that a single frame contributes."""
-VIBRATES_FROM = 1.25
+VIBRATION_SCATTER = 1.25
 """Scatter over reported variance above which frames vibrate: more than the reported covariance may be wrong by."""
 PRIOR_FRAMES, SCATTER_FRAMES = 30.0, 1200.0
 """Number of frames that the assumed share is worth, and number of frames that are remembered."""
 LEARN_EVERY = 4
 """Only every fourth frame is learnt from: neighbouring frames carry nearly the same information."""
-RIPE = 0.6
+LEAST_SHOWN_SCATTER = 0.6
 """Part of the scatter that an average must show before it is learnt from: an average of fewer than three frames shows
 less."""
 
@@ -108,12 +109,12 @@ class QuietTime:
         reported on some axis, and ``vibration`` (6,), by what share of the reported variance.
         """
         self.scatter = scatter
-        self.vibrates = bool(scatter.max() > VIBRATES_FROM)
-        self.vibration: Array = np.where(scatter > VIBRATES_FROM, scatter - 1.0, 0.0)
+        self.vibrates = bool(scatter.max() > VIBRATION_SCATTER)
+        self.vibration: Array = np.where(scatter > VIBRATION_SCATTER, scatter - 1.0, 0.0)
         # Before the scatter is learnt, up to all of the reported variance may scatter.
         unknown = (1.0 - PRIOR_SCATTER) * PRIOR_FRAMES / self._scatter_frames
-        self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter + unknown, LEAST_SCATTER)
-        self._least_kept = SMALLEST_VARIANCE_RATIO * np.minimum(scatter, 1.0)
+        self.lag_from: Array = LAG_SCATTER_RATIO * np.maximum(scatter + unknown, LEAST_SCATTER)
+        self._least_kept = LEAST_KEPT_RATIO * np.minimum(scatter, 1.0)
 
     def kept(self, ripe: Array | float) -> Array:
         """Share (6,) of a frame's reported variance that stays in the average's; all of it at ``ripe`` = 0."""
@@ -132,7 +133,7 @@ class QuietTime:
         """Learn from a quiet frame.  ``share`` (6,) is its squared distance from the average ``mean_T`` over its
         ``variance`` (6,); a young average shows only the part ``ripe`` (6,) of the scatter.
         """
-        if ripe.min() > RIPE:
+        if ripe.min() > LEAST_SHOWN_SCATTER:
             self._scatter_frames = min(self._scatter_frames + LEARN_EVERY, SCATTER_FRAMES)
             news = np.minimum(share, MOST_SCATTER) / ripe - self.scatter
             self._set_scatter(self.scatter + LEARN_EVERY / self._scatter_frames * news)
@@ -296,9 +297,9 @@ class PoseAverage:
         if self.cam_T_grip is None:
             self._restart()
             return
-        settled = self._filter.frames >= SETTLING
+        settled = self._filter.frames >= SETTLING_FRAMES
         innovation, gain, surprise = self._filter.weigh(cam_T_grip, self._as_it_scatters(covariance))
-        if surprise <= (GATE_SQUARE if settled else SETTLING_GATE):
+        if surprise <= (GATE_SQUARE if settled else SETTLING_GATE_SQUARE):
             self._suspicions = 0
             self._conclude(self._filter.correct(innovation, gain), covariance, quiet, settled)
             return
@@ -316,7 +317,7 @@ class PoseAverage:
         self._filter = PoseFilter(*self._newest[-1])
         if self._suspicions >= 2:
             innovation, gain, surprise = self._filter.weigh(*self._newest[-2])
-            if surprise < SETTLING_GATE:
+            if surprise < SETTLING_GATE_SQUARE:
                 self._filter.correct(innovation, gain)
                 self.cam_T_grip = self._filter.mean_T
         self._recent, self._suspicions = self.learnt.scatter, 0

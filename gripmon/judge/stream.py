@@ -26,9 +26,9 @@ RING_FRAMES = 8
 FREEZE_TO_USUAL_RATIO = 4
 """A source that repeats frames now and then counts as frozen at this multiple of its longest repetition."""
 
-STOOD_SHARE = 0.95
-"""Share of bit-identical pixels between two images that differ from which the stream is a coded one.  Of a sensor's own
-pixels fewer than nine in ten repeat, down to a noise of 0.1 grey levels.
+STILL_PIXEL_SHARE = 0.95
+"""Share of bit-identical pixels, between two images that differ, from which the stream is a coded one.  Of a sensor's
+own pixels fewer than nine in ten repeat, down to a noise of 0.1 grey levels.
 """
 
 FEWEST_INNER = 200
@@ -51,8 +51,8 @@ JUMP_PERIODS, JUMP_NS = 50.0, 5 * NS_PER_S
 BLOCK_INTERVALS = 8
 """Intervals in a block."""
 
-LEARN_BLOCKS, LEARN_NS = 6, 2 * NS_PER_S
-"""Blocks, and the time they span, needed to learn the usual rate."""
+LEARN_BLOCKS = 6
+"""Blocks needed to learn the usual rate; and as much time as shows another one."""
 
 ARRIVALS, MOST_BLOCKS = 64, 512
 """Newest intervals, and newest blocks, that are kept."""
@@ -60,8 +60,8 @@ ARRIVALS, MOST_BLOCKS = 64, 512
 REGULAR_INTERVAL_DEVIATION = 0.3
 """Median deviation of the intervals over their median, above which the stream has no usual rate."""
 
-DEPARTED, RETURNED = 1.6, 1.3
-"""Ratio to the usual rate, either way, above which the rate is a fault, and below which it is right again."""
+RATE_FAULT_RATIO, RATE_RELEASE_RATIO = 1.6, 1.3
+"""Ratio to the usual rate, either way, above which the rate is a fault; and below which it is right again."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -86,7 +86,8 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         Meta(
             gt=0.0,
             le=3600.0,
-            description="time for which the frame rate must differ from the usual one to count as a fault (s)",
+            description="time for which the frame rate must differ from the usual one to count as a fault, and "
+            "which it takes to learn the usual one (s)",
         ),
     ] = 2.0
 
@@ -195,13 +196,13 @@ def _stands_in_large_parts(sample: Image, before: Image | None) -> bool:
         return False
     if sample.dtype in FULL_SCALE:  # for no other type is it compiled again
         count, standing = inner_pixels(sample.ravel(), before.ravel())
-        return bool(count >= FEWEST_INNER and STOOD_SHARE * count <= standing)
+        return bool(count >= FEWEST_INNER and STILL_PIXEL_SHARE * count <= standing)
     stands = sample == before
-    if np.count_nonzero(stands) < STOOD_SHARE * FEWEST_INNER:
+    if np.count_nonzero(stands) < STILL_PIXEL_SHARE * FEWEST_INNER:
         return False  # too few, whichever of them count
     inner = (sample > sample.min()) & (sample < sample.max())
     count = int(np.count_nonzero(inner))
-    return count >= FEWEST_INNER and STOOD_SHARE * count <= int(np.count_nonzero(inner & stands))
+    return count >= FEWEST_INNER and STILL_PIXEL_SHARE * count <= int(np.count_nonzero(inner & stands))
 
 
 @compiled
@@ -328,14 +329,15 @@ class _Rate:
         else:
             return
         slower = _middle_ns(recent) / usual_ns
-        if max(slower, 1.0 / slower) > DEPARTED:
+        if max(slower, 1.0 / slower) > RATE_FAULT_RATIO:
             text = f"{NS_PER_S / (slower * usual_ns):.1f} frames a second arrive; {NS_PER_S / usual_ns:.1f} were usual"
             self._fault = StreamFault("rate", Cause.CLOCK, text)
-        elif max(slower, 1.0 / slower) < RETURNED:
+        elif max(slower, 1.0 / slower) < RATE_RELEASE_RATIO:
             self._fault = None
 
     def _learn(self) -> None:
-        if len(self._blocks) < LEARN_BLOCKS or sum(block.lasted_ns for block in self._blocks) < LEARN_NS:
+        lasted_ns = sum(block.lasted_ns for block in self._blocks)
+        if len(self._blocks) < LEARN_BLOCKS or lasted_ns < NS_PER_S * self._settings.rate_s:
             return
         # Frames at irregular intervals have no usual rate.
         if statistics.median(block.uneven for block in self._blocks) < REGULAR_INTERVAL_DEVIATION:

@@ -32,7 +32,7 @@ from gripmon.track.edges import Effort, Measurement, agreeing_fingers, edge_resi
 LULL_FRAMES = 3
 """Successive frames without anything wrong after which an explanation no longer holds."""
 
-GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
+GATHERED_AT, CONCLUDED_AT, CONCLUDED_EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
 """Of the frames that look wrong, counted from 1: those whose evidence is gathered, those after which a conclusion is
 drawn, and the period of later ones for both.  Gathering takes as long as measuring, a conclusion as several frames.
 """
@@ -118,7 +118,7 @@ class CauseAnalysis:
         if wrong:
             self._calm = 0
             self._asked += 1
-            confirms = self._asked % EVERY == 0
+            confirms = self._asked % CONCLUDED_EVERY == 0
             gathers, concludes = (confirms or self._asked in at for at in (GATHERED_AT, CONCLUDED_AT))
         else:
             if self._calm == CALM_FRAMES:

@@ -33,11 +33,12 @@ from gripmon.model.records import (
 from gripmon.model.records.notes import SixNumbers
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
+from gripmon.monitor.tracker import USUAL_SHARE
 from gripmon.track.edges import Measurement
 from gripmon.track.jaw import UNREPORTED_MOTION_SIGMAS
 
-FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
-"""Inlier ratios of a finger's search lines: above the first it is where it should be, below the second it is not."""
+FINGER_ASTRAY = 0.35
+"""Inlier ratio of a finger's search lines below which it is not where it should be; above the usual ratio it is."""
 
 
 def flat(covariance: Array) -> tuple[float, ...]:
@@ -153,7 +154,7 @@ def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
     """
     if abs(measurement.jaw_innovation) > UNREPORTED_MOTION_SIGMAS:
         return True
-    return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
+    return max(shares) > USUAL_SHARE and min(shares) < FINGER_ASTRAY
 
 
 class NoteTaker:

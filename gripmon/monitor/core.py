@@ -62,8 +62,6 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.track.edges import Measurement, TaughtEdges, trace_of
 
-RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
-
 
 class Monitor:
     """Watches one camera on one gripper, starting from a reference calibration."""
@@ -215,7 +213,8 @@ class Monitor:
     def _after_restart(self, judgement: Judgement, evidence: Evidence) -> Judgement:
         """Suspect until a frame shows whether the picture fits the reference; then an alert reports which."""
         if evidence.motion.frames == 0 or not evidence.believed:
-            return replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
+            reason = "restarted, and too few frames since to say whether the picture fits the reference"
+            return replace(judgement, verdict=Verdict.SUSPECT, reason=reason)
         self._restarted = False
         compared = after_restart(self.reference, evidence, self._settings.policy.warn_m)
         return replace(judgement, alerts=(compared, *judgement.alerts))

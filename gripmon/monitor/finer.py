@@ -42,10 +42,10 @@ from gripmon.track.look import (
     another_background,
 )
 
-DIFFERENT = 0.5
+RENEWED_SHARE = 0.5
 """Share of a finger's blocks that no longer look as learnt, above which it looks different: grasps hide half."""
 
-DIFFERENT_S = 300.0
+RENEWED_AFTER_S = 300.0
 """How long a finger has to look different, or the look to contradict the edges, before an alert and a new look, s:
 robots hold a grasped object for seconds or a minute.
 """
@@ -175,7 +175,7 @@ class FinerLook:
         elif not measured and self._alignment.views > views:
             self._fusion.place(pending.cam_T_grip, pending.of_background, pending.jaw_opening_m)
         self._count(pending.stamp_ns)
-        self._report_lasting(self._alignment.renewed > DIFFERENT, pending.now_s, pending.stamp_ns)
+        self._report_lasting(self._alignment.renewed > RENEWED_SHARE, pending.now_s, pending.stamp_ns)
 
     def _count(self, stamp_ns: int) -> None:
         """Update the version with this frame; an alert reports when it begins to measure."""
@@ -205,14 +205,14 @@ class FinerLook:
         return due
 
     def _report_lasting(self, different: NDArray[np.bool_], now_s: float, stamp_ns: int) -> None:
-        """Report fingers (f,) that look different, or a look that contradicts the edges, after :data:`DIFFERENT_S`."""
+        """Report fingers (f,) that look different, or a look that contradicts the edges for :data:`RENEWED_AFTER_S`."""
         wrong = np.append(different, self._fusion.contradicts)
         self._since_s = np.where(wrong, np.minimum(self._since_s, now_s), np.inf)
         self._since_ns = [
             (stamp_ns if since is None else since) if now else None
             for now, since in zip(wrong.tolist(), self._since_ns, strict=True)
         ]
-        long = now_s - self._since_s >= DIFFERENT_S
+        long = now_s - self._since_s >= RENEWED_AFTER_S
         if not long.any():
             return
         since_ns = min(

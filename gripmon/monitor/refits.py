@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.smoothing import MOST_SCATTER, SMALLEST_VARIANCE_RATIO
+from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
@@ -38,8 +38,8 @@ would gain little, given the least variance that an average may claim.
 CONFIRMING_FRAMES = 5
 """Frames after a knock, besides the first, that need the full proof of the new place."""
 
-NOTHING, UNKNOWN = -1, 1e12
-"""Number of a missing fit, and the factor on the covariance of the fit in its place that removes its information."""
+NO_FIT, UNKNOWN_VARIANCE_RATIO = -1, 1e12
+"""Number of a missing fit; and the factor on the covariance of the fit in its place that removes its information."""
 
 
 @cache
@@ -207,7 +207,7 @@ class Lasting(NamedTuple):
         """
         number = {doubted: k for k, doubted in reversed([*enumerate(_doubted(hypotheses, edges))])}
         known = frozenset[int]().union(*number)
-        return np.array([number.get(doubted & known, NOTHING) for doubted in self.doubted], dtype=np.intp)
+        return np.array([number.get(doubted & known, NO_FIT) for doubted in self.doubted], dtype=np.intp)
 
 
 def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[int]]:
@@ -262,7 +262,7 @@ class Anchor:
         self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
         young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
         # Averaging reduces persistent errors less than independent ones.
-        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, SMALLEST_VARIANCE_RATIO * self._scatter)
+        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT_RATIO * self._scatter)
         scale = np.sqrt(kept / young)
         self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
         self.cam_T_grip = perturb(self._base_T, self._filters.shift[0])
@@ -286,7 +286,7 @@ class Anchor:
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:
     """The fits ``rows`` (g,), as shifts from a pose (4, 4)."""
-    covariance, unknown = fits.covariance[rows], rows == NOTHING
+    covariance, unknown = fits.covariance[rows], rows == NO_FIT
     if unknown.any():
-        covariance[unknown] *= UNKNOWN
+        covariance[unknown] *= UNKNOWN_VARIANCE_RATIO
     return Separation(fits.shifts(base_T)[rows], covariance, fits.of_model[rows])

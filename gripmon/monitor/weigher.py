@@ -38,8 +38,6 @@ from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_
 from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
 from gripmon.track.look import ONE_EDGE_PX
 
-SECONDS_A_MONTH = 30.0 * 86400.0
-
 VIBRATION_FRAMES = 20.0
 """Proven frames over which the mount's vibration is learnt."""
 
@@ -87,7 +85,7 @@ class Weigher:
         self._lone = has_lone_end(gripper)
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
+        self._jumps_per_s = settings.policy.mount_jumps_per_month / (30.0 * 86_400.0)
         self._model = _model_error(tracker, gripper)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))

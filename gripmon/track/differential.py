@@ -17,9 +17,6 @@ from gripmon.model.geometry import exp_rotation, log_rotation, skew
 from gripmon.model.gripper import on_a_line
 from gripmon.model.records import Array
 
-SMALLEST_EIGENVALUE = 1e-12
-"""Of the normal matrix scaled to a unit diagonal; below, rounding decides."""
-
 
 @dataclass(frozen=True, slots=True)
 class Update:
@@ -97,6 +94,6 @@ def _inverse(normal: Array) -> Array:
     if not (scale > 0.0).all():
         raise DegenerateGeometry("the corners don't determine all six parameters")
     scaled = normal / np.outer(scale, scale)
-    if np.linalg.eigvalsh(scaled)[0] < SMALLEST_EIGENVALUE:
+    if np.linalg.matrix_rank(scaled, hermitian=True) < len(scaled):
         raise DegenerateGeometry("the corners lie on a line, or so nearly that a direction is undetermined")
     return np.linalg.inv(scaled) / np.outer(scale, scale)

@@ -21,10 +21,12 @@ UNREPORTED_MOTION_SIGMAS = 5.0
 SYSTEMATIC_M = 2e-6
 """What no number of images tells about the opening: a fiftieth of a pixel at 100 µm a pixel."""
 
-_NOTHING = 1e-6  # of the prior's information: what an image must add to count
+LEAST_INFORMATION_RATIO = 1e-6  # of the prior's information: what an image must add to count
 
-PATIENCE, CORRELATED = 10.0, 0.8
-"""Images, or backgrounds, over which it is learnt how alike edges err from one to the next; and before that."""
+ALIKE_IMAGES, ALIKE_AT_FIRST, ALIKE_AT_MOST = 10.0, 0.8, 0.98
+"""Number of images, or backgrounds, over which it is learnt how the edges' errors correlate from one to the next (no
+unit), the correlation assumed before that, and the largest one.
+"""
 
 
 class OpeningSeen(NamedTuple):
@@ -54,6 +56,25 @@ class Fused:
     seen: OpeningSeen | None
 
 
+class AlikeErrors:
+    """How many successive measurements count as one, because their errors are alike: by the ``correlation`` of
+    neighbours, as in a first-order autoregression.
+    """
+
+    def __init__(self, correlation: float = ALIKE_AT_FIRST):
+        self.correlation = correlation
+
+    def learn(self, differing: float) -> None:
+        """``differing``: square of the difference of two neighbours over what independent errors make it on average."""
+        self.correlation += (min(1.0 - differing, 1.0) - self.correlation) / ALIKE_IMAGES
+
+    @property
+    def count(self) -> float:
+        """Measurements that count as one."""
+        correlation = min(max(self.correlation, 0.0), ALIKE_AT_MOST)
+        return (1.0 + correlation) / (1.0 - correlation)
+
+
 class JawKnowledge:
     """A filter of two states, both errors of the report: an offset that is always the same, and a part that changes as
     the jaw moves (backlash, rounding, calibration of the scale).
@@ -66,7 +87,7 @@ class JawKnowledge:
         self.exact = sigma_m == 0.0
         self._sigma_m, self._offset_sigma_m = sigma_m, 0.0 if self.exact else offset_sigma_m
         self._reported_m: float | None = None
-        self._correlation = CORRELATED
+        self._alike = AlikeErrors()
         self._seen: tuple[float, float] | None = None
         self._forget()
 
@@ -84,7 +105,7 @@ class JawKnowledge:
         prior = self.report_sigma_m**2
         variance = float(covariance[6, 6])
         image = 0.0 if self.exact else 1.0 / variance - 1.0 / prior
-        if image * prior <= _NOTHING:
+        if image * prior <= LEAST_INFORMATION_RATIO:
             return Fused(
                 np.zeros(6),
                 covariance[:6, :6],
@@ -147,11 +168,9 @@ class JawKnowledge:
             self._forget()
         if self._seen is not None:
             before_m, before = self._seen
-            differing = (error_m - before_m) ** 2 / (variance + before)
-            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / PATIENCE
+            self._alike.learn((error_m - before_m) ** 2 / (variance + before))
         self._seen = error_m, variance
-        correlation = min(max(self._correlation, 0.0), 0.98)
-        variance *= (1.0 + correlation) / (1.0 - correlation)
+        variance *= self._alike.count
         with_sum = self._covariance.sum(axis=1)
         gain = with_sum / (with_sum.sum() + variance)
         self._mean = self._mean + gain * (error_m - self._mean.sum())

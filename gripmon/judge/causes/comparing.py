@@ -33,10 +33,11 @@ MODEL_M = 3e-5
 """Standard deviation of the edges' places in a gripper file, m; it counts while there is no baseline."""
 
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
-SETTLED_JAW_M = float(SETTLED_SIGMA[0])
-"""Standard deviations of the pose (m and rad) and the opening (m) that a baseline knows."""
+"""Standard deviations of the pose that a baseline knows, m and rad; the first also of the opening."""
 
 LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
+"""Causes with which the blur may change."""
+
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
 """Standard deviation of the blur while the lens is unchanged, and the range of its changes otherwise, px."""
 
@@ -45,8 +46,10 @@ LOWEST_BLUR_LOG_RATIO = -40.0
 
 ABSENT_PROBABILITY = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 """How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
-several things happened; with every other cause it is a ``STRAY_PROBABILITY``."""
+several things happened."""
+
 STRAY_PROBABILITY = 0.02
+"""The same with every other cause, and with a bent finger that is seen itself."""
 
 BLOCKED_VIEW_PROBABILITY = 0.15
 """Prior probability of a blocked view where a finger isn't seen."""
@@ -145,8 +148,8 @@ def _knowledge(
         return Knowledge(pose, JAW_UNREPORTED_SIGMA_M, jaw_reported=False)
     if baseline is None:
         jaw_m = 0.0 if exact else math.hypot(report.sigma_m, report.offset_sigma_m)
-        return Knowledge(reference_sigma, max(jaw_m, SETTLED_JAW_M), jaw_reported=True)
-    jaw_m = SETTLED_JAW_M
+        return Knowledge(reference_sigma, max(jaw_m, float(SETTLED_SIGMA[0])), jaw_reported=True)
+    jaw_m = float(SETTLED_SIGMA[0])
     if baseline.jaw_reported_m is not None and not exact:
         # The part of the report's error that changes is another one some way on.
         way_m = abs(jaw_reported_m - baseline.jaw_reported_m)

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, Weighed
-from gripmon.judge.causes.pooling import FEWEST_EDGES, Baseline, Pooled, pool
+from gripmon.judge.causes.pooling import SEEN_EDGES, Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.judge.causes.watches import BASELINE_FRAMES
 from gripmon.model.camera import Camera
@@ -60,8 +60,11 @@ less than the first while all was well, the share in the third must differ from 
 fractions of full scale.
 """
 
-TO_CONFIRM = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
-"""Causes that borders of other things near some of the edges can imitate: two conclusions in a row must name them."""
+NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
+"""Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
+where it was, and is not calibrated again.  Borders of other things near some of the edges can imitate them, so that two
+conclusions in a row must name one.
+"""
 
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -147,7 +150,7 @@ class CauseJudge:
         found = self._concluded(ref_cam_T_grip)
         named, before = (found.probable.cause, found.probable.part), self._named
         self._named = named
-        if found.probable.cause not in TO_CONFIRM or named == before:
+        if found.probable.cause not in NOT_THE_CAMERA or named == before:
             return found
         return replace(found, text=f"perhaps {found.text}", confirmed=False)
 
@@ -266,7 +269,7 @@ def _of_few_edges(key: Key, comparison: Comparison) -> bool:
 def _of_one_edge(key: Key, comparison: Comparison) -> bool:
     """Whether a finger seems bent because of a single edge: a border of something else beside it shows the same."""
     moved = (comparison.fits[key].own > 0.5) & (comparison.fits[None, None].own <= 0.5)
-    return key[0] is Cause.FINGER_BENT and int(moved.sum()) < FEWEST_EDGES
+    return key[0] is Cause.FINGER_BENT and int(moved.sum()) < SEEN_EDGES
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

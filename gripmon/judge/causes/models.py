@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -32,11 +33,18 @@ PART_SIZES_M = np.geomspace(SMALLEST_M, 3e-3, 6)
 FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 """How far things move when they move: shift of the TCP; of a finger or the opening; relative focal length."""
 
-_MOUNT, _FINGER, _JAW, _RARE = 0.3, 0.25, 0.15, 0.1
-"""Prior probabilities, given that something looks wrong: of a mount that moved, or another camera after a pause; of a
-bent finger; of a wrong opening; and of a lens, of several things and of nothing, each.
+PRIOR: dict[Cause | None, float] = {
+    Cause.CAMERA_MOUNT: 0.3,
+    Cause.CAMERA_REPLACED: 0.3,
+    Cause.FINGER_BENT: 0.25,
+    Cause.JAW_OPENING: 0.15,
+    Cause.LENS: 0.1,
+    Cause.UNKNOWN: 0.1,
+    None: 0.1,
+}
+"""Probability of each cause, given that something looks wrong: of another camera after a pause, of any bent finger, of
+several things at once (``UNKNOWN``), and of nothing at all.
 """
-
 
 MOST_FOREIGN_EDGES = 0.5
 """Share of the seen edges that may belong to something else; a cause must explain the others to be named.  The
@@ -44,10 +52,15 @@ prior of their share is uniform up to this: a grasped thing has borders beside s
 aren't mistaken independently of each other.
 """
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # exact up to 23 edges
-_SHARES = 0.5 * MOST_FOREIGN_EDGES * (1.0 + _NODES)
-_LOG_FOREIGN, _LOG_OWN = np.log(_SHARES)[:, None], np.log1p(-_SHARES)[:, None]
-_LOG_WEIGHTS = np.log(0.5 * _WEIGHTS)
+
+@cache
+def _shares() -> tuple[Array, Array, Array]:
+    """Logarithms of the shares (12, 1) of foreign edges that are averaged over, of one less those, and of their weights
+    (12,): Gauss's quadrature, exact up to 23 edges.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    foreign = 0.5 * MOST_FOREIGN_EDGES * (1.0 + nodes)[:, None]
+    return np.log(foreign), np.log1p(-foreign), np.log(0.5 * weights)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,37 +110,35 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
 
     pose = np.array([1.0] * 3 + [1.0 / distance_m] * 3)
     out = [
-        Suspect(None, None, _RARE, Model(held, freed(), np.zeros(0))),
-        Suspect(Cause.CAMERA_MOUNT, None, _MOUNT, Model(held, freed((POSE, pose)), MOUNT_SIZES_M)),
-        Suspect(Cause.LENS, None, _RARE, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
+        Suspect(None, None, PRIOR[None], Model(held, freed(), np.zeros(0))),
+        Suspect(Cause.CAMERA_MOUNT, None, PRIOR[Cause.CAMERA_MOUNT], Model(held, freed((POSE, pose)), MOUNT_SIZES_M)),
+        Suspect(Cause.LENS, None, PRIOR[Cause.LENS], Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
     ]
     if interrupted:
         # Another camera in its place: an image of another scale from nearly the same place.
         model = Model(held, freed((POSE, pose), (FOCAL, 5.0)), MOUNT_SIZES_M)
-        out.append(Suspect(Cause.CAMERA_REPLACED, None, _MOUNT, model))
+        out.append(Suspect(Cause.CAMERA_REPLACED, None, PRIOR[Cause.CAMERA_REPLACED], model))
     if gripper.has_jaw and known.jaw_reported:
-        out.append(Suspect(Cause.JAW_OPENING, None, _JAW, Model(held, freed((JAW, 1.0)), PART_SIZES_M)))
+        model = Model(held, freed((JAW, 1.0)), PART_SIZES_M)
+        out.append(Suspect(Cause.JAW_OPENING, None, PRIOR[Cause.JAW_OPENING], model))
     if fingers > 1:
         for finger in range(fingers):
             model = Model(held, freed(bent(finger)), PART_SIZES_M)
-            out.append(Suspect(Cause.FINGER_BENT, finger, _FINGER / fingers, model))
+            out.append(Suspect(Cause.FINGER_BENT, finger, PRIOR[Cause.FINGER_BENT] / fingers, model))
     every = freed((POSE, pose), (FOCAL, 5.0), *(bent(finger) for finger in range(fingers)))
-    out.append(Suspect(Cause.UNKNOWN, None, _RARE, Model(held, every, MOUNT_SIZES_M)))
+    out.append(Suspect(Cause.UNKNOWN, None, PRIOR[Cause.UNKNOWN], Model(held, every, MOUNT_SIZES_M)))
     return out
 
 
 STUDENT_FREEDOM = 3.0
 """Degrees of freedom of Student's distribution of the errors."""
 
-_STUDENT_HEIGHT = math.gamma(2.0) / (math.gamma(1.5) * math.sqrt(math.pi * STUDENT_FREEDOM))
-"""Density of an error of zero, for a scale of one."""
-
 LEAST_SHARE = 1e-9
 """Of an edge's weight, so that an edge that belongs to something else still has an offset."""
 
-_COARSE_PX = 1.0
-_COARSE_ROUNDS, _FINE_ROUNDS = 3, 8
-_CONVERGED_PX = 2e-3
+_COARSE_PX = 1.0  # standard deviation that is added to each piece's own, so that all count alike at first
+_COARSE_ROUNDS, _FINE_ROUNDS = 3, 8  # steps with it; most steps with the weights that residuals give
+_CONVERGED_PX = 2e-3  # largest motion of a piece by a step that ends the fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,9 +312,10 @@ def _of_edges(residual: Array, off_px: Array, errors: Errors) -> tuple[float, Ar
     own = np.bincount(errors.edge, pieces, errors.edges) + _student(off_px, errors.of_edge_px)
     if errors.something_else is None:
         return float(own.sum()), np.ones(len(own))
-    is_own = own + _LOG_OWN
-    either = np.logaddexp(is_own, errors.something_else + _LOG_FOREIGN)
-    of_share = either.sum(axis=1) + _LOG_WEIGHTS
+    log_foreign, log_own, log_weight = _shares()
+    is_own = own + log_own
+    either = np.logaddexp(is_own, errors.something_else + log_foreign)
+    of_share = either.sum(axis=1) + log_weight
     log = float(np.logaddexp.reduce(of_share))
     return log, np.maximum(np.exp(of_share - log) @ np.exp(is_own - either), LEAST_SHARE)
 
@@ -316,6 +328,9 @@ def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: f
     out = np.zeros(errors.edges)
     weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.sigma_px**2)
     spread_weight = (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM * errors.of_edge_px**2)
+    # Student's density of an error of zero, for a scale of one.
+    height = math.gamma(0.5 * STUDENT_FREEDOM + 0.5) / math.gamma(0.5 * STUDENT_FREEDOM)
+    height /= math.sqrt(math.pi * STUDENT_FREEDOM)
     for k in range(errors.edges):
         at = np.flatnonzero(errors.edge == k)
         first, last = fraction[at].min(), fraction[at].max()
@@ -328,7 +343,7 @@ def something_else(residual: Array, fraction: Array, errors: Errors, reach_px: f
         # Volumes of what agrees: of the border's ends within the reach, of the edge's own offset within its spread.
         may_be = 0.5 * np.log(2.0 * math.pi) * len(information) - 0.5 * np.linalg.slogdet(information)[1]
         may_be -= len(information) * math.log(2.0 * reach_px)
-        is_own = math.log(_STUDENT_HEIGHT / errors.of_edge_px[k]) + 0.5 * math.log(2.0 * math.pi)
+        is_own = math.log(height / errors.of_edge_px[k]) + 0.5 * math.log(2.0 * math.pi)
         is_own -= 0.5 * math.log(weight[at].sum() + spread_weight[k])
         fit = float(_student(residual[at] - border, errors.sigma_px[at]).sum())
         out[k] = fit + may_be - is_own

@@ -28,7 +28,7 @@ SEEN_FRAME_SHARE = 1.0 / 3.0
 TEXTURE_SIGMA_SHARE = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
 
-FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
+SEEN_STRETCHES, SEEN_EDGES, SEEN_SHARE = 3, 2, 0.25
 """Stretches of a finger, edges that they lie on, and inlier ratio of its search lines from which it counts as seen."""
 
 
@@ -136,8 +136,8 @@ def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
     stretches = np.bincount(gripper.edge_finger[evidence.edge], minlength=count)
     edges = np.bincount(gripper.edge_finger[np.unique(evidence.edge)], minlength=count)
     sampled = np.isfinite(evidence.finger_share)
-    seen = (stretches >= FEWEST_STRETCHES) & (edges >= FEWEST_EDGES)
-    seen &= np.nan_to_num(evidence.finger_share) >= FEWEST_SHARE
+    seen = (stretches >= SEEN_STRETCHES) & (edges >= SEEN_EDGES)
+    seen &= np.nan_to_num(evidence.finger_share) >= SEEN_SHARE
     return tuple(np.flatnonzero(sampled & ~seen).tolist())
 
 

@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from gripmon.judge.causes.models import SMALLEST_M
-from gripmon.judge.causes.pooling import FEWEST_EDGES
+from gripmon.judge.causes.pooling import SEEN_EDGES
 from gripmon.judge.drift.kinds import SIGNIFICANT_SIGMAS
 from gripmon.model.records import Array
 
@@ -114,7 +114,7 @@ class ResidualWatch:
             return False
         usual_px, allowed_px = self._usual
         beyond = np.abs(sum(self._newest) / NEWEST_FRAMES - usual_px) > allowed_px
-        return int(np.count_nonzero(beyond)) >= FEWEST_EDGES
+        return int(np.count_nonzero(beyond)) >= SEEN_EDGES
 
 
 class JawWatch:

@@ -18,9 +18,6 @@ from gripmon.model.records import Array
 CORRELATION_FRAMES = 20.0
 """Frames over which errors are assumed to be correlated: as for a robot that works over clutter at 60 frames/s."""
 
-_MEDIAN_FRAMES = 1
-"""Delay of a step, in frames, by the median over three frames: no single frame decides."""
-
 
 @dataclass(frozen=True, slots=True)
 class Foresight:
@@ -54,7 +51,8 @@ def foresee(covariance: Array, settings: DriftSettings) -> Foresight:
     per_axis = np.sqrt((threshold - 6.0) / np.linalg.inv(covariance).diagonal())
     sizes = np.sqrt(np.minimum.accumulate(least))[:, None] * per_axis
     sizes = sizes + settings.tolerated
-    return Foresight(sizes[-1], tuple(length + _MEDIAN_FRAMES for length in LENGTHS), sizes)
+    # A step is a frame late: the median over three frames, so that no single one decides.
+    return Foresight(sizes[-1], tuple(length + 1 for length in LENGTHS), sizes)
 
 
 def _variance_of_means(lengths: Array) -> Array:

@@ -18,11 +18,8 @@ BLOCK_S = 0.5
 KEPT_BLOCKS = 256
 """Blocks in which the onset of a motion is searched for: two minutes."""
 
-LASTING_BLOCKS = 3
-"""Fewest blocks after a step."""
-
-FEWEST_BLOCKS = 2 * LASTING_BLOCKS
-"""Fewest blocks that distinguish a creep from a step: as many before it as after it."""
+FEWEST_BLOCKS = 6
+"""Fewest blocks that distinguish a creep from a step: half of them before it, half of them after it."""
 
 EXPLAINED_SQUARES_RATIO = 0.6
 """Largest ratio of the squares that a creep leaves to those that a step leaves for it to be a creep, and vice versa."""
@@ -89,7 +86,7 @@ class History:
         along = np.array(self._means) @ towards
         step, before = _best_step(along)
         # The first block of a creep that has just begun also looks like a step.
-        lasts = count - 1 - before >= LASTING_BLOCKS
+        lasts = count - 1 - before >= FEWEST_BLOCKS // 2
         return lasts and step <= EXPLAINED_SQUARES_RATIO * _best_ramp(along, np.array(self._times_s))[0]
 
 
@@ -149,10 +146,7 @@ KEPT_FRAMES = 128
 """Frames in which a vibration is searched for: two seconds at 60 frames/s."""
 
 PARTS = 4
-"""Number of parts of these frames, each evaluated separately."""
-
-LOOK_FRAMES = KEPT_FRAMES // PARTS
-"""Frames between two evaluations: one part is new each time."""
+"""Number of parts of these frames, each evaluated separately, and whenever one of them is new."""
 
 VIBRATION_VARIANCE_RATIO = 6.0
 """Ratio of the variance in a direction to the usual one, claimed or learnt, from which it is a vibration."""
@@ -194,7 +188,7 @@ class VibrationWatch:
         self._shifts.append(shift)
         self._times_s.append(now_s)
         self._since_look += 1
-        if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
+        if len(self._shifts) == KEPT_FRAMES and self._since_look >= KEPT_FRAMES // PARTS:
             self._since_look = 0
             learnt = usual()[:3, :3]
             if self._found is None:

@@ -70,14 +70,9 @@ as back; between this and the test's threshold an alert stays.
 EVIDENCE_LOOK_RATIO = 0.4
 """Part of the threshold from which the evidence is examined more closely, before the test decides."""
 
-BIAS_CHANGED = 0.2
+BIAS_CHANGE_RATIO = 0.2
 """Relative change of the lasting variance of a finer measurement from which the test is updated: a tenth of its
 standard deviation.
-"""
-
-VIBRATING_FRAMES = BLOCK_FRAMES
-"""Frames of the shortest window that decides during a vibration, since the mean over a block nearly cancels it; the
-mean over twice this number tells whether the camera is back.
 """
 
 VIBRATION_STEP_RATIO = 4.0
@@ -174,7 +169,7 @@ class MotionWatch:
                 self._other.restart(np.array([True]))
         self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance)
         frames = max(int(test.windows.frames[0]), 1)
-        level, level_covariance = self._level(min(frames, 2 * VIBRATING_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
+        level, level_covariance = self._level(min(frames, 2 * BLOCK_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
         before = self._present
         # A detected difference discards the frames before it: as many frames again may be needed to show the motion.
         self._held = 2 * length if moved else max(self._held - 1, 0)
@@ -216,7 +211,7 @@ class MotionWatch:
             self._missed = 0
         if bias is not None:
             was, now = np.trace(self._of_bias[:3, :3]), np.trace(bias.covariance[:3, :3])
-            if abs(now - was) > BIAS_CHANGED * was:
+            if abs(now - was) > BIAS_CHANGE_RATIO * was:
                 self._of_bias = bias.covariance
                 self.test.set_bias(*bias)
 
@@ -235,13 +230,15 @@ class MotionWatch:
         return replace(self._last, begun=False, stepped=False, suspicious=False)
 
     def _shortest_window(self, shift: Array) -> int:
-        """Frames of the shortest window that may decide: the swings of a vibration are not steps."""
+        """Frames of the shortest window that may decide: the swings of a vibration are not steps, and the mean over a
+        block nearly cancels them.
+        """
         if self._vibrates is None or not self.vibrates_anew or not self._newest:
             return 1
-        frames = min(int(self.test.windows.frames[0]), VIBRATING_FRAMES)
+        frames = min(int(self.test.windows.frames[0]), BLOCK_FRAMES)
         middle = self._level(frames)[0] if frames > 1 else np.zeros(6)
         off_m = min(float(np.linalg.norm((each - middle)[:3])) for each in (shift, self._newest[-1]))
-        return 1 if off_m > VIBRATION_STEP_RATIO * self._vibrates.rms_m else VIBRATING_FRAMES
+        return 1 if off_m > VIBRATION_STEP_RATIO * self._vibrates.rms_m else BLOCK_FRAMES
 
     def _goes_on(self, length: int) -> bool:
         """Whether the frames about a difference between windows of ``length`` frames show a creep, not a step."""

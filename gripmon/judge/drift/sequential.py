@@ -46,12 +46,9 @@ number of frames by which those of a mean grow: the mean of many frames is close
 """
 
 TAIL, TAIL_WINDOWS = 0.01, 500.0
-NORMAL_SQUARE = chi_square_limit(TAIL)
-"""Probability at which the noise's tail is compared with the normal one; number of windows over which; and the squared
-value at that probability for normal errors.
-"""
+"""Probability at which the noise's tail is compared with the normal one, and number of windows over which."""
 
-STUDENT_TAIL, HEAVY = 1.6, (0.25, 1.5)
+STUDENT_TAIL, TAIL_POWER_BOUNDS = 1.6, (0.25, 1.5)
 """Ratio of this tail to the normal one for Student's distribution with :data:`FREEDOM`, assumed at first; and bounds on
 the factor by which a stream with lighter or heavier tails scales the logarithm of its inflation.
 """
@@ -67,9 +64,6 @@ assumes (streams simulated after images needed 1.2 to 1.5 to keep the false-alar
 SHORT_LENGTHS = LENGTHS.index(BLOCK_FRAMES) + 1
 """Number of lengths, 1 to 256 frames, whose limits are learnt: a stream shows too few longer windows."""
 
-ALIKE_FRAMES = 2.0 * BLOCK_FRAMES
-"""Frames over which extremes count as one: a background stays at least this long, and bursts come and go."""
-
 OUTLIER_LIMIT_RATIO = 2.0
 """Multiple of its limit above which a difference is not noise, and isn't learnt.  Below it may be either."""
 
@@ -80,8 +74,7 @@ BIAS_FREEDOM = 10.0
 """Student's degrees of freedom of the bias from a background, on simulated images."""
 
 REPORTED_MEMORY = 1.0 / 64.0
-
-_LENGTHS = np.array(LENGTHS)
+"""Weight of the newest frame in the running mean of the reported covariances."""
 
 SEARCH_THRESHOLD_RATIO = 0.25
 """Part of its threshold above which a statistic is worth the search for the tolerated part of the shift."""
@@ -124,7 +117,9 @@ class SequentialTest:
         self._seen_last: tuple[Array, Array, Array, np.ndarray | None] | None = None
         self._threshold = 1.0
         self._inflation: Array | None = None
-        self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT_LENGTHS], ALIKE_FRAMES), (2, 1)), streams)
+        # Extremes within two blocks count as one: a background stays at least this long, and bursts come and go.
+        alike_frames = np.maximum(2.0 * COUNT[:SHORT_LENGTHS], 2.0 * BLOCK_FRAMES)
+        self._extremes = Extremes(np.tile(alike_frames, (2, 1)), streams)
         self._of_extremes: tuple[float, np.ndarray, Array] | None = None
         self._limit = np.full((2, len(LENGTHS), streams), np.inf)
         self._known = np.zeros(self._limit.shape, dtype=bool)
@@ -178,8 +173,8 @@ class SequentialTest:
             # Fewer than three frames have no median.
             self.windows.keep(self._seen < 3, 0)
         beyond, found = kernel.decide(
-            mean, difference, self.windows.frames, _LENGTHS, self._whitening, self._limit, self._most_tolerated,
-            self._tolerated, SEARCH_THRESHOLD_RATIO, SWEEPS, LENGTHS.index(at_least),
+            mean, difference, self.windows.frames, self.windows.lengths, self._whitening, self._limit,
+            self._most_tolerated, self._tolerated, SEARCH_THRESHOLD_RATIO, SWEEPS, LENGTHS.index(at_least),
         )  # fmt: skip
         self._seen_last = mean, difference, beyond, learn
         return Finding(*found)
@@ -248,7 +243,7 @@ class SequentialTest:
         Monro).
         """
         share = np.minimum(LEARN_EVERY / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
-        beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
+        beyond = (normalised > self._tail * chi_square_limit(TAIL)) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 
     def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
@@ -275,7 +270,7 @@ class SequentialTest:
         self._middle = self.windows.mean_of_last(LENGTHS[-1])
         if fitted:
             self._limit, self._known = self._limits()
-        heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
+        heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *TAIL_POWER_BOUNDS)
         surge = np.maximum(self._surge, 1.0)
         # The reported covariance of a mean gives its standard deviation; it isn't inflated for rare events.
         self._whiten(np.stack([self._inflation**heavy * surge, np.ones_like(surge), surge]))

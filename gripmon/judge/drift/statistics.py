@@ -41,7 +41,7 @@ class Windows:
 
     def __init__(self, streams: int):
         self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
-        self._lengths = np.array(LENGTHS)
+        self.lengths = np.array(LENGTHS)
         self._newest = 0
 
         self.frames = np.zeros(streams, dtype=np.intp)
@@ -55,12 +55,12 @@ class Windows:
         """
         self._newest = (self._newest + 1) % len(self._ring)
         self.frames += 1
-        of: tuple[Array, Array] = kernel.slide(self._ring, self._newest, values, self._lengths)
+        of: tuple[Array, Array] = kernel.slide(self._ring, self._newest, values, self.lengths)
         return of
 
     def full(self) -> tuple[np.ndarray, np.ndarray]:
         """Masks (k, s): whether the last n frames, and the last 2 n, lie within the stream."""
-        count = self._lengths[:, None]
+        count = self.lengths[:, None]
         return self.frames >= count, self.frames >= 2 * count
 
     def mean_of_last(self, frames: int) -> Array:
@@ -77,21 +77,19 @@ PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
 until the stream has shown its own: until then nearly all of the claimed error is a bias that may change.
 """
 
-LONGER, LONG = (4, 1), 64
-"""Number of lengths, from a window's own on, whose noise is always present: for windows shorter than ``LONG`` frames,
+ALWAYS_LENGTHS, LONG_FRAMES = (4, 1), 64
+"""Number of lengths, from a window's own on, whose noise is always present: for windows shorter than ``LONG_FRAMES``,
 and for longer ones.  Noise that shows only at longer lengths comes in rare steps, and the next may come at any moment.
-Windows of ``LONG`` frames and more are as rare themselves.
+Windows of ``LONG_FRAMES`` and more are as rare themselves.
 """
 
 MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
 """Memory of what is learnt, in frames and in windows; the longer one applies."""
 
-_MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
-
 LARGEST_SQUARE = 4.0
 """Largest squared normalised difference, over its expectation, that is learnt; larger ones are clipped to it."""
 
-RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
+RARE = np.array([min(k + ALWAYS_LENGTHS[length >= LONG_FRAMES], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
 """(k,) for each length, the index of the first length at which noise counts as rare to it."""
 
 
@@ -102,6 +100,7 @@ class Scatter:
         lengths = len(LENGTHS)
         self._of_difference = np.zeros((lengths, streams, 6, 6))
         self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
+        self._most_windows = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
 
     @property
     def windows(self) -> Array:
@@ -118,7 +117,7 @@ class Scatter:
         """
         share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
         kernel.learn(
-            difference, normalised, usable, self._of_difference, self._windows, share, _MOST_WINDOWS,
+            difference, normalised, usable, self._of_difference, self._windows, share, self._most_windows,
             6.0 * LARGEST_SQUARE,
         )  # fmt: skip
 

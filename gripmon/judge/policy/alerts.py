@@ -4,6 +4,7 @@ enough, acknowledged by people.
 
 from __future__ import annotations
 
+import enum
 import hashlib
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,19 @@ class _Open:
     alert: Alert
     said_s: float
     absent_since_s: float | None = None
+
+
+class Topic(enum.StrEnum):
+    """What alerts are about; of each there is one open at a time."""
+
+    MOTION = "motion"
+    VIBRATION = "vibration"
+    VIEW = "view"
+    IMAGE = "image"
+    GRIPPER = "gripper"
+    RENEWAL = "renewal"
+    STREAM = "stream:"
+    """And what is wrong with the stream, behind the colon."""
 
 
 class AlertBook:

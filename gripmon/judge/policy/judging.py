@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.judge.policy.alerts import AlertBook
+from gripmon.judge.causes import NOT_THE_CAMERA
+from gripmon.judge.policy.alerts import AlertBook, Topic
 from gripmon.judge.policy.settings import PolicySettings, time_left_s
 from gripmon.judge.policy.words import creep_text, frequency_text, motion_text, unproven_text
 from gripmon.model.records import (
@@ -32,11 +33,6 @@ from gripmon.model.records import (
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.track.edges import VAGUE_M, VAGUE_RAD
 
-NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
-"""Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
-where it was, and is not calibrated again.
-"""
-
 NO_REFERENCE = (*NOT_THE_CAMERA, Cause.CAMERA_REPLACED)
 """Causes with which nothing that is measured may be relied on, nor become a reference: with another camera the lens's
 calibration doesn't hold either.
@@ -44,10 +40,6 @@ calibration doesn't hold either.
 
 HIDES_NOTHING = (Cause.CAMERA_MOUNT, Cause.JAW_OPENING)
 """Causes that are found by where the gripper is seen: none of them is why it is not."""
-
-MOTION, VIBRATION, VIEW, IMAGE, GRIPPER, RENEWAL = "motion", "vibration", "view", "image", "gripper", "renewal"
-STREAM = "stream:"
-"""What alerts are about; of each there is one open at a time."""
 
 NO_EXPLANATION = Explanation()
 
@@ -203,36 +195,38 @@ class Policy:
             why = "" if refusal else explanation.text
             text = f"{what} for {lasted_s:.1f} s; no transform is given" + (f"; {why}" if why else "")
             lost = Alert(AlertKind.LOST, cause, Severity.ERROR, text, part=probable.part, causes=explanation.causes)
-            alerts += book.present(VIEW, lost, now_s, stamp_ns)
+            alerts += book.present(Topic.VIEW, lost, now_s, stamp_ns)
         elif self.state is State.OCCLUDED:
             text = "too few edges of the gripper are seen; the last transform is held"
             text += f"; {explanation.text}" if explanation.text else ""
             cause, causes = probable.cause, explanation.causes
             occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
-            before = book.about(VIEW)
+            before = book.about(Topic.VIEW)
             # Lost isn't taken back for one frame, nor is it over while frames in between show nothing; and a place that
             # nothing proves is not proven by them.
             since = self._unproven_since
             lasts = since is not None and now_s - since[0] >= settings.hold_s
             told = occluded if before is None or (before.kind is AlertKind.OCCLUDED and not lasts) else before
-            alerts += book.present(VIEW, told, now_s, stamp_ns)
+            alerts += book.present(Topic.VIEW, told, now_s, stamp_ns)
         if refusal and lasted_s >= settings.image_alert_after_s:
             text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
             bad = Alert(AlertKind.IMAGE, self._bad(explanation), Severity.ERROR, text)
-            alerts += book.present(IMAGE, bad, now_s, stamp_ns)
+            alerts += book.present(Topic.IMAGE, bad, now_s, stamp_ns)
         elif not refusal:
-            alerts += book.absent(IMAGE, "images are good again", now_s)
+            alerts += book.absent(Topic.IMAGE, "images are good again", now_s)
         return Judgement(self.state, Verdict.SUSPECT if held else Verdict.UNKNOWN, alerts)
 
     def stream(self, faults: tuple[tuple[str, Cause, str], ...], now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
         """What is wrong with the stream of frames just now: kind of fault, cause, and what there is to say of it."""
         book = self.alerts
         alerts: tuple[Alert, ...] = ()
-        wrong = {STREAM + kind: Alert(AlertKind.STREAM, cause, Severity.ERROR, text) for kind, cause, text in faults}
+        wrong = {
+            Topic.STREAM + kind: Alert(AlertKind.STREAM, cause, Severity.ERROR, text) for kind, cause, text in faults
+        }
         for topic, alert in wrong.items():
             alerts += book.present(topic, alert, now_s, stamp_ns)
         for each in book.open:
-            if each.topic.startswith(STREAM) and each.topic not in wrong:
+            if each.topic.startswith(Topic.STREAM) and each.topic not in wrong:
                 alerts += book.absent(each.topic, "the stream of frames is as it should be", now_s)
         return alerts
 
@@ -244,7 +238,7 @@ class Policy:
     def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
         """The reference was replaced: drift counts from zero, and its alerts are cleared."""
         self._still = 0
-        over = self.alerts.absent(MOTION, "there is a new reference", now_s, at_once=True)
+        over = self.alerts.absent(Topic.MOTION, "there is a new reference", now_s, at_once=True)
         return over + self.decided("there is a new reference", now_s)
 
     def not_recalibrated(self) -> None:
@@ -261,23 +255,23 @@ class Policy:
 
     def decided(self, text: str, now_s: float) -> tuple[Alert, ...]:
         """Nothing waits for an operator any more."""
-        return self.alerts.absent(RENEWAL, text, now_s, at_once=True)
+        return self.alerts.absent(Topic.RENEWAL, text, now_s, at_once=True)
 
     def _about_renewal(
         self, kind: AlertKind, severity: Severity, text: str, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
-        probable, before = explanation.confirmed_cause, self.alerts.about(RENEWAL)
+        probable, before = explanation.confirmed_cause, self.alerts.about(Topic.RENEWAL)
         alert = Alert(kind, probable.cause, severity, text, part=probable.part, causes=explanation.causes)
         over: tuple[Alert, ...] = ()
         if before is not None and (before.kind is not kind or (kind is AlertKind.PROPOSED and before.text != text)):
             # A new alert, not an update, which may be too soon or of something that was acknowledged.
             over = self.decided("overtaken by what follows", now_s)
-        return over + self.alerts.present(RENEWAL, alert, now_s, stamp_ns)
+        return over + self.alerts.present(Topic.RENEWAL, alert, now_s, stamp_ns)
 
     @property
     def drifting(self) -> bool:
         """Whether an alert about the camera's motion is open."""
-        return self.alerts.about(MOTION) is not None
+        return self.alerts.about(Topic.MOTION) is not None
 
     def hold_variance(self, held_s: float) -> Array:
         """(6,) what a held transform's variances have grown by after ``held_s`` seconds."""
@@ -313,36 +307,38 @@ class Policy:
             # As long as a transform is held of which nothing is seen.
             text = unproven_text(since[1])
             unproven = Alert(AlertKind.OCCLUDED, Cause.UNKNOWN, Severity.WARNING, text)
-            before = book.about(VIEW)
-            alerts = book.present(VIEW, unproven, now_s, stamp_ns, news=before is not None and before.text != text)
+            before = book.about(Topic.VIEW)
+            alerts = book.present(
+                Topic.VIEW, unproven, now_s, stamp_ns, news=before is not None and before.text != text
+            )
         else:
-            alerts = book.absent(VIEW, "the gripper is measured again", now_s)
-        alerts += book.absent(IMAGE, "images are good again", now_s)
+            alerts = book.absent(Topic.VIEW, "the gripper is measured again", now_s)
+        alerts += book.absent(Topic.IMAGE, "images are good again", now_s)
         # A fault of the gripper or the lens has one alert, about that.
-        if moved and (not not_the_camera or book.about(MOTION) is not None):
-            alerts += book.present(MOTION, self._motion_alert(evidence), now_s, stamp_ns)
+        if moved and (not not_the_camera or book.about(Topic.MOTION) is not None):
+            alerts += book.present(Topic.MOTION, self._motion_alert(evidence), now_s, stamp_ns)
         else:
-            alerts += book.absent(MOTION, "the camera is where the reference has it", now_s)
+            alerts += book.absent(Topic.MOTION, "the camera is where the reference has it", now_s)
         vibration = motion.vibration
         if vibration is not None:
             size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
             text = f"the camera vibrates: TCP {size_mm:.3f} mm rms{frequency_text(hertz)}"
-            severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(VIBRATION))
+            severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(Topic.VIBRATION))
             alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
-            alerts += book.present(VIBRATION, alert, now_s, stamp_ns)
+            alerts += book.present(Topic.VIBRATION, alert, now_s, stamp_ns)
         else:
-            alerts += book.absent(VIBRATION, "the camera no longer vibrates", now_s)
+            alerts += book.absent(Topic.VIBRATION, "the camera no longer vibrates", now_s)
         if evidence.d_m <= self._settings.limit_m and evidence.delta_rad <= self._settings.limit_rad:
-            refused = book.about(RENEWAL)
+            refused = book.about(Topic.RENEWAL)
             if refused is not None and refused.kind is AlertKind.REFUSED:
-                alerts += book.absent(RENEWAL, "no longer past the limit", now_s)
+                alerts += book.absent(Topic.RENEWAL, "no longer past the limit", now_s)
         if not_the_camera:
-            alerts += book.present(GRIPPER, _gripper_alert(evidence.explanation), now_s, stamp_ns)
+            alerts += book.present(Topic.GRIPPER, _gripper_alert(evidence.explanation), now_s, stamp_ns)
         elif probable.cause is Cause.CAMERA_MOUNT:
             # The same edges, seen better: the alert about the gripper was wrong.
-            alerts += book.absent(GRIPPER, "the camera moved, not the gripper or the lens", now_s, at_once=True)
+            alerts += book.absent(Topic.GRIPPER, "the camera moved, not the gripper or the lens", now_s, at_once=True)
         elif evidence.explanation.confirmed:
-            alerts += book.absent(GRIPPER, "fingers, jaw and lens are as they should be", now_s)
+            alerts += book.absent(Topic.GRIPPER, "fingers, jaw and lens are as they should be", now_s)
         return alerts
 
     def _motion_alert(self, evidence: Evidence) -> Alert:
@@ -359,7 +355,7 @@ class Policy:
         return Alert(
             kind=motion.kind,
             cause=explanation.confirmed_cause.cause,
-            severity=_severity(past_warning, past_limit, self.alerts.about(MOTION)),
+            severity=_severity(past_warning, past_limit, self.alerts.about(Topic.MOTION)),
             text="; ".join(part for part in parts if part),
             part=explanation.confirmed_cause.part,
             causes=explanation.causes,

@@ -16,15 +16,9 @@ from gripmon.track.edges.kernel import FEWEST_FREE
 STRETCH_PX, EDGE_PX = 0.015, 0.03
 """Standard deviations of lasting errors without a known cause, px: of a stretch's mean, and of a whole edge."""
 
-UNDETERMINED_VARIANCE = 1.0
-"""Variance given to a pose that isn't determined when one of its edges is left out, m² and rad²."""
-
 WORST_CONDITION = 1e10
 """Condition number of an information matrix, its unknowns scaled alike, from which it determines no pose."""
 
-_INDEX: tuple[type, tuple[int, ...]] = (np.intp, ())
-_NUMBER: tuple[type, tuple[int, ...]] = (float, ())
-_SHAPES = (_INDEX, _INDEX, _INDEX, _NUMBER, _NUMBER, (float, (6,)), (float, (6,)), (float, (6, 6)), _NUMBER)
 _SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m per rad: about equal motions in the image
 
 
@@ -47,7 +41,9 @@ class PooledEdges:
 
 def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
     """Sum the stretches seen in at least half of the frames, with residuals about ``cam_T_grip`` (4, 4)."""
-    nothing = EdgeSums(*(np.zeros((0, *shape), kind) for kind, shape in _SHAPES))
+    number, index = np.zeros(0), np.zeros(0, dtype=np.intp)
+    vector = np.zeros((0, 6))
+    nothing = EdgeSums(index, index, index, number, number, vector, vector, np.zeros((0, 6, 6)), number)
     shown = [nothing, *(_about(f, f.edges, cam_T_grip) for f in frames if f.edges is not None)]
 
     def all_of(field: str) -> Array:
@@ -89,21 +85,21 @@ def _about(frame: StillFrame, evidence: EdgeSums, cam_T_grip: Array) -> EdgeSums
 
 def leave_one_out(pooled: PooledEdges) -> Array:
     """Covariance (6, 6) of the pose by the jackknife (Tukey 1958): how much it moves when each edge is left out.
-    :data:`UNDETERMINED_VARIANCE` on the diagonal where the other edges don't determine a pose.
+    1 m² and 1 rad² on the diagonal, as good as unknown, where the other edges don't determine a pose.
     """
     edges = np.unique(pooled.edge)
     information = pooled.information * np.outer(_SCALE, _SCALE)
     moment = pooled.moment * _SCALE
     total, pull = information.sum(axis=0), moment.sum(axis=0)
     if len(edges) < 2 or not np.linalg.cond(total) < WORST_CONDITION:
-        return np.eye(6) * UNDETERMINED_VARIANCE
+        return np.eye(6)
     whole = np.linalg.solve(total, pull)
     covariance = np.zeros((6, 6))
     for edge in edges.tolist():
         own = pooled.edge == edge
         rest = total - information[own].sum(axis=0)
         if not np.linalg.cond(rest) < WORST_CONDITION:
-            return np.eye(6) * UNDETERMINED_VARIANCE
+            return np.eye(6)
         moved = _SCALE * (np.linalg.solve(rest, pull - moment[own].sum(axis=0)) - whole)
         covariance += np.outer(moved, moved)
     return covariance * (len(edges) - 1) / len(edges)

@@ -29,10 +29,6 @@ likely by a factor of exp(8) at most.
 """
 
 
-SAME_POSE_SQUARED_DISTANCE = 1.0
-"""Squared distance of two refined poses, normalised by their covariance, below which they are the same pose."""
-
-
 class RecalibrationRefused(ValueError):
     """The corners don't determine a pose; the text gives the reason."""
 
@@ -93,9 +89,9 @@ def rivals(every: list[Recalibration], corners: int) -> list[Recalibration]:
 
 
 def _apart(one: Recalibration, other: Recalibration) -> bool:
-    """Whether two refined poses are not the same minimum."""
+    """Whether two refined poses are not the same minimum: farther apart than a standard deviation."""
     xi = perturbation_between(one.cam_T_grip, other.cam_T_grip)
-    return bool(xi @ np.linalg.solve(one.covariance, xi) > SAME_POSE_SQUARED_DISTANCE)
+    return bool(xi @ np.linalg.solve(one.covariance, xi) > 1.0)
 
 
 def coplanar(points_grip_m: Array) -> bool:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.lines import SHOWN_BESIDE
-from gripmon.track.edges.prediction import STEP_PX, Prediction
-from gripmon.track.edges.profiles import find_candidates, read_profiles
+from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import filter_reach_px, find_candidates, profile_offsets_px, read_profiles
 from gripmon.track.edges.roles import PARALLEL_COSINE, along_fingers
 from gripmon.track.edges.roundings import GoesOn, Rounding, Roundings, crossing
 from gripmon.track.edges.settings import EdgeSettings
@@ -26,22 +26,16 @@ from gripmon.track.edges.settling import Measurement
 END_CORNERS = 2
 """Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
 
-BEYOND_PX = (3.0, 16.5)
-"""Stretch beyond a corner that is searched, px: clear of the corner's own blur, and as far as the stretch of an edge
-that makes a corner seen (``corners.neighbourhood_px``).
+PROBES_PX = np.linspace(3.0, 16.5, 10)
+"""Distances of the search lines beyond a corner, px: clear of the corner's own blur, 1.5 px apart, since neighbours see
+the same pixels, and as far as the stretch of an edge that makes a corner seen (``corners.neighbourhood_px``).
 """
-
-PROBES = 10
-"""Search lines on it: one each 1.5 px, since neighbours see the same pixels."""
 
 PROBES_SKIPPED = 2
 """Probes next to a corner that another edge of the finger may run through."""
 
 PROBES_AT_CORNER = 3
 """Probes next to a corner that all show an edge where it goes on a little: beyond a step on the finger."""
-
-PROBE_REACH_PX = 4.0
-"""How far they reach to both sides, px: the shortest that shows the decline of the edge filter's response."""
 
 CONTINUATION_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
@@ -78,11 +72,11 @@ class FingerEndsSeen:
 
 @dataclass(frozen=True, slots=True)
 class _Probes:
-    """Search lines beyond places, for one prediction; c extensions of :data:`PROBES` each.
+    """Search lines beyond places, for one prediction; c extensions, each at all of :data:`PROBES_PX`.
 
-    ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's search line next to it, ``ok`` (c *
-    PROBES,).  ``turns``: for each place where a side turns into a curve, the search lines of the stretches that show
-    it.
+    ``place`` (c,) among those at the fingers' ends, ``sample`` (c,) the edge's search line next to it, ``ok`` (c * p,)
+    of their p probes.  ``turns``: for each place where a side turns into a curve, the search lines of the stretches
+    that show it.
     """
 
     place: NDArray[np.intp]
@@ -141,7 +135,7 @@ class FingerEnds:
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
         self.axis, self.along = along_fingers(gripper)
-        self._roundings = Roundings(gripper, self.along, BEYOND_PX[1], PARALLEL_COSINE)
+        self._roundings = Roundings(gripper, self.along, float(PROBES_PX[-1]), PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
         self._kept: tuple[Prediction, _Probes] | None = None
         self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
@@ -201,16 +195,17 @@ class FingerEnds:
         prediction, candidates = measurement.prediction, measurement.candidates
         # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
-        shift_px = np.repeat(offset_px[:, None] * prediction.normal[probes.sample], PROBES, axis=0).astype(np.float32)
+        of_edge_px = (offset_px[:, None] * prediction.normal[probes.sample]).astype(np.float32)
+        shift_px = np.repeat(of_edge_px, len(PROBES_PX), axis=0)
         maps = probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:]
         profiles = read_profiles(image, *maps, self._settings.response)
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
         step = _own_step(measurement)[prediction.layout.edge[probes.sample]]
-        of = found.sample // PROBES
+        of = found.sample // len(PROBES_PX)
         near = np.abs(found.offset_px) < CONTINUATION_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
         strong = near & (np.abs(found.step) > CONTINUATION_STEP_RATIO * np.abs(step[of]))
-        shown, well_shown = np.zeros((2, len(probes.place), PROBES), dtype=bool)
+        shown, well_shown = np.zeros((2, len(probes.place), len(PROBES_PX)), dtype=bool)
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
         goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > SHOWN_BESIDE
@@ -235,8 +230,8 @@ class FingerEnds:
                     further += [] if back is None else [(number, back)]
                 place.append(number)
                 sample.append(here)
-                at.append(from_uv_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * way)
-                across.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
+                at.append(from_uv_px + PROBES_PX[:, None] * way)
+                across.append(np.broadcast_to(prediction.normal[here], (len(PROBES_PX), 2)))
         for number, rounding in self._rounded(prediction).items():
             here = int(np.flatnonzero(places.rounding == number)[0])
             turns[here] = rounding.beside
@@ -244,14 +239,14 @@ class FingerEnds:
         for number, goes_on in further:
             place.append(number)
             sample.append(goes_on.profile)
-            at.append(goes_on.from_px + np.linspace(*BEYOND_PX, PROBES)[:, None] * goes_on.way)
-            across.append(np.broadcast_to(prediction.normal[goes_on.profile], (PROBES, 2)))
+            at.append(goes_on.from_px + PROBES_PX[:, None] * goes_on.way)
+            across.append(np.broadcast_to(prediction.normal[goes_on.profile], (len(PROBES_PX), 2)))
         if not place:
             nowhere = np.zeros((0, 3), dtype=np.float32)
             none = np.zeros(0, dtype=np.intp)
             return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool), {})
-        half = round(PROBE_REACH_PX / STEP_PX)
-        offsets = np.arange(-half, half + 1) * STEP_PX
+        # To both sides what the edge filter needs about a continuation, and as much again to see its response decline.
+        offsets = profile_offsets_px(filter_reach_px(self._settings.blur_px) + 2.0 * CONTINUATION_PX)
         probes = np.concatenate(at)
         maps = probes[:, :, None] + np.concatenate(across)[:, :, None] * offsets
         inside: NDArray[np.bool_] = np.asarray(np.isfinite(probes).all(axis=1))
@@ -279,13 +274,14 @@ class FingerEnds:
         self, prediction: Prediction, number: int, here: int, clear_px: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
         """The search lines that show a side turn into a curve: of the side's end, of the curve beside it, and of the
-        curve from where it has left the side's direction, ``clear_px`` (2,), on; :data:`BEYOND_PX` long each.
+        curve from where it has left the side's direction, ``clear_px`` (2,), on; as long
+        each as the probes reach.
 
         A straight border beside or across the finger is like two of them at most.
         """
         uv_px, edge = prediction.uv_px, prediction.layout.edge
         side, curve = (np.flatnonzero(edge == edges[number]) for edges in (self._places.side, self._places.curve))
-        reach_px = BEYOND_PX[1]
+        reach_px = float(PROBES_PX[-1])
         on_side = side[np.linalg.norm(uv_px[side] - uv_px[here], axis=1) < reach_px]
         if self._gripper.edge_points[self._places.curve[number], 1] == self._places.point[number]:
             curve = curve[::-1]

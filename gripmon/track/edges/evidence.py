@@ -22,29 +22,27 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
 from gripmon.track.edges.prediction import FEWEST_SAMPLES
 from gripmon.track.edges.profiles import Edgels, weigh
-from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls
+from gripmon.track.edges.robust_fit import Prior, RobustFit, fit_irls, prior_information
 from gripmon.track.edges.settling import ZOOMS, Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
 
-FINGER_ELSEWHERE_RATIO = 1.2
-"""Least ratio of a finger's inliers elsewhere to those at the pose of the whole gripper."""
-
-FINGER_SEEN_SHARE = 0.5
-"""Inlier ratio of a finger at its expected place below which it is searched for farther away: anything with an edge or
-two may give less, such as a shadow, the finger's other side, or something behind it.
+ELSEWHERE_SHARE_RATIO = 1.3
+"""Least inlier ratio elsewhere over that where something is expected: of a gripper over that of a trusted fit, of a
+finger over that at the pose of the whole gripper.
 """
 
-FINGER_FOUND_SHARE = 0.55
-"""Least inlier ratio of a finger there: other things have a straight edge or two as well."""
+FINGER_SEEN_SHARE = 0.5
+"""Least inlier ratio of a finger that is seen; below, it is searched for farther away: anything with an edge or two may
+give less, such as a shadow, the finger's other side, or something behind it.
+"""
 
-FEWEST_SHARE = 0.4
-"""Least inlier ratio of a stretch that counts as seen; at least as many inliers as an edge needs."""
+STRETCH_SEEN_SHARE = 0.4
+"""Least inlier ratio of a stretch that counts as seen; it also needs as many inliers as an edge's own line."""
 
-_STEP_PX = 2.0
-_REFINED = 3
-_FIXED = 1e12  # information of an opening that stays
+_STEP_PX = 2.0  # of the grid of shifts that a finger's fit starts from; px of the zoomed image
+_REFINED = 3  # shifts of the grid that are fitted
 
 
 class _Place(NamedTuple):
@@ -114,7 +112,7 @@ class FingerMeter(Settler):
                 continue
             for pose in (measurement.cam_T_grip, *elsewhere):
                 other = self._farther(image, Expected(pose, opening_m, opening_m), zoom, finger)
-                if other is not None and other.share >= max(FINGER_FOUND_SHARE, FINGER_ELSEWHERE_RATIO * best.share):
+                if other is not None and other.share >= max(FINGER_SEEN_SHARE, ELSEWHERE_SHARE_RATIO * best.share):
                     best = other
             if best.share >= FINGER_SEEN_SHARE:
                 break
@@ -152,11 +150,11 @@ class FingerMeter(Settler):
         edgels = replace(edgels, weight=np.where(own[edgels.candidates.sample] == finger, edgels.weight, 0.0))
         best: _Place | None = None
         for start in starts:
-            information = np.full(len(start), _FIXED)
+            information = prior_information(0.0)[: len(start)]  # the opening stays
             information[:6] = FINGER_SIGMA**-2
             fit = fit_irls(edgels, Prior(start, information), start, self._settings.consensus)
             share = np.count_nonzero(fit.supported) / sampled
-            if best is None or share > FINGER_ELSEWHERE_RATIO * best.share:
+            if best is None or share > ELSEWHERE_SHARE_RATIO * best.share:
                 best = _Place(edgels, fit, share)
         return best
 
@@ -307,5 +305,5 @@ def _points(place: _Place) -> NDArray[np.intp]:
     number = prediction.layout.stretch
     profiles = np.bincount(number[prediction.ok], minlength=int(number.max(initial=0)) + 1)
     points = np.bincount(number[candidates.sample[index]], minlength=len(profiles))
-    good = (points >= FEWEST_SAMPLES) & (points >= FEWEST_SHARE * profiles)
+    good = (points >= FEWEST_SAMPLES) & (points >= STRETCH_SEEN_SHARE * profiles)
     return index[good[number[candidates.sample[index]]]]

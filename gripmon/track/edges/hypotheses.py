@@ -18,6 +18,7 @@ from gripmon.model.geometry import invert, skew
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.track.edges.kernel import FEWEST_EDGES
+from gripmon.track.edges.prediction import PLACES
 from gripmon.track.edges.reduced import (
     ORIENTATIONS,
     RANK_LEVELS,
@@ -71,7 +72,7 @@ def outline_points(
     if np.count_nonzero(wanted) < FEWEST_EDGES:  # then lines between two faces are looked at, too
         wanted = view.visible
     edges = np.flatnonzero(wanted)
-    share = np.linspace(_EDGE_MARGIN, 1.0 - _EDGE_MARGIN, 65)
+    share = np.linspace(_EDGE_MARGIN, 1.0 - _EDGE_MARGIN, PLACES)
     points_m, _ = _places(gripper, ends_m, np.repeat(edges, len(share)), np.tile(share, len(edges)))
     uv = camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]).reshape(-1, len(share), 2)
     with np.errstate(invalid="ignore"):

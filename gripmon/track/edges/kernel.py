@@ -23,8 +23,8 @@ WIDTH_DECAY = 0.4
 """What is left of the width that covers the start's error, from round to round."""
 
 CONVERGED_SQUARED_STEP = 0.04
-"""Squared step over its covariance, a fifth of a standard deviation, at which the fit ends; what is still to come is
-less.
+"""Squared step over its covariance, a fifth of a standard deviation, below which one of the last three rounds ends the
+fit; what is still to come is less.
 """
 
 LARGEST_SPREAD_PX = 1.0
@@ -39,7 +39,9 @@ INNER_SIGMAS, INNER_PX = 4.0, 0.3
 """The robust spread is estimated from residuals within 4 standard deviations and 0.3 px, however wide the weight is."""
 
 SMALLEST_STIFFNESS = 0.2
-"""Of a fit whose weights all fall off: below, the covariance would grow without bound."""
+"""Least stiffness (no unit; 0.83 for normal residuals): where most points lie half way out it nears zero, and the
+covariance would grow without bound.
+"""
 
 FEWEST_EDGES = 3
 """Edges that must be seen for a fit to be believed at all."""
@@ -47,11 +49,13 @@ FEWEST_EDGES = 3
 FEWEST_AGREEING = 5
 """Search lines of an edge that must agree for it to count as seen."""
 
-SMALLEST_VARIANCE_RATIO = 0.1
-"""Points are never taken to be better than by this factor of their variance."""
+LEAST_SCATTER = 0.1
+"""Factor by which the scatter of the stretches may lower the points' variances at most."""
 
 FEWEST_FREE = 3
-"""Degrees of freedom from which the scatter of stretches is judged."""
+"""Degrees of freedom from which the scatter of stretches is judged: Student's distribution has no variance with
+fewer.
+"""
 
 
 @compiled
@@ -193,8 +197,8 @@ def _residuals(jacobian: Any, offset: Any, xi: Any, residual: Any) -> None:
 
 @compiled
 def _spread(residual: Any, sigma: Any, width: float, buffer: Any) -> tuple[float, float]:
-    """Robust size of the residuals that may belong to the fit, 1.4826 times their median: over their standard
-    deviations, at least 1, and in px.  ``buffer`` (j,) is overwritten.
+    """Robust size of the residuals that may belong to the fit, 1.4826 times the median of their absolute values:
+    over their standard deviations, at least 1, and in px.  ``buffer`` (j,) is overwritten.
     """
     count = 0
     for j in range(len(residual)):
@@ -340,7 +344,7 @@ def assess(
     first, total, moment, pulls = _stretches(sample, weight, residual_px, jacobian, edge, stretch, worth)
     contradiction = _contradiction(total, moment, unknowns)
     freedom = len(total) - unknowns
-    scatter, shared = max(min(contradiction, 1.0), SMALLEST_VARIANCE_RATIO), 0.0
+    scatter, shared = max(min(contradiction, 1.0), LEAST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / total.sum()
     if len(total):

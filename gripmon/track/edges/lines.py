@@ -6,6 +6,7 @@ line is fitted by ``e = a + b * along``.  Corners come with a 2x2 covariance eac
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -26,16 +27,19 @@ SHOWN_BESIDE = 0.5
 each stretch of a turn into a curve, from which that is seen; of probes beyond an end, from which the edge goes on.
 """
 
-_FAULTS = (
-    None,
-    CornerFault.OUTSIDE,
-    CornerFault.SELF_HIDDEN,
-    CornerFault.FEW_POINTS,
-    CornerFault.HIDDEN,
-    CornerFault.PARALLEL,
-    CornerFault.UNCERTAIN,
-)
-_OUTSIDE, _SELF_HIDDEN, _FEW_POINTS, _HIDDEN, _PARALLEL, _UNCERTAIN = range(1, len(_FAULTS))
+
+class _Fault(enum.IntEnum):
+    """A :class:`~gripmon.model.records.CornerFault` in machine code, by its name; 0 for none."""
+
+    OUTSIDE = 1
+    SELF_HIDDEN = 2
+    FEW_POINTS = 3
+    HIDDEN = 4
+    PARALLEL = 5
+    UNCERTAIN = 6
+
+
+_FAULTS = (None, *(CornerFault[fault.name] for fault in _Fault))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +89,10 @@ class CornerGeometry:
 
 def _fault_of_view(inside: bool, facing: bool, edges: int) -> int:
     if not inside:
-        return _OUTSIDE
+        return _Fault.OUTSIDE
     if not facing:
-        return _SELF_HIDDEN
-    return _FEW_POINTS if edges < 2 else 0
+        return _Fault.SELF_HIDDEN
+    return _Fault.FEW_POINTS if edges < 2 else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,16 +252,16 @@ def _intersect(
                     sine = max(sine, abs(ax * y - ay * x) / (math.hypot(ax, ay) * math.hypot(x, y)))
         begin = end
         if fault[c] == 0 and beside < 2:
-            fault[c] = _HIDDEN
+            fault[c] = _Fault.HIDDEN
         if fault[c] == 0 and sine < smallest_sine:
-            fault[c] = _PARALLEL
+            fault[c] = _Fault.PARALLEL
         if fault[c] != 0:
             continue
         determinant = ixx * iyy - ixy * ixy
         cxx, cxy, cyy = iyy / determinant, -ixy / determinant, ixx / determinant
         sigma = _larger_sigma(lens[c], cxx, cxy, cyy)
         if sigma > largest_sigma_px:
-            fault[c] = _UNCERTAIN
+            fault[c] = _Fault.UNCERTAIN
             continue
         shift_x, shift_y = cxx * bx + cxy * by, cxy * bx + cyy * by
         sigma_px[c], covariance[c, 0, 0], covariance[c, 1, 1] = sigma, cxx, cyy

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
-from gripmon.track.edges.evidence import FingerMeter
+from gripmon.track.edges.evidence import ELSEWHERE_SHARE_RATIO, FingerMeter
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
 from gripmon.track.edges.profiles import unevenness
 from gripmon.track.edges.robust_fit import (
@@ -39,20 +39,19 @@ EVEN_SIDES = (0.35, 0.7)
 UNEVEN_SIDES = 0.6
 """Unevenness from which all edges must be seen: neither of their sides is of one shade."""
 
-FITTED_AGAIN, SETTLED = 4, 2
-"""Places elsewhere that are fitted roughly once more, and that are followed to the end."""
+REFITTED_PLACES, SETTLED_PLACES = 4, 2
+"""Best places elsewhere that are fitted roughly once more; and those of them that are followed to the end."""
 
-PROMISING, NEARLY_AS_GOOD = 0.8, 0.9
-"""What places must show in a rough fit to be followed: parts of the share to beat, and of the best one's."""
+PROMISING_RATIO = 0.8
+"""Part of the share to beat, and of the best rough fit's, that a rough fit must show to be followed: the refit after it
+finds more.
+"""
 
 SATISFYING_SHARE_RATIO = 0.65
 """Fraction of the usual inlier ratio below which the gripper may be elsewhere."""
 
 TRUSTED_SHARE_RATIO = 0.4
 """Fraction of the usual inlier ratio below which a fit is not believed, whatever the settings allow."""
-
-ELSEWHERE_SHARE_RATIO = 1.3
-"""Least inlier ratio elsewhere over that of a trusted fit where the gripper was expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +186,7 @@ class FingertipMeter(FingerMeter):
         beat = (ELSEWHERE_SHARE_RATIO if best.trusted else 1.0) * best.consensus.share
         least = max(self._settings.consensus.found_share, TRUSTED_SHARE_RATIO * usual_share)
         for effort in (Effort.GRID, Effort.SEARCH) if at_once else (Effort.SEARCH,):
-            enough = PROMISING * max(beat, least)
+            enough = PROMISING_RATIO * max(beat, least)
             if effort is Effort.GRID:
                 places = self._fitted_again(image, self._near_places(image, expected), enough)
             else:
@@ -232,7 +231,7 @@ class FingertipMeter(FingerMeter):
         for zoom in others[self._lost % len(others) :][:1] if self._lost else others:
             self._zoom = zoom
             beat = ELSEWHERE_SHARE_RATIO * best.consensus.share
-            least = PROMISING * max(beat, self._settings.consensus.trusted_share)
+            least = PROMISING_RATIO * max(beat, self._settings.consensus.trusted_share)
             if self._rough_share(image, expected) < least:
                 continue
             other = self._settle(image, expected)
@@ -350,14 +349,14 @@ class FingertipMeter(FingerMeter):
         return fit_irls(self._look(image, prediction), prior, start, self._settings.consensus).share
 
 
-def _best(places: list[_Place], count: int = FITTED_AGAIN) -> list[_Place]:
+def _best(places: list[_Place], count: int = REFITTED_PLACES) -> list[_Place]:
     return sorted(places, key=lambda place: -place.share)[:count]
 
 
 def _promising(places: list[_Place], least: float) -> list[_Place]:
     """The best places with at least the share ``least``, and only those that may turn out as good as the first."""
-    best = _best(places, SETTLED)
-    return [place for place in best if place.share >= max(least, NEARLY_AS_GOOD * best[0].share)]
+    best = _best(places, SETTLED_PLACES)
+    return [place for place in best if place.share >= max(least, PROMISING_RATIO * best[0].share)]
 
 
 def _shows_nearly_all(measurement: Measurement) -> bool:

@@ -41,9 +41,6 @@ it.
 BORDER_PX = 2.0
 """What is closer than this to the image's border counts as outside: a search line reads the rows beside it, too."""
 
-SHORTEST_PX = float(FEWEST_AGREEING - 1)
-"""A shorter edge isn't sampled: the least number of inliers would be closer than a pixel."""
-
 PLACES = 65
 """Places of an edge, evenly spaced, at which it is checked whether it lies in the image."""
 
@@ -207,7 +204,8 @@ def lay_out(
     along_m = gripper.outlines_m(points_cam_m, np.arange(len(gripper.edge_ids)), PLACES, cam_T_grip[:3, :3])
     uv = camera.project(along_m.reshape(-1, 3)).reshape(-1, PLACES, 2)
     margin_px = settings.end_margin_px
-    shortest_px = max(margin_px, SHORTEST_PX)  # the margin is zoomed, and so is what has to be left
+    # On a shorter edge the fewest inliers would be closer than a pixel.  The margin is zoomed, and so is what is left.
+    shortest_px = max(margin_px, FEWEST_AGREEING - 1.0)
     ways = np.asarray(np.gradient(uv, axis=1))
     inside_px = _lines_inside_px(camera, uv, _unit(ways[..., ::-1] * (-1.0, 1.0)), settings.reach_px) - BORDER_PX
     ranges = prediction_kernel.sampled_ranges(uv, inside_px, wanted, margin_px, shortest_px)

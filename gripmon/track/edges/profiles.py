@@ -20,7 +20,7 @@ from gripmon.track.edges.kernel import FEWEST_AGREEING
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.settings import EdgeSettings, RobustFitSettings
 
-_CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
+_CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)  # the weights of read_profiles, every half pixel
 
 BESIDE_SAMPLES = (4, 10)
 """From where to where beside an edge grey levels are averaged and texture is looked for that may shift it, in samples
@@ -67,6 +67,11 @@ def profile_offsets_px(reach_px: float) -> Array:
     """Sample positions (s,) of a search line along its normal, px, symmetric about the predicted edge."""
     half = round(reach_px / STEP_PX)
     return np.arange(-half, half + 1) * STEP_PX
+
+
+def filter_reach_px(blur_px: float) -> float:
+    """How far the derivative of a Gaussian of this standard deviation reaches to both sides, px: three of them."""
+    return math.ceil(3.0 * blur_px / STEP_PX) * STEP_PX
 
 
 def read_profiles(
@@ -124,7 +129,7 @@ def quantum(image: Image) -> float:
 
 @lru_cache(maxsize=64)
 def _kernel(samples: int, blur_px: float, zoom: int) -> _Kernel:
-    half = math.ceil(3.0 * blur_px / STEP_PX)
+    half = round(filter_reach_px(blur_px) / STEP_PX)
     if 2 * half + 5 > samples:
         raise ValueError(
             f"a blur of {blur_px} px needs search lines of at least {(half + 2) * STEP_PX} px to both sides"

@@ -24,7 +24,7 @@ from gripmon.model.records import Array, Image
 Floats = NDArray[np.float32]
 
 ORIENTATIONS = 16
-"""Of edges, in [0, pi)."""
+"""Number of orientations of edges, evenly spaced in [0, pi)."""
 
 HALF_LENGTH = 4
 """Cells to both sides over which strengths are averaged along an edge: texture cancels, straight edges don't."""
@@ -36,18 +36,18 @@ RANK_EXPONENT = 0.35
 """Exponent of the distribution of an edge's rank where it shows: median at the strongest 14 % of all places."""
 
 SMALLEST_RANK = 0.004
-"""Strengths rarer than this count alike."""
+"""Smallest share of the image that is taken to be stronger: a rarer strength says no more."""
 
 BESIDE_CELLS = 3
 """Cells from an outline to where its sides are looked at."""
 
 QUIET_GRADIENT_SHARE = 0.1
-"""Changes smaller than this part of the image's strong ones, the strongest 5 %, are none."""
+"""Gradients below this fraction of the image's 95th percentile all count as calm alike."""
 
 RANK_LEVELS = 256
 """Steps in which values are ranked."""
 
-_NODE = 8  # cells between places at which the lens is reckoned
+_NODE = 8  # cells between places at which the lens is evaluated
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def rectify(image: Image, camera: Camera, window: Window) -> tuple[Floats, NDArr
     places[~seen] = 0.0
     columns, rows = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
     grey = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    # Beside the image's border there is no telling an edge.
+    # Beside the image's border an edge can't be distinguished from the border.
     inner = cv2.erode(
         np.asarray(seen, np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
     )

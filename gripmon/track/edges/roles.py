@@ -13,9 +13,6 @@ from gripmon.model.records import Array
 PARALLEL_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""
 
-MAJORITY = 0.5
-"""Fraction of the edges' length that has to run one way for the fingers to have a direction at all."""
-
 DISTINCT_M = 1e-4
 """A finger's edges that are nearer to each other than a gripper file's points may be have no inner and outer one, m."""
 
@@ -32,7 +29,7 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
     near = np.abs(direction @ direction.T) > PARALLEL_COSINE
     together = near @ length
     best = int(np.argmax(together))
-    if together[best] < MAJORITY * length.sum():
+    if together[best] < 0.5 * length.sum():
         return np.zeros(3), np.ones(len(length), dtype=bool)
     return direction[best], np.asarray(near[best])
 

@@ -1,8 +1,8 @@
 """Finding the gripper again after a jump that is wider than the search lines reach.
 
 In a reduced image (``reduced``) the points on the predicted outlines vote for shifts, turns about the optical axis and
-scales.  The best places are shaken in all six directions, tilts included, then polished on an image of twice the
-resolution (``hypotheses``); the result is a few starts for the joint fit on the full image, which decides.
+scales.  The best places are perturbed in all six directions, tilts included, then refined by least squares on an image
+of twice the resolution (``hypotheses``); the result is a few starts for the joint fit on the full image, which decides.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""
 
 STEP_CELLS = 3.0
-"""Step of turn and scale: so many cells of motion at the farthest outline point."""
+"""Step of turn and scale, in cells of motion at the farthest outline point."""
 
 FOLLOWED_PLACES = 64
 """Best places of the votes that are followed."""
@@ -43,16 +43,16 @@ POLISHED_PLACES = 24
 """Of these, how many are polished."""
 
 PERTURBATION_ROUNDS = ((24, 2.5, 1.0), (12, 1.25, 0.5))
-"""Rounds of perturbations: how many of each place, by how many cells, and by which part of the searched tilt."""
+"""Rounds of perturbations: number of them at each place, their range in cells, and as a part of the searched tilt."""
 
 POLISHING_ZOOM = 2
 """Resolution of the image for polishing over that for voting."""
 
 POLISH_REACH, POLISH_ROUNDS = 4, 4
-"""Cells beside the outlines that are looked at when polishing, at first; steps."""
+"""Finer cells to both sides of the outlines that are read in the first least squares step; number of steps."""
 
 DISTINCT_CELLS = 2.0
-"""Poses whose outlines differ by less than so many (finer) cells are one."""
+"""Difference of the outlines, in cells of the finer image, up to which two poses count as one."""
 
 
 def search_poses(

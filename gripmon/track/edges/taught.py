@@ -33,6 +33,8 @@ from gripmon.model.records import Array, Transform
 from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
+"""Bound on an edge's offset in a file, m: more is another edge, or another unit."""
+
 SAME_POSE = 1e-6
 """Poses are the same if no element of their matrices (m, no unit) differs by more: files hold rounded numbers."""
 
@@ -223,7 +225,8 @@ class TaughtEdges:
         """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
         it is exact, or only differences from it count.
         """
-        listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
+        untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
+        listed = [edges.get(name, untaught) for name in gripper.edge_ids]
         across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
         share = np.array([e.share for e in listed])
         offset_m = np.array([e.offset_m for e in listed])
@@ -291,6 +294,3 @@ def _cross(a: Array, b: Array) -> Array:
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
     return out
-
-
-_UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)

@@ -27,21 +27,35 @@ from gripmon.track.integrity import kernel
 LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
 
-LOG_RISK_SPACING = 0.05
-_LOG_RISK = -LOG_RISK_SPACING * np.arange(281.0)
-SQUARES = chdtri(np.array([[1.0], [3.0]]), 10.0**_LOG_RISK)
-"""(2, 281) squares that normal errors along one axis, and along three equal ones, exceed with the probabilities 1 to
-1e-14, in even steps of their logarithm.
-"""
 
-GUIDE_STEP = 0.25
-GUIDE = np.stack(
-    [
-        np.searchsorted(row, np.arange(0.0, SQUARES.max(), GUIDE_STEP), side="right").clip(1, len(row) - 1) - 1
-        for row in SQUARES
-    ]
-)
-"""(2, n) where a square's place in the table is found from on, for each :data:`GUIDE_STEP`."""
+class Quantiles(NamedTuple):
+    """Tables of the normal distribution: ``squares`` (2, r) that errors along one axis, and along three equal ones,
+    exceed with probabilities whose decadic logarithms are a ``spacing`` apart; ``guide`` (2, n): where a square's place
+    among them is found from on, for each ``step`` of it.
+    """
+
+    squares: Array
+    spacing: float
+    guide: NDArray[np.intp]
+    step: float
+
+    @classmethod
+    def of(cls, spacing: float, step: float) -> Quantiles:
+        """Tables from the probability 1 to 1e-14."""
+        log_risk = -spacing * np.arange(round(14.0 / spacing) + 1.0)
+        squares = chdtri(np.array([[1.0], [3.0]]), 10.0**log_risk)
+        at = np.arange(0.0, squares.max(), step)
+        guide = [np.searchsorted(row, at, side="right").clip(1, len(row) - 1) - 1 for row in squares]
+        return cls(squares, spacing, np.stack(guide), step)
+
+    @property
+    def log_risk(self) -> Array:
+        """(r,) decadic logarithms of the probabilities, from zero down."""
+        return -self.spacing * np.arange(float(self.squares.shape[1]))
+
+
+QUANTILES = Quantiles.of(spacing=0.05, step=0.25)
+"""Between its places the length that a risk allows is interpolated to 0.1 %."""
 
 
 class Separation(NamedTuple):
@@ -157,8 +171,8 @@ class Tails(NamedTuple):
         """Lengths that are exceeded with the probabilities ``risk``."""
         log_risk = np.log10(np.maximum(risk, 1e-300))
         # The tables run from the certain to the improbable.
-        one = np.interp(self.factor - log_risk, -_LOG_RISK, SQUARES[0])
-        three = np.interp(-log_risk, -_LOG_RISK, SQUARES[1])
+        one = np.interp(self.factor - log_risk, -QUANTILES.log_risk, QUANTILES.squares[0])
+        three = np.interp(-log_risk, -QUANTILES.log_risk, QUANTILES.squares[1])
         return np.asarray(self.sigma * np.sqrt(np.minimum(one, three)))
 
 
@@ -210,9 +224,9 @@ class Doubts:
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        tables = SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP
+        squares, spacing, guide, step = QUANTILES
         position, rotation, number = kernel.levels(
-            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, *tables
+            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, squares, spacing, guide, step
         )
         return position, rotation, self.name[number] if number >= 0 else ""
 

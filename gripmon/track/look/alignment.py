@@ -39,16 +39,17 @@ CLOSE_PX = 0.1
 """Step of the alignment up to which the image isn't read again, px: central differences are a fifth too small."""
 
 READINGS = 3
+"""Times that the image is read in one alignment, at most."""
 
 LEAST_DN = 0.5
 """Scatter below which no pixel is believed, steps of grey: the root mean square of rounding is 0.3."""
 
-TEXTURE = 5.0
+TEXTURE_NOISE_RATIO = 5.0
 """Mean square of a block's gradient over what the noise of its mean makes of it, below which it has no texture: noise
 would show a gripper that never moves.
 """
 
-UNLIKE = 2.0
+UNLIKE_SIGMAS = 2.0
 """Root mean square of a block's residuals, in standard deviations, from which it looks otherwise than learnt: noise
 gives 1.  It isn't learnt from then; after :data:`FEWEST_VIEWS` running it is learnt again: what covered it is gone.
 """
@@ -280,11 +281,11 @@ class LookAlignment:
         learnt = self._mean - middle
         own = np.maximum((learnt**2).sum(axis=1, keepdims=True), 1e-9)
         gain = ((values - level) * learnt).sum(axis=1, keepdims=True) / own
-        told = seen & (gain[:, 0] >= kernel.GAINS[0]) & (gain[:, 0] <= kernel.GAINS[1])
+        told = seen & (gain[:, 0] >= kernel.GAIN_BOUNDS[0]) & (gain[:, 0] <= kernel.GAIN_BOUNDS[1])
         with np.errstate(invalid="ignore", divide="ignore"):
             away = np.where(told[:, None], (values - level) / gain + middle, values) - self._mean
         usual = np.sqrt(self._variance) + LEAST_DN
-        unlike = seen & (self._count >= FEWEST_VIEWS) & (((away / usual) ** 2).mean(axis=1) > UNLIKE**2)
+        unlike = seen & (self._count >= FEWEST_VIEWS) & (((away / usual) ** 2).mean(axis=1) > UNLIKE_SIGMAS**2)
         self._unlike = np.where(seen, np.where(unlike, self._unlike + 1, 0), self._unlike)
         again = self._unlike >= FEWEST_VIEWS
         self._mean[again], away[again] = values[again], 0.0
@@ -302,7 +303,7 @@ class LookAlignment:
         jacobian = jacobian_of(self._mean, self._flow, weight)
         noise = 0.5 / (weight * np.minimum(self._count, MOST_VIEWS)[:, None] + 1e-12)
         across, down = gradients(self._mean)
-        textured = (across**2 + down**2).mean(axis=1) > TEXTURE * 2.0 * noise[:, INNER].mean(axis=1)
+        textured = (across**2 + down**2).mean(axis=1) > TEXTURE_NOISE_RATIO * 2.0 * noise[:, INNER].mean(axis=1)
         weight = weight * textured[:, None]
         best = most_telling(jacobian, weight[:, INNER], MEASURED_BLOCKS)
         best = best[textured[best]]

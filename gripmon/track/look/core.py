@@ -41,8 +41,8 @@ pixel's scatter is known to 1/sqrt(24) = 0.2.
 """
 
 MANY_VIEWS, RELEARN_S = 100, 0.1
-"""Frames learnt one after the other, what isn't the gripper's averages to a tenth; then so many seconds apart: frames
-of a fast camera show nearly the same, and forgetting takes hours.
+"""Number of frames that are learnt one after the other, so that what isn't the gripper's averages to a tenth; and pause
+between later ones, s: frames of a fast camera show nearly the same, and forgetting takes hours.
 """
 
 LAY_OUT_AGAIN_S = 60.0
@@ -50,29 +50,23 @@ LAY_OUT_AGAIN_S = 60.0
 
 CHANGED_CORRELATION = 0.5
 """Correlation of some pixels with what they showed before, below which they show something else: a patch beside a
-finger another background, a block on it another look.
+finger another background, a block on it another look.  A patch of which two frames correlate by more on average is the
+gripper's: that is the square of the length of the mean of its unit vectors.
 """
 
 CHANGED_BACKGROUND_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
-"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
-
-ELSEWHERE_M = 2e-3
-"""From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
-
-CONSTANT_PATCH_LENGTH = 0.7
-"""Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
+"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm.  From the
+second on a patch must look otherwise to count: things that are mistaken for a tip lie farther off than the first.
+"""
 
 KEPT_PATCHES = 16
 """Most telling ones of a finger that poses are compared with: 512 points on two fingers."""
 
 DISAGREEING_FRAME_WEIGHT = 0.125
 """Of a frame in which a known patch disagrees, when it is learnt: mostly something hides it, rarely it has changed."""
-
-SMALLEST_CONTRAST_LEVELS = 1.0
-"""Contrast (root mean square) below which a patch has none, in steps of grey."""
 
 
 def _without_light() -> Array:
@@ -97,7 +91,7 @@ class GripperLook:
         axis = np.asarray(axis_grip, dtype=float)
         steps_m = np.array([sign * way for way in SLIDES_M for sign in (1.0, -1.0)])
         self._slides_grip_m = steps_m[:, None] * (axis / np.linalg.norm(axis))
-        self._far = np.abs(steps_m) >= ELSEWHERE_M - 1e-9
+        self._far = np.abs(steps_m) > SLIDES_M[0]
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.forget()
 
@@ -306,7 +300,7 @@ class GripperLook:
         length = np.linalg.norm(self._mean, axis=1)
         alike = np.einsum("knp,np->kn", look, self._mean) / np.maximum(length, 1e-12)
         agree = alike > AGREEING_CORRELATION
-        known = (length > CONSTANT_PATCH_LENGTH) & (self._weight > FEWEST_VIEWS / 2)
+        known = (length**2 > CHANGED_CORRELATION) & (self._weight > FEWEST_VIEWS / 2)
         weight = np.where(known & ~agree[0], DISAGREEING_FRAME_WEIGHT, 1.0) * inside[0]
         self._weight = np.maximum(kept * self._weight, np.minimum(self._weight, FEWEST_VIEWS)) + weight
         share = weight / np.maximum(self._weight, 1e-12)
@@ -323,7 +317,7 @@ class GripperLook:
         """The patches of each finger that tell most: always the same where they are, and another view elsewhere."""
         length = np.linalg.norm(self._mean, axis=1)
         chance = self._chance[self._far].max(axis=0)
-        tells = (length > CONSTANT_PATCH_LENGTH) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
+        tells = (length**2 > CHANGED_CORRELATION) & (chance <= CHANCE_BOUNDS[1]) & bool((self._tried >= 0.5).all())
         worth = np.where(tells, length - chance, -np.inf)
         best = []
         for finger in range(len(self._first)):
@@ -343,10 +337,12 @@ class GripperLook:
 
 
 def _texture(values: NDArray[np.float32], quantum: float) -> NDArray[np.float32]:
-    """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero without contrast."""
+    """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero where their root mean
+    square is no more than a step of grey, ``quantum``.
+    """
     texture = values @ _TEXTURE
     length = np.sqrt(np.einsum("np,np->n", texture, texture))
-    shows = length > SMALLEST_CONTRAST_LEVELS * quantum * math.sqrt(POINTS)
+    shows = length > quantum * math.sqrt(POINTS)
     np.divide(texture, length[:, None], out=texture, where=shows[:, None])
     texture[~shows] = 0.0
     return texture

@@ -17,20 +17,17 @@ from gripmon.model.geometry import from_record
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between, to_record
 from gripmon.model.records import Array, LookBias
-from gripmon.track.jaw import CORRELATED, PATIENCE
+from gripmon.track.jaw import AlikeErrors
 from gripmon.track.look.agreement import LookRefused
 from gripmon.track.look.alignment import LookMotion
 
-MEMORY = 64
+BIAS_BACKGROUNDS = 64
 """Backgrounds over which the bias is averaged: the edges' share of its error is an eighth then, minutes of work."""
 
 PER_MOTION, PER_OPENING = 0.02, 2e-3
 """How wrong a motion or an opening of the jaw comes out at most (no unit): rendered sequences showed 0.006 after 4.5 mm
 of the camera and 0.002 after 17 mm of the jaw, where depths are interpolated between edges.
 """
-
-MOST_CORRELATED = 0.98
-"""How alike the edges are taken to err from one background to the next, at most."""
 
 
 class Fused(NamedTuple):
@@ -60,7 +57,7 @@ class LookFusion:
         self._bias: Array = np.zeros(6)
         self._covariance: Array = np.zeros((6, 6))
         self._at: tuple[Array, float] | None = None
-        self._correlation = CORRELATED
+        self._alike = AlikeErrors()
         self._share = 1.0  # of the bias that the newest background has changed
         self._before: Array | None = None
         self._pending: tuple[Array, Array, Array, Array, float] | None = None
@@ -72,7 +69,7 @@ class LookFusion:
         x, y, z, about_x, about_y, about_z = self._bias.tolist()
         covariance = tuple(self._covariance.ravel().tolist())
         bias, where = (x, y, z, about_x, about_y, about_z), to_record(self._at[0])
-        return LookBias(self.backgrounds, bias, covariance, where, float(self._at[1]), float(self._correlation))
+        return LookBias(self.backgrounds, bias, covariance, where, float(self._at[1]), self._alike.correlation)
 
     def restore(self, record: LookBias) -> None:
         """Go on with a kept bias.  Raises :class:`LookRefused`, and begins again, for one that can't be."""
@@ -83,7 +80,7 @@ class LookFusion:
             raise LookRefused("the kept look's bias can't be; it is learnt again")
         self.backgrounds, self._bias, self._covariance = record.backgrounds, bias, covariance
         self._at = from_record(record.cam_T_grip), record.jaw_opening_m
-        self._correlation = record.correlation
+        self._alike = AlikeErrors(record.correlation)
 
     def fuse(self, cam_T_grip: Array, covariance: Array, look: LookMotion) -> Fused | None:
         """The edges' pose (4, 4), whose errors have a ``covariance`` (6, 6), and the look's in one; None where they
@@ -129,8 +126,7 @@ class LookFusion:
             return
         if self._before is not None:
             way = difference - self._before
-            differing = float(way @ np.linalg.solve(2.0 * (of_edges + of_look), way)) / 6.0
-            self._correlation += (min(1.0 - differing, 1.0) - self._correlation) / PATIENCE
+            self._alike.learn(float(way @ np.linalg.solve(2.0 * (of_edges + of_look), way)) / 6.0)
         self._before = difference
 
     def _follow(self, difference: Array, of_edges: Array, of_look: Array, cam_T_grip: Array, opening_m: float) -> None:
@@ -146,12 +142,10 @@ class LookFusion:
         self.contradicts = square > CONTRADICTION_SQUARE
         if self.contradicts:
             return
-        correlation = min(max(self._correlation, 0.0), MOST_CORRELATED)
-        alike = (1.0 + correlation) / (1.0 - correlation)
-        gain = np.linalg.solve(known + alike * of_edges + of_look, known).T
+        gain = np.linalg.solve(known + self._alike.count * of_edges + of_look, known).T
         self._bias = self._bias + gain @ innovation
         left = known - gain @ known
-        self._covariance = _symmetric(left) * (1.0 + 1.0 / MEMORY)
+        self._covariance = _symmetric(left) * (1.0 + 1.0 / BIAS_BACKGROUNDS)
         # The bias is that of where it was learnt: the place follows as the bias does.
         share = self._share = float(np.trace(gain)) / 6.0
         then_T, then_m = self._at

@@ -23,7 +23,7 @@ CLIP_SIGMAS = 3.0
 mean: a bright thing in front of a finger weighs no more than a line on it.
 """
 
-GAINS = (0.25, 4.0)
+GAIN_BOUNDS = (0.25, 4.0)
 """Of a patch's light; beyond, it shows something else."""
 
 
@@ -89,7 +89,7 @@ def _light(values: Array, mean: Array, weight: Array) -> tuple[float, float, flo
     if not own > 0.0:
         return 0.0, 0.0, 0.0
     gain = both / own
-    if not GAINS[0] <= gain <= GAINS[1]:
+    if not GAIN_BOUNDS[0] <= gain <= GAIN_BOUNDS[1]:
         return 0.0, 0.0, 0.0
     return gain, value, learnt
 

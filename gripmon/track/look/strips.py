@@ -29,14 +29,13 @@ LENGTH_PX, REACH_PX = 64, 96
 lost gripper is searched for, 12 mm at 8 px to the millimetre.
 """
 
-SHORTEST_PX = 16
-"""Of a strip that is learnt: four independent points."""
-
 STRIP_LINES = 3
 """Side by side behind each end edge: something partly in front of a finger hides some of them."""
 
 SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
-"""A tenth of a millimetre must do no harm, and light that falls off along the finger says nothing."""
+"""Filter along the strips, so that a shift by a tenth of a millimetre does no harm; and length of the mean that is
+subtracted, px: light that falls off along the finger says nothing.
+"""
 
 FILTERED_PX = SLOPE_PX // 2 + 1
 """Beside a strip that what is smooth and what changes slowly on it are taken from."""
@@ -49,7 +48,7 @@ INDEPENDENT_PX = 4.0
 
 ONE_EDGE_PX = 2
 """Edges of an image that are nearer to each other are one, and fitted ten times better: no mark on a finger is taken
-for its end then, and slides up to this are none.
+for its end then, and a slide up to this can't be seen.
 """
 
 EXPLAINED_CORRELATION = 0.87
@@ -236,7 +235,7 @@ class FingerStrips:
         pitch_m = 1.0 / px_per_m
         # What the filters take in at the first point must be the finger, not what lies behind its end.
         start, length_m = start + FILTERED_PX * pitch_m * way, length_m - FILTERED_PX * pitch_m
-        long_enough = length_m >= SHORTEST_PX * pitch_m
+        long_enough = length_m >= 4.0 * INDEPENDENT_PX * pitch_m  # four independent points
         if not long_enough.any():
             return
         within = (np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]).astype(np.float32)

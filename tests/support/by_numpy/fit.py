@@ -20,9 +20,9 @@ from gripmon.track.edges.kernel import (
     INNER_SIGMAS,
     LARGEST_SPREAD,
     LARGEST_SPREAD_PX,
+    LEAST_SCATTER,
     SMALLEST_SPREAD_PX,
     SMALLEST_STIFFNESS,
-    SMALLEST_VARIANCE_RATIO,
     WIDTH_DECAY,
 )
 from gripmon.track.edges.profiles import Edgels
@@ -236,7 +236,7 @@ def assess(
     moment = np.add.reduceat(alone * residual_px, first)
     freedom = len(total) - unknowns
     contradiction = _contradiction(total, moment, freedom)
-    scatter, shared = max(min(contradiction, 1.0), SMALLEST_VARIANCE_RATIO), 0.0
+    scatter, shared = max(min(contradiction, 1.0), LEAST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
     shared = max(shared, (stiffness * expected_shared_px) ** 2)

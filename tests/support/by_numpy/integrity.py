@@ -6,7 +6,7 @@ import numpy as np
 
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
-from gripmon.track.integrity.separation import _LOG_RISK, SQUARES, Tails
+from gripmon.track.integrity.separation import QUANTILES, Tails
 
 
 def add_up(
@@ -80,8 +80,8 @@ def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) ->
 def beyond(tails: Tails, radius: Array) -> Array:
     """Probabilities of lengths above ``radius``; 1 for a negative one."""
     square = np.square(np.maximum(radius, 0.0) / tails.sigma)
-    one = np.interp(square, SQUARES[0], _LOG_RISK) + tails.factor
-    three = np.interp(square, SQUARES[1], _LOG_RISK)
+    one = np.interp(square, QUANTILES.squares[0], QUANTILES.log_risk) + tails.factor
+    three = np.interp(square, QUANTILES.squares[1], QUANTILES.log_risk)
     return np.asarray(10.0 ** np.minimum(one, three))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gripmon.model.least_squares import TUKEY
 from gripmon.model.records import Array, Image
-from gripmon.track.look.kernel import CLIP_SIGMAS, GAINS, ROUNDS
+from gripmon.track.look.kernel import CLIP_SIGMAS, GAIN_BOUNDS, ROUNDS
 
 
 def read(image: Image, weights: Array, base_px: Array, flow: Array, motion: Array) -> Array:
@@ -62,5 +62,5 @@ def _residual(values: Array, mean: Array, weight: Array) -> Array:
         value, learnt = values - (weight * values).sum(axis=1, keepdims=True) / total, mean
         learnt = learnt - (weight * learnt).sum(axis=1, keepdims=True) / total
         gain = (weight * learnt * value).sum(axis=1, keepdims=True) / (weight * learnt**2).sum(axis=1, keepdims=True)
-        gain = np.where((gain >= GAINS[0]) & (gain <= GAINS[1]), gain, np.nan)
+        gain = np.where((gain >= GAIN_BOUNDS[0]) & (gain <= GAIN_BOUNDS[1]), gain, np.nan)
         return np.asarray(value / gain - learnt)
