@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -17,7 +18,18 @@ from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import invert
 from gripmon.model.poses import perturb
-from gripmon.model.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
+from gripmon.model.records import (
+    AlertEvent,
+    AlertKind,
+    Cause,
+    Command,
+    CommandName,
+    CornerFault,
+    Origin,
+    State,
+    Verdict,
+    to_json,
+)
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Background, JawScript
@@ -240,14 +252,21 @@ def test_without_recalibration_the_old_reference_stays():
     assert np.linalg.norm(seen.records[-1].drift.tcp_shift_m) == pytest.approx(4.5e-3, abs=2e-4)
 
 
-def test_a_start_from_a_wrong_calibration_ends_at_the_right_one():
+def test_a_start_from_a_wrong_calibration_ends_at_the_right_one_once_an_operator_says_so():
+    """Whether the mount was knocked before the start, or the gripper isn't the one in its file, no image shows."""
     frames, truths = frames_of("static")
     wrong = moved(nominal_cam_T_grip(), np.array([0.003, -0.002, 0.001, 0.0, 0.01, 0.02]))
     settings = MonitorSettings(recalibration=RecalibrationSettings(sure_sigma_m=1e-4))
-    seen = watch(frames, truths, new_monitor(settings, cam_T_grip=wrong))
+    monitor = new_monitor(settings, cam_T_grip=wrong)
+    seen = watch(frames, truths, monitor)
     assert seen.records[0].state is State.ACQUIRING
     assert AlertKind.STEP not in [kind for _, kind in seen.alerts()], "where it was before no one saw"
-    assert seen.records[-1].revision == 2
+    assert seen.records[-1].revision == 1 and Verdict.VALID not in seen.verdicts()
+    assert monitor.command(Command(CommandName.ACCEPT), 0).done
+    ns = frames[-1].stamp_ns - frames[0].stamp_ns + round(1e9 / FPS)
+    later = tuple(replace(f, seq=f.seq + len(frames), stamp_ns=f.stamp_ns + ns) for f in frames[:5])
+    assert {monitor.process(frame).verdict for frame in later} == {Verdict.VALID}
+    assert monitor.reference.revision == 2
     assert np.abs(seen.errors()[5:, :2]).max() < 3e-5
 
 

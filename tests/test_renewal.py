@@ -59,7 +59,8 @@ class Cell:
         """The camera has stood still for long enough, a third of a second after the last time."""
         self.now_s += 0.33
         stamp_ns = round(1e9 * self.now_s)
-        alerts = self.renewal.recalibrate(DRIFT, self.cam_T_grip, explanation or Explanation(), self.now_s, stamp_ns)
+        told = explanation or Explanation()
+        alerts = self.renewal.recalibrate(DRIFT, self.cam_T_grip, told, None, self.now_s, stamp_ns)
         return _told(alerts)
 
     def say(self, name: CommandName) -> list[tuple[AlertKind, AlertEvent]]:

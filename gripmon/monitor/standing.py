@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from gripmon.judge.references import OPERATOR
 from gripmon.model.records import Array, Protection, ReferenceRecord
 from gripmon.monitor.refits import Anchored, Refits
 from gripmon.track.edges import FingerEndsSeen, Measurement
@@ -84,5 +83,5 @@ class Question(NamedTuple):
 
     def with_reference(self, reference: ReferenceRecord) -> Question:
         """The question once a reference is in force."""
-        answers = reference.accepted_by == OPERATOR and reference.revision > self.revision
+        answers = reference.accepted_by == "operator" and reference.revision > self.revision
         return self._replace(answered=reference.revision) if self.answered is None and answers else self

@@ -106,15 +106,13 @@ class Weigher:
         """
         expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
         self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
+        self.unexplained: Array | None = None
+        """(6,) of an open question what every bound includes, m and rad; None for nothing."""
         if self.question is not None:
             self.question = self.question.with_reference(reference)
+            self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
         self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
-
-    @property
-    def unexplained(self) -> Array | None:
-        """(6,) what every bound includes of the open question, m and rad; None for nothing."""
-        return self.question.away if self.question is not None and self.question.open_at(self._revision) else None
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -179,15 +177,17 @@ class Weigher:
             if displaced:
                 away = perturbation_between(self._expected[0], cam_T_grip)
                 protection = larger(protection, self._not_as_expected(away))
-            return Trust(
-                self._questioned(protection), proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of
-            )
+            if self.unexplained is not None:
+                protection = larger(protection, self._not_as_expected(self.unexplained))
+            return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
         # Hypotheses since the anchor, and the most probable one.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
-        protection = self._questioned(protection_of(all_along + since, risk))
+        protection = protection_of(all_along + since, risk)
+        if self.unexplained is not None:
+            protection = larger(protection, self._not_as_expected(self.unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
@@ -229,7 +229,8 @@ class Weigher:
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
-            self.question = Question(perturbation_between(self._expected[0], cam_T_grip), self._revision)
+            self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
+            self.question = Question(self.unexplained, self._revision)
         if self.anchor is None or trust.displaced:
             self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
         else:
@@ -314,11 +315,6 @@ class Weigher:
         """
         bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
         return past_alert_limit(bound, self._policy) is None
-
-    def _questioned(self, protection: Protection) -> Protection:
-        """A bound that includes what the first frames differed by, unless an operator has said why."""
-        away = self.unexplained
-        return protection if away is None else larger(protection, self._not_as_expected(away))
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
