@@ -36,7 +36,7 @@ from gripmon.teach.views import ImageRefused, SampledEdge, TeachingImage, Teachi
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
-from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdges
+from gripmon.track.edges.taught import Look, PoseOffset, TaughtCorner, TaughtEdge, TaughtEdges
 
 T = TypeVar("T")
 
@@ -53,7 +53,8 @@ class Taught:
     """What was learnt.  ``untaught``: for each other edge in view the reason; ``notes``: what a person should know.
 
     ``closure_px``: largest distance of the gripper from the reference when the images are measured with what was
-    taught.  ``left_out``: the images that contradict the others, by their numbers, and why.
+    taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
+    bevels don't explain it.  ``left_out``: the images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -61,6 +62,7 @@ class Taught:
     untaught: dict[str, str]
     notes: tuple[str, ...]
     closure_px: float
+    reference_offset: PoseOffset
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -119,7 +121,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     lines, untaught = _lines(viewer, views, search=True)
     check_standing(views, list(lines))
     check_enough(viewer, views, lines)
-    doubt = check_reference(viewer, images[0].name, lines)
+    offset, doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
     notes = _notes(viewer, lines, len(images), doubt)
     edges = estimate_edges(viewer, lines, None)
@@ -137,6 +139,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
+        offset,
         {},
     )
 

@@ -155,7 +155,8 @@ class Setup:
         """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
         found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
-        return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
+        pose, covariance = from_record(reference.cam_T_grip), reference.covariance
+        return found, TaughtEdges.of(found.edges, self.gripper, pose, opening_m, covariance, found.reference_offset)
 
 
 def _reference_of(pose: CornerPose) -> ReferenceRecord:

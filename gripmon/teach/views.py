@@ -155,7 +155,8 @@ class Viewer:
             raise ImageRefused(
                 image,
                 f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
-                f"{self._reach_px:g} px: {self.advice(motion)}",
+                f"{self._reach_px:g} px: images at the reference; or correct gripper file or jaw opening; or calibrate "
+                "again",
             )
 
     def view(
@@ -219,18 +220,24 @@ class Viewer:
         x, y, z = (1e3 * motion[:3]).tolist()
         return f"by ({x:.3f}, {y:.3f}, {z:.3f}) mm and {np.degrees(np.linalg.norm(motion[3:6])):.3f}°"
 
-    def pose(self, motion: Array) -> str:
-        """The reference after a motion (6 or 7,), as written in a configuration."""
-        there = to_record(perturb(self.ref_cam_T_grip, motion[:6]))
+    def pose(self, motion: Array, covariance: Array) -> str:
+        """The reference after a motion (6,) with the covariance (6, 6), as written in a configuration."""
+        there = to_record(perturb(self.ref_cam_T_grip, motion))
         translation_m = [round(v, 7) for v in there.translation_m]
         rotation_xyzw = [round(v, 8) for v in there.rotation_xyzw]
-        return f"reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
+        sigma = np.sqrt(covariance.diagonal())
+        return (
+            f"reference: {{cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}, "
+            f"position_sigma_m: {sigma[:3].max():.2g}, rotation_sigma_rad: {sigma[3:].max():.2g}}}"
+        )
 
-    def advice(self, motion: Array) -> str:
-        """What to do about a reference with an error of a motion (6 or 7,)."""
+    def advice(self, motion: Array, covariance: Array) -> str:
+        """What to do about a reference with an error of a motion (6,), known with the covariance (6, 6), which bevels
+        have to be part of.
+        """
         return (
             "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
-            f"pose as {self.pose(motion)}"
+            f"pose with its standard deviations as {self.pose(motion, covariance)}"
         )
 
 
