@@ -23,15 +23,13 @@ from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.records import Array
+from gripmon.teach.inset import INSET_SIGMA_M
 from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
 from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
 from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
 """Largest distance of a real edge from the sharp model's: a bevel of 0.7 mm, or a rounding of 1.2 mm radius."""
-
-INSET_SIGMA_M = 0.5 * SHAPE_M
-"""Standard deviation of the shift towards the finger that bevels give all outlines in common."""
 
 PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
 """Standard deviation of the difference between the bevels of different edges."""

@@ -119,8 +119,9 @@ class Setup:
         pose, reference, why, expected = None, self.reference, None, None
         if reference is None:
             try:
+                exact = self.settings.model_sigma_m == 0.0
                 fixed = {name: put_px[name] for name in by_hand if name in put_px}
-                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error)
+                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error, exact)
                 reference = _reference_of(pose)
             except PoseRefused as refused:
                 why = str(refused)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.model.records import Array, Image, ReferenceRecord
 from gripmon.monitor.tracker import USUAL_SHARE
+from gripmon.teach.inset import finger_side
 from gripmon.teach.lines import EdgePoints
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import FingertipMeter, Measurement, Patience
@@ -95,7 +96,7 @@ class Viewer:
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
         edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
         self.crease = edges.crease
-        self.inside = self._inside(self.points_grip_m, edges.inside_point_m)
+        self.inside = finger_side(gripper, self.points_grip_m, self.ref_cam_T_grip, edges)
         _, depth = sight_axes(gripper, self.points_grip_m, self.ref_cam_T_grip)
         openings = [gripper.points_grip_m(image.jaw_opening_m) for image in images]
         across = [sight_axes(gripper, points_grip_m, self.ref_cam_T_grip)[0] for points_grip_m in openings]
@@ -104,19 +105,6 @@ class Viewer:
     def arrays(self, edges: Mapping[str, TaughtEdge]) -> TaughtEdges:
         """Taught edges as arrays for the measurement."""
         return TaughtEdges.of(edges, self.gripper, self.ref_cam_T_grip, self.jaw_opening_m)
-
-    def _inside(self, points_grip_m: Array, inside_point_m: Array) -> Array:
-        """Side (e,) of the visible face at each edge; without faces, of the middle of the finger's points."""
-        gripper, cam_T_grip = self.gripper, self.ref_cam_T_grip
-        middles = np.array(
-            [points_grip_m[gripper.point_finger == f].mean(axis=0) for f in range(len(gripper.finger_ids))]
-        )
-        inside = np.where(np.isfinite(inside_point_m), inside_point_m, middles[gripper.edge_finger])
-        ends = points_grip_m[gripper.edge_points]
-        # To the right of the edge as the camera sees it: x right, y down, z forward.
-        eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
-        right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
-        return np.sign(np.einsum("ei,ei->e", right, inside - eye))
 
     def measured(
         self,
