@@ -220,6 +220,20 @@ def test_a_reference_that_is_off_is_refused_and_the_measured_pose_is_named(shift
     assert away_m[:2].max() < 1e-5 and away_m[2] < 4e-5
 
 
+@pytest.mark.parametrize("shift_m", [(5e-4, 0.0, 0.0), (0.0, -3e-3, 2e-3)])
+@pytest.mark.parametrize("bevel_m", [1e-4, BEVEL_M])
+def test_the_pose_that_is_named_states_what_bevels_do_to_it(shift_m: tuple[float, float, float], bevel_m: float):
+    off = moved(POSE, np.array([*shift_m, 0.0, 0.0, 0.0]))
+    with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
+        taught_from(image_of(bevel_m), using=reference(off, 2e-5, 2e-4))
+    named = re.search(
+        r"translation_m: \[(.*?)\].*position_sigma_m: (.*?), rotation_sigma_rad: (.*?)}", str(refused.value)
+    )
+    assert named is not None
+    away_m = np.subtract([float(v) for v in named[1].split(",")], POSE[:3, 3])
+    assert np.linalg.norm(away_m) < 3.0 * float(named[2]) and float(named[2]) > 1e-4
+
+
 def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
     """A third of a millimetre: then it is by definition where the gripper stands."""
     off = moved(POSE, np.array([2e-4, -2e-4, 0.0, 0.0, 0.0, 0.0]))

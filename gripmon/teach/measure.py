@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import GATE_SQUARE
-from gripmon.model.geometry import perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.estimate import (
     SHAPE_M,
@@ -30,9 +30,19 @@ from gripmon.teach.estimate import (
     check_reference,
     check_standing,
     estimate_edges,
+    found_off,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
-from gripmon.teach.views import ImageRefused, SampledEdge, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.views import (
+    REMEDIES,
+    ImageRefused,
+    SampledEdge,
+    TeachingImage,
+    TeachingRefused,
+    View,
+    Viewer,
+    sampled,
+)
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
@@ -111,9 +121,30 @@ def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequ
         raise
     except TeachingRefused:
         for image, fit in zip(images, fits, strict=True):
-            if fit is None:
-                viewer.check_elsewhere(image)
+            if fit is None and (found := viewer.elsewhere(image)) is not None:
+                raise ImageRefused(image, _elsewhere(viewer, image, found)) from None
         raise
+
+
+def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
+    """Why an image that shows the gripper elsewhere is refused, and what to do; the pose to take allows for bevels."""
+    there = viewer.at(found.cam_T_grip, image)
+    views = [there.view(image, there.fitted(image))]
+    lines, _ = _lines(there, views, search=True)
+    motion = perturbation_between(viewer.ref_cam_T_grip, found.cam_T_grip)
+    try:
+        check_enough(there, views, lines)
+    except TeachingRefused:
+        remedies = REMEDIES
+    else:
+        moved = found_off(there, lines)
+        pose = perturb(found.cam_T_grip, moved.common[:6])
+        motion = perturbation_between(viewer.ref_cam_T_grip, pose)
+        remedies = viewer.advice(motion, moved.common_covariance[:6, :6])
+    return (
+        f"the gripper is {viewer.off_reference_px(found):.1f} px off the reference, {viewer.distance(motion)}; at most "
+        f"{viewer.reach_px:g} px: {remedies}"
+    )
 
 
 def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:

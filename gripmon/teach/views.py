@@ -32,6 +32,7 @@ from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
 _CLEAR_SHARE = 0.9  # inlier ratio where the gripper was expected; below it it is searched for elsewhere
 _DENSE = 4096  # search lines: as many as there are pixels along the edges
+REMEDIES = "images at the reference; or correct gripper file or jaw opening; or calibrate again"
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 
@@ -88,9 +89,9 @@ class Viewer:
     def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
         self.rig, self.gripper, gripper = rig, rig.gripper, rig.gripper
         sampling, self._jaw_sigma_m = rig.settings.corners.sampling, rig.settings.jaw_sigma_m
-        self.ref_cam_T_grip = from_record(reference.cam_T_grip)
+        self._reference, self.ref_cam_T_grip = reference, from_record(reference.cam_T_grip)
         self.reference_covariance = np.reshape(reference.covariance, (6, 6))
-        self._reach_px = sampling.reach_px
+        self.reach_px = sampling.reach_px
         self._dense = msgspec.structs.replace(sampling, samples=_DENSE, creases=True)
         self.jaw_opening_m = float(np.mean([image.jaw_opening_m for image in images]))
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
@@ -120,32 +121,28 @@ class Viewer:
         here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
         return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
 
-    def _off_reference_px(self, found: Measurement) -> float:
+    def off_reference_px(self, found: Measurement) -> float:
         """Distance in the image between the measured gripper and the reference."""
         return found.prediction.moved_px(perturbation_between(self.ref_cam_T_grip, found.cam_T_grip))
 
     def fitted(self, image: TeachingImage) -> Measurement | None:
         """Fit the sharp model to the image from the reference; None where it doesn't fit, as with wide bevels."""
         found = self.measured(image, None)
-        return found if found.trusted and self._off_reference_px(found) <= self._reach_px else None
+        return found if found.trusted and self.off_reference_px(found) <= self.reach_px else None
 
-    def check_elsewhere(self, image: TeachingImage) -> None:
-        """Raise :class:`ImageRefused` if the gripper is clearly farther from the reference than the search lines
-        reach.
+    def elsewhere(self, image: TeachingImage) -> Measurement | None:
+        """The gripper where the sharp model finds it, if that is clearly farther from the reference than the search
+        lines reach; else None.
         """
         found = self.measured(image, None, None, _CLEAR_SHARE, EVERYWHERE)
         if found.trusted:
             # Repeat from there: the first search uses predictions at the reference, where clutter may mislead it.
             found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, EVERYWHERE)
-        away_px = self._off_reference_px(found)
-        if found.trusted and away_px > self._reach_px:
-            motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
-            raise ImageRefused(
-                image,
-                f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
-                f"{self._reach_px:g} px: images at the reference; or correct gripper file or jaw opening; or calibrate "
-                "again",
-            )
+        return found if found.trusted and self.off_reference_px(found) > self.reach_px else None
+
+    def at(self, cam_T_grip: Array, image: TeachingImage) -> Viewer:
+        """The same for one image with the reference at another pose (4, 4)."""
+        return Viewer(self.rig, msgspec.structs.replace(self._reference, cam_T_grip=to_record(cam_T_grip)), [image])
 
     def view(
         self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
@@ -180,7 +177,7 @@ class Viewer:
     def _predict(
         self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
     ) -> Prediction:
-        offsets_px = zoom * profile_offsets_px(self._reach_px)
+        offsets_px = zoom * profile_offsets_px(self.reach_px)
         return predict(self.rig.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
 
     def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
@@ -193,7 +190,7 @@ class Viewer:
         variance = np.einsum("ni,ij,nj->n", rows, self.reference_covariance, rows).max()
         variance += np.square(self._jaw_sigma_m * here.jacobian[mine, 6]).max()
         bevel_m = max(shape_m, float(self.gripper.edge_bevel_m[edge]))
-        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self._reach_px)
+        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self.reach_px)
 
     @property
     def prior_covariance(self) -> Array:
@@ -223,10 +220,7 @@ class Viewer:
         """What to do about a reference with an error of a motion (6,), known with the covariance (6, 6), which bevels
         have to be part of.
         """
-        return (
-            "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
-            f"pose with its standard deviations as {self.pose(motion, covariance)}"
-        )
+        return f"{REMEDIES}, or take the measured pose with its standard deviations as {self.pose(motion, covariance)}"
 
 
 class SampledEdge(NamedTuple):
