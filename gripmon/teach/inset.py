@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
@@ -81,7 +82,7 @@ def inset_motion(gripper: Gripper, found: Measurement, inset_m: float) -> Array:
     return np.linalg.solve(consensus.information, pull)
 
 
-def _inset(gripper: Gripper, found: Measurement, inset_m: float) -> tuple[Array, Array]:
+def _inset(gripper: Gripper, found: Measurement, inset_m: float) -> tuple[Array, NDArray[np.bool_]]:
     """The shift (e, 3) of all edges towards their fingers across the line of sight, gripper frame; and which are
     visible outlines.
     """
