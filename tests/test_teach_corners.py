@@ -185,7 +185,8 @@ def test_the_pose_is_as_good_as_its_covariance_says():
         assert isinstance(sensor, Sensor)
         scene = plain_scenario(jaw=JawScript(knots=((0.0, OPENING_M),)), sensor=sensor)
         simulator = Simulator(make_camera(lens), gripper, pose, scene, trial)
-        setup = Setup(make_camera(PAPER_LENS), gripper, MonitorSettings(jaw_sigma_m=sigma_m), None, error)
+        exact = MonitorSettings(jaw_sigma_m=sigma_m, model_sigma_m=0.0)
+        setup = Setup(make_camera(PAPER_LENS), gripper, exact, None, error)
         points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points]
         uv_px = make_camera(lens).project(points_m @ pose[:3, :3].T + pose[:3, 3])
         shown = dict(zip(gripper.corner_ids, uv_px + rng.normal(0.0, 3.0, uv_px.shape), strict=True))
