@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from support.simulated import nominal_cam_T_grip
 from support.taught_scenes import (
     CAMERA,
     OPENING_M,
+    RIG,
     arrays,
     bevelled,
     error,
@@ -24,6 +26,7 @@ from support.taught_scenes import (
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
+from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.views import TeachingRefused
 from gripmon.track.edges.taught import sight_axes
 
@@ -217,12 +220,44 @@ def test_a_reference_that_is_off_is_refused_and_the_measured_pose_is_named(shift
     assert away_m[:2].max() < 1e-5 and away_m[2] < 4e-5
 
 
+@pytest.mark.parametrize("shift_m", [(5e-4, 0.0, 0.0), (0.0, -3e-3, 2e-3)])
+@pytest.mark.parametrize("bevel_m", [1e-4, BEVEL_M])
+def test_the_pose_that_is_named_states_what_bevels_do_to_it(shift_m: tuple[float, float, float], bevel_m: float):
+    off = moved(POSE, np.array([*shift_m, 0.0, 0.0, 0.0]))
+    with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
+        taught_from(image_of(bevel_m), using=reference(off, 2e-5, 2e-4))
+    named = re.search(
+        r"translation_m: \[(.*?)\].*position_sigma_m: (.*?), rotation_sigma_rad: (.*?)}", str(refused.value)
+    )
+    assert named is not None
+    away_m = np.subtract([float(v) for v in named[1].split(",")], POSE[:3, 3])
+    assert np.linalg.norm(away_m) < 3.0 * float(named[2]) and float(named[2]) > 1e-4
+
+
 def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
     """A third of a millimetre: then it is by definition where the gripper stands."""
     off = moved(POSE, np.array([2e-4, -2e-4, 0.0, 0.0, 0.0, 0.0]))
     taught = taught_from(image_of(0.0), using=reference(off))
     found = measured(image_of(0.0), arrays(taught, off), off)
     assert np.linalg.norm(error(found, off)[:3]) < 5e-6
+
+
+@pytest.mark.parametrize(("bevel_m", "shift_m"), [(0.0, 4e-4), (1e-4, -4e-4), (BEVEL_M, 0.0)])
+def test_what_the_images_show_off_the_reference_is_in_every_bound(bevel_m: float, shift_m: float):
+    """A mount that has moved along the optical axis since the calibration, less than the uncertainty due to bevels;
+    bevels alone cost less than their width.
+    """
+    off = moved(POSE, np.array([0.0, 0.0, -shift_m, 0.0, 0.0, 0.0]))
+    taught = taught_from(image_of(bevel_m), using=reference(off, 5e-5, 5e-4))
+    offset_m = np.linalg.norm(taught.reference_offset[:3])
+    assert taught.reference_offset[2] == pytest.approx(shift_m, abs=1.2 * bevel_m + 2e-5)
+    edges = arrays(taught, off)
+    bounds_m = [
+        forecast_frame(RIG._replace(taught=known), off, OPENING_M).protection.position_m
+        for known in (replace(edges, reference_offset=np.zeros(6)), edges)
+    ]
+    assert bounds_m[1] - bounds_m[0] == pytest.approx(offset_m, rel=0.05)
+    assert bounds_m[1] < RIG.settings.policy.alert_limit_m
 
 
 def test_an_opening_that_the_image_contradicts_is_refused():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,6 @@ from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
 from gripmon.model.gripper import UNTOLD_BEVEL_M, Gripper
-from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.records import Protection
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.accuracy import (
@@ -53,6 +51,7 @@ from gripmon.teach.accuracy import (
     forecast_frame,
     with_bevels,
 )
+from gripmon.teach.inset import made_from_images
 from gripmon.teach.mounts import Mount
 from gripmon.teach.visibility import (
     FEWEST_CORNERS,
@@ -166,9 +165,7 @@ def _if_bevelled(config: Config) -> Bounds | None:
     gripper file was made from images, or if the file is stated to be exact.
     """
     rig = rig_of(config)
-    made_of = () if rig.gripper.model.provenance is None else rig.gripper.model.provenance.inputs
-    from_images = any(Path(each.file).suffix.lower() in IMAGE_SUFFIXES for each in made_of)
-    if rig.taught is not None or from_images or rig.settings.model_sigma_m == 0.0:
+    if rig.taught is not None or made_from_images(rig.gripper) or rig.settings.model_sigma_m == 0.0:
         return None
     bevelled = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
     return _bounds(forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).protection)

@@ -8,6 +8,7 @@ in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -71,11 +72,13 @@ class Known(NamedTuple):
 class CommonError(NamedTuple):
     """What no frame tells, since all are off by it alike: ``scale_sigma``, the standard deviation of a factor on all
     lengths of the gripper file (a larger gripper farther away gives the same image); ``taught`` (k, 6), the error of
-    the reference at which edges were taught, by one standard deviation along each of k directions.
+    the reference at which edges were taught, by one standard deviation along each of k directions; ``offset`` (6,), how
+    far off that reference the teaching images showed the gripper.
     """
 
     scale_sigma: float
     taught: Array
+    offset: Array
 
     def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
         """The fits near a pose (4, 4) with it."""
@@ -83,6 +86,11 @@ class CommonError(NamedTuple):
         parts = np.vstack([self.taught, farther])
         parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
         return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
+
+    def reaching(self, doubts: Doubts) -> Doubts:
+        """The doubts, each farther away by the offset: it is measured, so it counts once, not as a deviation."""
+        lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
+        return replace(doubts, away=doubts.away + lengths[:, None])
 
 
 class ModelError(NamedTuple):
@@ -95,6 +103,12 @@ class ModelError(NamedTuple):
     finger: NDArray[np.intp]
     fingers: int
     common: CommonError | None
+
+    def doubts(self, name: tuple[str, ...], prior: Array, fits: Separation, cam_T_grip: Array) -> Doubts:
+        """The doubts about a pose (4, 4) under the hypotheses of these fits, with what is common to all of them."""
+        if self.common is None:
+            return Doubts.of(name, prior, fits, SIGMA_INFLATION)
+        return self.common.reaching(Doubts.of(name, prior, self.common.on(fits, cam_T_grip), SIGMA_INFLATION))
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
@@ -159,9 +173,7 @@ class Refits:
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
-        if self.model.common is not None:
-            fits = self.model.common.on(fits, cam_T_grip)
-        return Doubts.of(self.hypotheses.name, prior, fits, SIGMA_INFLATION)
+        return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
@@ -279,9 +291,7 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
-        if fits.model.common is not None:
-            told = fits.model.common.on(told, cam_T_grip)
-        return Doubts.of(self._lasting.name, self._lasting.prior, told, SIGMA_INFLATION)
+        return fits.model.doubts(self._lasting.name, self._lasting.prior, told, cam_T_grip)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

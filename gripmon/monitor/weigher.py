@@ -384,8 +384,8 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
-    scale_sigma, taught = gripper.model.scale_sigma, tracker.taught_error
-    common = CommonError(scale_sigma, taught) if scale_sigma or len(taught) else None
+    scale_sigma, taught, offset = gripper.model.scale_sigma, tracker.taught_error, tracker.taught_offset
+    common = CommonError(scale_sigma, taught, offset) if scale_sigma or len(taught) or offset.any() else None
     return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids), common)
 
 

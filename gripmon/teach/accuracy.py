@@ -157,8 +157,8 @@ def as_if_measured(rig: Rig) -> dict[str, Rig]:
     known = {}
     if taught is None:
         known["its bevels taught (gripmon teach)"] = rig._replace(gripper=as_if_taught(rig.gripper))
-    elif len(taught.reference_error):
-        exact = replace(taught, reference_error=np.zeros((0, 6)))
+    elif len(taught.reference_error) or taught.reference_offset.any():
+        exact = replace(taught, reference_error=np.zeros((0, 6)), reference_offset=np.zeros(6))
         known["a reference known better (its sigmas: gripmon calibrate plane)"] = rig._replace(taught=exact)
     if model.scale_sigma:
         exact_size = Gripper(structs.replace(model, scale_sigma=0.0))

@@ -207,7 +207,7 @@ def taught_model(
         ),
         camera=lens,
         gripper=model,
-        reference=stated_reference,
+        reference=msgspec.structs.replace(stated_reference, offset=taught.reference_offset),
         edge_settings=settings.corners.edges,
         edges=taught.edges,
         corners=taught.corners,
@@ -217,6 +217,8 @@ def taught_model(
 _HEADER = """\
 # Taught model: written by gripmon teach, named by `taught:` in a configuration.  Not to be edited: teach again.
 # It belongs to exactly this camera, gripper file, reference and edge settings, and is refused with any others.
+#   reference.offset    how far off the reference the gripper appeared in the images, as far as bevels don't explain it:
+#                       along and about the camera's axes (m, rad); every bound includes it
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
 #                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its
@@ -227,7 +229,8 @@ _HEADER = """\
 #   edges.*.rms_px      scatter of the edge points about the line (px); seen: share of its search lines that showed it
 #   edges.*.left, right grey level of the finger on that side over the median of all edges, its spread along the edge
 #   corners.*.uv_px     where taught edges meet in the first image (px), and its standard deviation
-# The measurement uses offsets, depths, their deviations, crease and brighter; the rest describes what was seen.
+# The measurement uses offsets, depths, their deviations, crease and brighter; the rest below edges and corners
+# describes what was seen.
 """
 
 

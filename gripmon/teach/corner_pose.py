@@ -20,6 +20,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord
+from gripmon.teach.inset import inset_corners_px, inset_motion, unstated_inset_m
 from gripmon.track.edges import Measurement
 
 BY_HAND_PX = 1.0
@@ -101,8 +102,11 @@ def pose_from_corners(
     snapped: Snapped,
     by_hand_px: Mapping[str, Array],
     camera_error: CameraError | None = None,
+    exact: bool = False,
 ) -> CornerPose:
-    """Pose of the gripper from corners that were measured or set by hand.  Raises :class:`PoseRefused`."""
+    """Pose of the gripper from corners that were measured or set by hand; ``exact``: its edges are as sharp as the file
+    says.  Raises :class:`PoseRefused`.
+    """
     found = snapped.measurement
     if found is None:
         raise PoseRefused(f"no pose: {snapped.refused}")
@@ -122,18 +126,25 @@ def pose_from_corners(
         every = [i for i, c in enumerate(snapped.corners) if np.isfinite(c.model_px).all()]
         uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
         joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
+    inset_m = 0.0 if exact else unstated_inset_m(gripper)
     covariance_xy = _covariance(camera, uv_px, joint, found.cam_T_grip[2, 3])
 
-    def solve(camera: Camera, jaw_opening_m: float | None) -> Recalibration:
+    def solve(camera: Camera, jaw_opening_m: float | None, moved_px: Array | None = None) -> Recalibration:
         points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[every]]
-        return recalibrate(points_m, camera.undistort(uv_px), covariance_xy, found.cam_T_grip)
+        shown_px = uv_px if moved_px is None else uv_px + moved_px[every]
+        return recalibrate(points_m, camera.undistort(shown_px), covariance_xy, found.cam_T_grip)
 
     try:
         pose = solve(camera, snapped.jaw_opening_m)
         slopes = [
             perturbation_between(solve(*low).cam_T_grip, solve(*high).cam_T_grip) / (2.0 * _STEP)
-            for low, high in _error_sources(camera, gripper, snapped, camera_error)
+            for low, high in [
+                *_error_sources(camera, gripper, snapped, camera_error),
+                *_bevels(camera, gripper, snapped, 0.0 if by_edges else inset_m),
+            ]
         ]
+        if by_edges and inset_m:
+            slopes.append(inset_motion(gripper, found, inset_m)[:6])
     except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
         raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
     # Corners that contradict each other have errors of at least their residuals.
@@ -159,8 +170,8 @@ def _covariance(camera: Camera, uv_px: Array, measured: Array, depth_m: float) -
     return np.asarray(out + (MADE_TO_M / depth_m) ** 2 * np.eye(2 * count))
 
 
-_Seen = tuple[Camera, float | None]
-"""A camera, and a jaw opening."""
+_Seen = tuple[Camera, float | None] | tuple[Camera, float | None, Array]
+"""A camera, a jaw opening, and by how much (c, 2) the corners appear elsewhere, px."""
 
 
 def _error_sources(
@@ -187,6 +198,19 @@ def _error_sources(
                 step[1] = step[0] * vector[1] / vector[0]
             sources.append(((model.camera(vector - step), opening_m), (model.camera(vector + step), opening_m)))
     return sources
+
+
+def _bevels(camera: Camera, gripper: Gripper, snapped: Snapped, inset_m: float) -> list[tuple[_Seen, _Seen]]:
+    """The same for bevels: the corners that show aren't the model's, and an opening measured with them is off, too."""
+    found, opening_m = snapped.measurement, snapped.jaw_opening_m
+    if found is None or not inset_m:
+        return []
+    moved_px = _STEP * inset_corners_px(camera, gripper, found, inset_m)
+    step_m = 0.0
+    if opening_m == found.jaw_opening_m:  # measured, not reported
+        step_m = _STEP * float(inset_motion(gripper, found, inset_m)[6:].sum())
+    low_m, high_m = (None if opening_m is None else opening_m + sign * step_m for sign in (-1.0, 1.0))
+    return [((camera, low_m, -moved_px), (camera, high_m, moved_px))]
 
 
 ROUGH_SHARE = 0.006

@@ -23,15 +23,13 @@ from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.records import Array
+from gripmon.teach.inset import INSET_SIGMA_M
 from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
 from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
-from gripmon.track.edges.taught import TaughtEdge, sight_axes
+from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
 """Largest distance of a real edge from the sharp model's: a bevel of 0.7 mm, or a rounding of 1.2 mm radius."""
-
-INSET_SIGMA_M = 0.5 * SHAPE_M
-"""Standard deviation of the shift towards the finger that bevels give all outlines in common."""
 
 PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
 """Standard deviation of the difference between the bevels of different edges."""
@@ -138,6 +136,13 @@ def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance:
         np.zeros(len(which), dtype=np.intp),
         block_diag(prior_covariance, INSET_SIGMA_M**2),
     )
+
+
+def found_off(viewer: Viewer, lines: Mapping[int, EdgeLines]) -> PooledOffsets:
+    """The same whatever the reference's standard deviations are: the images alone show where the gripper is."""
+    prior = viewer.prior_covariance
+    prior[:6, :6] = np.diag(np.square([0.01] * 3 + [0.1] * 3))
+    return motion_off(viewer, lines, prior)
 
 
 def estimate_edges(
@@ -301,19 +306,19 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
         )
 
 
-def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> str | None:
+def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> tuple[PoseOffset, str | None]:
     """Refuse a gripper whose pose or jaw opening differs by more than the stated standard deviations allow.
 
     Each is tested with the other one taken as stated, since both together can hardly be separated; the one that leaves
-    smaller own offsets to the edges is named first.  An allowed error above a pixel is returned as a text.
+    smaller own offsets to the edges is named first.  Returns the gripper's offset (6,) from the reference, which bounds
+    have to include, and a text if it is above a pixel.
     """
     stated = viewer.prior_covariance
-    free_pose, free_jaw = stated.copy(), stated.copy()
-    free_pose[:6, :6] = np.diag(np.square([0.01] * 3 + [0.1] * 3))
+    free_jaw = stated.copy()
     free_jaw[6, 6] = 0.01**2
-    moved, opened = (motion_off(viewer, lines, prior) for prior in (free_pose, free_jaw))
-    pose = moved.common[:6]
-    pose_square = pose @ np.linalg.solve((moved.common_covariance[:7, :7] + stated)[:6, :6], pose)
+    moved, opened = found_off(viewer, lines), motion_off(viewer, lines, free_jaw)
+    pose, covariance = moved.common[:6], moved.common_covariance[:6, :6]
+    pose_square = pose @ np.linalg.solve(covariance + stated[:6, :6], pose)
     jaw_m, jaw_sigma_m = float(opened.common[6]), float(np.sqrt(opened.common_covariance[6, 6] + stated[6, 6]))
     # Bevels on the inner sides alone look like a wider opening.
     allowed_m = JAW_SIGMAS * jaw_sigma_m + SHAPE_M
@@ -322,7 +327,7 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         times = np.sqrt(pose_square / GATE_SQUARE)
         faults.append(
             f"the gripper is off the reference, {viewer.distance(pose)}, {times:.1f} times what "
-            f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose)}"
+            f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose, covariance)}"
         )
     if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:
         faults.append(
@@ -334,11 +339,14 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         likelier_first = faults if moved.usual_own_m[0] <= opened.usual_own_m[0] else faults[::-1]
         raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}")
     away_px = max(float(np.abs(e.sampled.rows[:, :6] @ pose).max()) * e.sampled.per_m for e in lines.values())
+    x, y, z, *rotation = (round(v, 9) for v in pose.tolist())
+    offset = (x, y, z, rotation[0], rotation[1], rotation[2])
     if away_px <= NOTED_PX:
-        return None
-    return (
-        f"the reference is assumed exact, though the gripper appears up to {away_px:.1f} px off it, "
-        f"{viewer.distance(pose)}; taught at its own pose it holds over a wider range: {viewer.pose(pose)}"
+        return offset, None
+    return offset, (
+        f"the gripper appears up to {away_px:.1f} px off the reference, {viewer.distance(pose)}, and every bound is "
+        f"larger by as much: calibrate again, or take the measured pose with its standard deviations as "
+        f"{viewer.pose(pose, covariance)}"
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import GATE_SQUARE
-from gripmon.model.geometry import perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.estimate import (
     SHAPE_M,
@@ -30,13 +30,23 @@ from gripmon.teach.estimate import (
     check_reference,
     check_standing,
     estimate_edges,
+    found_off,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
-from gripmon.teach.views import ImageRefused, SampledEdge, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.views import (
+    REMEDIES,
+    ImageRefused,
+    SampledEdge,
+    TeachingImage,
+    TeachingRefused,
+    View,
+    Viewer,
+    sampled,
+)
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
-from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdges
+from gripmon.track.edges.taught import Look, PoseOffset, TaughtCorner, TaughtEdge, TaughtEdges
 
 T = TypeVar("T")
 
@@ -53,7 +63,8 @@ class Taught:
     """What was learnt.  ``untaught``: for each other edge in view the reason; ``notes``: what a person should know.
 
     ``closure_px``: largest distance of the gripper from the reference when the images are measured with what was
-    taught.  ``left_out``: the images that contradict the others, by their numbers, and why.
+    taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
+    bevels don't explain it.  ``left_out``: the images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -61,6 +72,7 @@ class Taught:
     untaught: dict[str, str]
     notes: tuple[str, ...]
     closure_px: float
+    reference_offset: PoseOffset
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -109,9 +121,30 @@ def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequ
         raise
     except TeachingRefused:
         for image, fit in zip(images, fits, strict=True):
-            if fit is None:
-                viewer.check_elsewhere(image)
+            if fit is None and (found := viewer.elsewhere(image)) is not None:
+                raise ImageRefused(image, _elsewhere(viewer, image, found)) from None
         raise
+
+
+def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
+    """Why an image that shows the gripper elsewhere is refused, and what to do; the pose to take allows for bevels."""
+    there = viewer.at(found.cam_T_grip, image)
+    views = [there.view(image, there.fitted(image))]
+    lines, _ = _lines(there, views, search=True)
+    motion = perturbation_between(viewer.ref_cam_T_grip, found.cam_T_grip)
+    try:
+        check_enough(there, views, lines)
+    except TeachingRefused:
+        remedies = REMEDIES
+    else:
+        moved = found_off(there, lines)
+        pose = perturb(found.cam_T_grip, moved.common[:6])
+        motion = perturbation_between(viewer.ref_cam_T_grip, pose)
+        remedies = viewer.advice(motion, moved.common_covariance[:6, :6])
+    return (
+        f"the gripper is {viewer.off_reference_px(found):.1f} px off the reference, {viewer.distance(motion)}; at most "
+        f"{viewer.reach_px:g} px: {remedies}"
+    )
 
 
 def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
@@ -119,7 +152,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     lines, untaught = _lines(viewer, views, search=True)
     check_standing(views, list(lines))
     check_enough(viewer, views, lines)
-    doubt = check_reference(viewer, images[0].name, lines)
+    offset, doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
     notes = _notes(viewer, lines, len(images), doubt)
     edges = estimate_edges(viewer, lines, None)
@@ -137,6 +170,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
+        offset,
         {},
     )
 

@@ -119,8 +119,9 @@ class Setup:
         pose, reference, why, expected = None, self.reference, None, None
         if reference is None:
             try:
+                exact = self.settings.model_sigma_m == 0.0
                 fixed = {name: put_px[name] for name in by_hand if name in put_px}
-                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error)
+                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error, exact)
                 reference = _reference_of(pose)
             except PoseRefused as refused:
                 why = str(refused)
@@ -155,7 +156,8 @@ class Setup:
         """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
         found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
-        return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
+        pose, covariance = from_record(reference.cam_T_grip), reference.covariance
+        return found, TaughtEdges.of(found.edges, self.gripper, pose, opening_m, covariance, found.reference_offset)
 
 
 def _reference_of(pose: CornerPose) -> ReferenceRecord:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.model.records import Array, Image, ReferenceRecord
 from gripmon.monitor.tracker import USUAL_SHARE
+from gripmon.teach.inset import finger_side
 from gripmon.teach.lines import EdgePoints
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import FingertipMeter, Measurement, Patience
@@ -31,6 +32,7 @@ from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
 _CLEAR_SHARE = 0.9  # inlier ratio where the gripper was expected; below it it is searched for elsewhere
 _DENSE = 4096  # search lines: as many as there are pixels along the edges
+REMEDIES = "images at the reference; or correct gripper file or jaw opening; or calibrate again"
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 
@@ -87,15 +89,15 @@ class Viewer:
     def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
         self.rig, self.gripper, gripper = rig, rig.gripper, rig.gripper
         sampling, self._jaw_sigma_m = rig.settings.corners.sampling, rig.settings.jaw_sigma_m
-        self.ref_cam_T_grip = from_record(reference.cam_T_grip)
+        self._reference, self.ref_cam_T_grip = reference, from_record(reference.cam_T_grip)
         self.reference_covariance = np.reshape(reference.covariance, (6, 6))
-        self._reach_px = sampling.reach_px
+        self.reach_px = sampling.reach_px
         self._dense = msgspec.structs.replace(sampling, samples=_DENSE, creases=True)
         self.jaw_opening_m = float(np.mean([image.jaw_opening_m for image in images]))
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
         edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
         self.crease = edges.crease
-        self.inside = self._inside(self.points_grip_m, edges.inside_point_m)
+        self.inside = finger_side(gripper, self.points_grip_m, self.ref_cam_T_grip, edges)
         _, depth = sight_axes(gripper, self.points_grip_m, self.ref_cam_T_grip)
         openings = [gripper.points_grip_m(image.jaw_opening_m) for image in images]
         across = [sight_axes(gripper, points_grip_m, self.ref_cam_T_grip)[0] for points_grip_m in openings]
@@ -104,19 +106,6 @@ class Viewer:
     def arrays(self, edges: Mapping[str, TaughtEdge]) -> TaughtEdges:
         """Taught edges as arrays for the measurement."""
         return TaughtEdges.of(edges, self.gripper, self.ref_cam_T_grip, self.jaw_opening_m)
-
-    def _inside(self, points_grip_m: Array, inside_point_m: Array) -> Array:
-        """Side (e,) of the visible face at each edge; without faces, of the middle of the finger's points."""
-        gripper, cam_T_grip = self.gripper, self.ref_cam_T_grip
-        middles = np.array(
-            [points_grip_m[gripper.point_finger == f].mean(axis=0) for f in range(len(gripper.finger_ids))]
-        )
-        inside = np.where(np.isfinite(inside_point_m), inside_point_m, middles[gripper.edge_finger])
-        ends = points_grip_m[gripper.edge_points]
-        # To the right of the edge as the camera sees it: x right, y down, z forward.
-        eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
-        right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
-        return np.sign(np.einsum("ei,ei->e", right, inside - eye))
 
     def measured(
         self,
@@ -132,31 +121,28 @@ class Viewer:
         here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
         return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
 
-    def _off_reference_px(self, found: Measurement) -> float:
+    def off_reference_px(self, found: Measurement) -> float:
         """Distance in the image between the measured gripper and the reference."""
         return found.prediction.moved_px(perturbation_between(self.ref_cam_T_grip, found.cam_T_grip))
 
     def fitted(self, image: TeachingImage) -> Measurement | None:
         """Fit the sharp model to the image from the reference; None where it doesn't fit, as with wide bevels."""
         found = self.measured(image, None)
-        return found if found.trusted and self._off_reference_px(found) <= self._reach_px else None
+        return found if found.trusted and self.off_reference_px(found) <= self.reach_px else None
 
-    def check_elsewhere(self, image: TeachingImage) -> None:
-        """Raise :class:`ImageRefused` if the gripper is clearly farther from the reference than the search lines
-        reach.
+    def elsewhere(self, image: TeachingImage) -> Measurement | None:
+        """The gripper where the sharp model finds it, if that is clearly farther from the reference than the search
+        lines reach; else None.
         """
         found = self.measured(image, None, None, _CLEAR_SHARE, EVERYWHERE)
         if found.trusted:
             # Repeat from there: the first search uses predictions at the reference, where clutter may mislead it.
             found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, EVERYWHERE)
-        away_px = self._off_reference_px(found)
-        if found.trusted and away_px > self._reach_px:
-            motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
-            raise ImageRefused(
-                image,
-                f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
-                f"{self._reach_px:g} px: {self.advice(motion)}",
-            )
+        return found if found.trusted and self.off_reference_px(found) > self.reach_px else None
+
+    def at(self, cam_T_grip: Array, image: TeachingImage) -> Viewer:
+        """The same for one image with the reference at another pose (4, 4)."""
+        return Viewer(self.rig, msgspec.structs.replace(self._reference, cam_T_grip=to_record(cam_T_grip)), [image])
 
     def view(
         self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
@@ -191,7 +177,7 @@ class Viewer:
     def _predict(
         self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
     ) -> Prediction:
-        offsets_px = zoom * profile_offsets_px(self._reach_px)
+        offsets_px = zoom * profile_offsets_px(self.reach_px)
         return predict(self.rig.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
 
     def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
@@ -204,7 +190,7 @@ class Viewer:
         variance = np.einsum("ni,ij,nj->n", rows, self.reference_covariance, rows).max()
         variance += np.square(self._jaw_sigma_m * here.jacobian[mine, 6]).max()
         bevel_m = max(shape_m, float(self.gripper.edge_bevel_m[edge]))
-        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self._reach_px)
+        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self.reach_px)
 
     @property
     def prior_covariance(self) -> Array:
@@ -219,19 +205,22 @@ class Viewer:
         x, y, z = (1e3 * motion[:3]).tolist()
         return f"by ({x:.3f}, {y:.3f}, {z:.3f}) mm and {np.degrees(np.linalg.norm(motion[3:6])):.3f}°"
 
-    def pose(self, motion: Array) -> str:
-        """The reference after a motion (6 or 7,), as written in a configuration."""
-        there = to_record(perturb(self.ref_cam_T_grip, motion[:6]))
+    def pose(self, motion: Array, covariance: Array) -> str:
+        """The reference after a motion (6,) with the covariance (6, 6), as written in a configuration."""
+        there = to_record(perturb(self.ref_cam_T_grip, motion))
         translation_m = [round(v, 7) for v in there.translation_m]
         rotation_xyzw = [round(v, 8) for v in there.rotation_xyzw]
-        return f"reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
-
-    def advice(self, motion: Array) -> str:
-        """What to do about a reference with an error of a motion (6 or 7,)."""
+        sigma = np.sqrt(covariance.diagonal())
         return (
-            "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
-            f"pose as {self.pose(motion)}"
+            f"reference: {{cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}, "
+            f"position_sigma_m: {sigma[:3].max():.2g}, rotation_sigma_rad: {sigma[3:].max():.2g}}}"
         )
+
+    def advice(self, motion: Array, covariance: Array) -> str:
+        """What to do about a reference with an error of a motion (6,), known with the covariance (6, 6), which bevels
+        have to be part of.
+        """
+        return f"{REMEDIES}, or take the measured pose with its standard deviations as {self.pose(motion, covariance)}"
 
 
 class SampledEdge(NamedTuple):

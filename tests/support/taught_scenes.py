@@ -78,7 +78,7 @@ def taught_from(*images: Image, using: ReferenceRecord | None = None, opening_m:
 
 def arrays(taught: Taught, cam_T_grip: np.ndarray | None = None) -> TaughtEdges:
     pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
-    return TaughtEdges.of(taught.edges, box_gripper(), pose, OPENING_M)
+    return TaughtEdges.of(taught.edges, box_gripper(), pose, OPENING_M, None, taught.reference_offset)
 
 
 def measured(

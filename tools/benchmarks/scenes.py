@@ -194,7 +194,7 @@ def _taught(
     except TeachingRefused as refused:
         print(f"accuracy: not taught: {refused}", file=sys.stderr)
         return None
-    return TaughtEdges.of(learnt.edges, gripper, cam_T_grip, float(np.mean(openings_m)))
+    return TaughtEdges.of(learnt.edges, gripper, cam_T_grip, float(np.mean(openings_m)), None, learnt.reference_offset)
 
 
 def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:

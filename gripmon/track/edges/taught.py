@@ -38,6 +38,7 @@ LARGEST_OFFSET_M = 0.02
 SAME_POSE = 1e-6
 """Poses are the same if no element of their matrices (m, no unit) differs by more: files hold rounded numbers."""
 
+PoseOffset = tuple[float, float, float, float, float, float]
 Length = Annotated[float, Meta(ge=-LARGEST_OFFSET_M, le=LARGEST_OFFSET_M, description="across the line of sight (m)")]
 Deviation = Annotated[float, Meta(ge=0.0, le=LARGEST_OFFSET_M, description="standard deviation (m)")]
 Share = Annotated[float, Meta(ge=0.0, le=1.0, description="part of the way from the edge's `from` to its `to`")]
@@ -70,8 +71,13 @@ class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The reference that was taught at; ``offset``: the perturbation (6,) from it to the gripper in the images, as far
+    as bevels don't explain it (m, rad).
+    """
+
     id: str
     cam_T_grip: Transform
+    offset: PoseOffset = (0.0,) * 6
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -200,6 +206,8 @@ class TaughtEdges:
     gripper (1: brighter to the right).  An edge that isn't known has no shift.  ``usual_m``: root mean square offset of
     the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
     at, which their offsets have in them: one standard deviation along each of k directions, m and rad.
+    ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
+    poses are off by as much if the camera moved since the calibration.
     """
 
     known: NDArray[np.bool_]
@@ -212,6 +220,7 @@ class TaughtEdges:
     polarity: NDArray[np.int8]
     usual_m: float
     reference_error: Array
+    reference_offset: Array
 
     @classmethod
     def of(
@@ -221,9 +230,10 @@ class TaughtEdges:
         cam_T_grip: Array,
         jaw_opening_m: float | None,
         covariance: Sequence[float] | None = None,
+        offset: Sequence[float] = (0.0,) * 6,
     ) -> TaughtEdges:
         """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
-        it is exact, or only differences from it count.
+        it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images.
         """
         untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
         listed = [edges.get(name, untaught) for name in gripper.edge_ids]
@@ -244,6 +254,7 @@ class TaughtEdges:
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
             np.zeros((0, 6)) if covariance is None else np.linalg.cholesky(np.reshape(covariance, (6, 6))).T,
+            np.array(offset),
         )
 
     @classmethod
@@ -253,7 +264,7 @@ class TaughtEdges:
         """
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
         opening_m = float(np.mean(openings)) if openings else None
-        return cls.of(model.edges, gripper, taught_pose(model), opening_m, covariance)
+        return cls.of(model.edges, gripper, taught_pose(model), opening_m, covariance, model.reference.offset)
 
     @property
     def digest(self) -> str:
