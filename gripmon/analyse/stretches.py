@@ -173,7 +173,7 @@ def _stretch(
     if holds.any():
         bounds = bounds[holds]
     elif valid[used].all():
-        beyond = past_alert_limit(Protection(*bounds.max(axis=0).tolist(), 0.0), policy)
+        beyond = _past_limit(bounds.max(axis=0), policy)
         counted = "; ".join(text for text in (f"as one transform {beyond}", counted) if text)
     out = np.ones(len(table), dtype=bool)
     out[used[holds]] = False
@@ -194,8 +194,13 @@ def _within(bounds: Array, policy: PolicySettings, *, all_or_none: bool) -> Bool
     """(n,) frames whose bounds (n, 2), m and rad, are within the alert limits.  With ``all_or_none``, for a camera that
     crept, none is unless all are: those who join frames to its one transform are told that they are several.
     """
-    within = np.array([past_alert_limit(Protection(*bound, 0.0), policy) is None for bound in bounds.tolist()])
+    within = np.array([_past_limit(bound, policy) is None for bound in bounds])
     return within & (within.all() or not all_or_none)
+
+
+def _past_limit(bound: Array, policy: PolicySettings) -> str | None:
+    position_m, rotation_rad = bound.tolist()
+    return past_alert_limit(Protection(position_m, rotation_rad, 0.0), policy)
 
 
 def _runs(stamp_ns: NDArray[np.int64], chosen: Bools) -> tuple[tuple[int, int], ...]:
