@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import psutil
 import pyarrow.parquet as pq
@@ -20,9 +21,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.dataset_scenes import FPS, MOTION_M, OF_BAGS, Truth, make_bags, make_lerobot, write_config
 from support.episode_files import WRIST, Shots, write_lerobot, write_mcap
+from support.playback_runs import table_of
+from support.reported import records
 
 from gripmon.analyse.dataset import Journal, Measured
-from gripmon.analyse.stretches import mountings_of
+from gripmon.analyse.stretches import Stretch, mountings_of, stretches_of
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.dataset import engines, measure_dataset
@@ -30,8 +33,10 @@ from gripmon.daemon.dataset.engines import DIED, local
 from gripmon.daemon.dataset.measuring import measure
 from gripmon.io.sources import BagSettings, SourceError
 from gripmon.io.sources.episodes import Episode, find_episodes
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import perturb
+from gripmon.model.records import Protection, Verdict
 
 NS = 1_000_000_000
 SMALL = [(0, False), (1, True), (2, False), (0, False)]
@@ -264,6 +269,43 @@ def test_every_kind_of_episode_is_found(tmp_path: Path):
         find_episodes(str(tmp_path / "images"), ["front"])
     with pytest.raises(SourceError, match="nothing in"):
         find_episodes(str(tmp_path / "nowhere"))
+
+
+def one_stretch(x_mm: np.ndarray, bounds_m: np.ndarray, valid: np.ndarray) -> tuple[Stretch, np.ndarray]:
+    """The stretch of frames in which the TCP is at ``x_mm``, all to be valid up to 1 mm, and their stamps (n,)."""
+    made = [
+        msgspec.structs.replace(
+            one, protection=Protection(bound_m, 0.01, 1e-7), verdict=Verdict.VALID if good else Verdict.SUSPECT
+        )
+        for one, bound_m, good in zip(
+            records(np.outer(1e-3 * x_mm, [1.0, 0.0, 0.0])), bounds_m.tolist(), valid, strict=True
+        )
+    ]
+    policy = PolicySettings(alert_limit_m=1e-3)
+    (stretch,) = stretches_of(table_of(made), [], [None if good else "hidden" for good in valid], policy)
+    return stretch, np.array([one.stamp_ns for one in made])
+
+
+def test_frames_whose_bound_is_past_the_alert_limit_are_not_valid_in_a_row():
+    """By hand: of a standing camera two frames' bounds, with the way to the mean, exceed 1 mm; three weren't valid."""
+    bounds_m, valid = np.full(100, 5e-4), np.ones(100, bool)
+    bounds_m[[0, 50]], valid[60:63] = 0.9999e-3, False
+    x_mm = np.where(np.arange(100) % 2, 0.02, -0.02)
+    row, stamps_ns = one_stretch(x_mm, bounds_m, valid)
+    assert row.verdict == "valid" and row.valid == 97 and row.crept_m is None
+    assert row.protection_m == pytest.approx(5.2e-4, abs=3e-5)
+    assert row.not_valid_ns == tuple((stamps_ns[a], stamps_ns[b]) for a, b in ((0, 0), (50, 50), (60, 62)))
+
+
+def test_row_of_a_camera_that_crept_past_the_alert_limit_is_suspect():
+    """Every frame's own transform is valid, but from the one that stands for all some are 0.7 mm away."""
+    row, stamps_ns = one_stretch(np.linspace(0.0, 1.4, 200), np.full(200, 5e-4), np.ones(200, bool))
+    assert row.crept_m == pytest.approx(0.7e-3, rel=0.1) and row.valid == 200
+    assert row.verdict == "suspect" and row.protection_m == pytest.approx(1.2e-3, rel=0.05)
+    assert re.match(r"as one transform the TCP may be 1\.2\d* mm off, alert limit 1 mm", row.reasons), row.reasons
+    assert row.not_valid_ns == ((stamps_ns[0], stamps_ns[-1]),)
+    row, _ = one_stretch(np.linspace(0.0, 0.4, 200), np.full(200, 5e-4), np.ones(200, bool))
+    assert row.verdict == "valid" and row.not_valid_ns == () and row.protection_m < 1e-3
 
 
 def test_mountings_are_parted_as_often_by_chance_as_said():

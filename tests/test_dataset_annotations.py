@@ -31,7 +31,14 @@ def stretches(begin_ns: int, verdict: str = "valid") -> tuple[Stretch, ...]:
     at_ns = [begin_ns + i * TENTH_NS if begin_ns else round(1e9 * float(np.float32(i / 10))) for i in range(6)]
     motion = Motion(at_ns[3], at_ns[2], at_ns[4], (1e-3, 0.0, 0.0), 1e-3, 1.287, 1e-9, "camera_mount_moved")
     return (
-        Stretch(start_ns=at_ns[0], end_ns=at_ns[2], verdict="valid", cam_T_grip=FIRST, **plain),
+        Stretch(
+            start_ns=at_ns[0],
+            end_ns=at_ns[2],
+            verdict="valid",
+            cam_T_grip=FIRST,
+            not_valid_ns=((at_ns[1], at_ns[1]),),
+            **plain,
+        ),
         Stretch(start_ns=at_ns[3], end_ns=at_ns[5], verdict=verdict, cam_T_grip=LAST, motion=motion, **plain),
     )
 
@@ -72,6 +79,7 @@ def test_mcap_beside_each_recording_holds_its_stretches(tmp_path: Path):
     assert [message.log_time for _, message, _ in found] == [shots.stamps_ns[0], shots.stamps_ns[3]]
     assert (first["verdict"], last["verdict"], last["motion_cause"]) == ("valid", "suspect", "camera_mount_moved")
     assert [first["mounting"], last["mounting"]] == [0, None] and first["cam_T_grip_tz_m"] == FIRST[2]
+    assert first["not_valid_ns"] == [[shots.stamps_ns[1]] * 2]
     assert set(first) <= set(schema["properties"]) and first["covariance"] == list(COVARIANCE)
     with made[1].open("rb") as file:
         reader = make_reader(file)
@@ -89,8 +97,8 @@ def test_copy_of_a_lerobot_dataset_has_the_columns(tmp_path: Path, version: str)
         annotated(dataset, tmp_path / "out", copy, answers)
     assert hashes_of(dataset) == hashes, "originals are never touched"
     rows = [row for path in sorted((copy / "data").rglob("*.parquet")) for row in pq.read_table(path).to_pylist()]
-    # The frames in which it may have moved by then or not are not to be used, though the stretches are valid.
-    assert [row[FLAG] for row in rows] == [1, 1, 1, 0, 1, 1] + [1, 1, 1, 0, 0, 0] + [0] * 6
+    # Not to be used in valid stretches: the second frame, and those in which it may have moved by then or not.
+    assert [row[FLAG] for row in rows] == [1, 0, 1, 0, 1, 1] + [1, 0, 1, 0, 0, 0] + [0] * 6
     np.testing.assert_allclose([row[POSE] for row in rows[:6]], [FIRST] * 3 + [LAST] * 3, atol=1e-8)
     assert [row[POSE] for row in rows[12:]] == [[0.0] * 7] * 6
     features = json.loads((copy / "meta" / "info.json").read_text())["features"]

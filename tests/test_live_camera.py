@@ -16,17 +16,20 @@ import numpy as np
 import pytest
 
 from gripmon.io.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
-from gripmon.io.sources.live import Backoff, shown_name
+from gripmon.io.sources.live import Backlog, Backoff, shown_name
 from gripmon.model.records import Frame
 
 PERIOD_S = 0.02
 
 
 class MjpegServer:
-    """Serves grey frames whose brightness is their number; can fall silent with the connection open."""
+    """Serves grey frames whose brightness is their number; can fall silent with the connection open, and hold frames
+    back to send them all at once.  ``made_s``: when each was made, by the monotonic clock.
+    """
 
     def __init__(self, port: int = 0) -> None:
-        self.stopping, self.silent = threading.Event(), threading.Event()
+        self.stopping, self.silent, self.held = threading.Event(), threading.Event(), threading.Event()
+        self.made_s: list[float] = []
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -49,14 +52,19 @@ class MjpegServer:
         self._thread.start()
 
     def stream(self, send: Callable[[bytes], object]) -> None:
-        count = 0
+        count, waiting = 0, b""
+        self.made_s.clear()
         while not self.stopping.wait(PERIOD_S):
             if self.silent.is_set():
                 continue
             jpeg = cv2.imencode(".jpg", np.full((96, 128, 3), count % 250, np.uint8))[1].tobytes()
             head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
-            send(head + jpeg + b"\r\n")
+            self.made_s.append(time.monotonic())
+            waiting += head + jpeg + b"\r\n"
             count += 1
+            if not self.held.is_set():
+                send(waiting)
+                waiting = b""
 
     def stop(self) -> None:
         self.stopping.set()
@@ -140,6 +148,55 @@ def test_the_camera_comes_back_after_its_server_was_gone(servers: list[MjpegServ
         assert camera.connected and back.seq > last.seq and back.stamp_ns > last.stamp_ns
     finally:
         camera.close()
+
+
+def test_frames_that_queued_up_while_the_network_stood_still_are_dropped(servers: list[MjpegServer]):
+    """Frames are no older than they say: those of the first 1.5 s are sent all at once."""
+    servers.append(MjpegServer())
+    server, shown = servers[0], []
+    camera = camera_at(server.port)
+    try:
+        for _ in range(40):
+            next_frame(camera)
+        server.held.set()
+        time.sleep(1.5)
+        server.held.clear()
+        while len(shown) < 20:
+            if (frame := next_frame(camera)).arrived_ns > 1e9 * server.made_s[-1] - 1e9:
+                shown.append((round(float(frame.image.mean())), 1e-9 * frame.arrived_ns))
+        dropped = camera.dropped
+    finally:
+        camera.close()
+    old = [number for number, arrived_s in shown if arrived_s - server.made_s[number] > 0.5]
+    assert old == [] and dropped > 30
+
+
+def queued_of(taken_s: np.ndarray, read_s: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many frames are taken for queued, and the ages (s) of the others."""
+    backlog = Backlog()
+    kept = np.array([not backlog.queued(at_s) for at_s in read_s.tolist()])
+    return int((~kept).sum()), (read_s - taken_s)[kept]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+@pytest.mark.parametrize("decoding_s", [0.001, 0.02, 0.028])
+def test_queued_frames_are_told_by_their_pace(decoding_s: float, jitter: float):
+    """Twenty-five a second; for two seconds nothing can be read, then as fast as frames can be decoded."""
+    taken_s = np.arange(1000) / 25.0 + 0.04 * jitter * (np.arange(1000) % 2)
+    read_s, free_s = [], 0.0
+    for at_s in taken_s.tolist():
+        free_s = max(at_s if not 4.0 < at_s < 6.0 else 6.0, free_s + decoding_s)
+        read_s.append(free_s)
+    queued, ages_s = queued_of(taken_s, np.array(read_s))
+    assert ages_s.max() < 0.1 and queued <= 2.1 / (0.04 - decoding_s)
+
+
+@pytest.mark.parametrize("later_fps", [5.0, 25.0, 60.0])
+def test_after_a_silence_in_which_nothing_queued_up_frames_go_on(later_fps: float):
+    """Frames that were lost, or a camera that paused, perhaps to go on at another rate."""
+    taken_s = np.concatenate([np.arange(100) / 25.0, 6.0 + np.arange(300) / later_fps])
+    queued, ages_s = queued_of(taken_s, taken_s)
+    assert queued <= {5.0: 12, 25.0: 3, 60.0: 90}[later_fps] and len(ages_s) > 300
 
 
 def test_a_stream_that_falls_silent_is_opened_again(servers: list[MjpegServer]):

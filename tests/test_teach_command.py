@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -125,6 +126,16 @@ def test_the_file_says_where_it_comes_from(rig: Path, taught: Path):
     assert model.reference.id == "demo-calibration"
     assert taught.read_text().startswith("# Taught model: written by gripmon teach")
     assert [p.name for p in taught.parent.iterdir() if p.name.startswith(".")] == [], "no temporary file is left"
+
+
+def test_taught_edges_carry_the_error_of_the_reference_they_were_taught_at(rig: Path, taught: Path):
+    """Also where a better one has replaced it, as for an episode of a dataset or in the replay of a recording."""
+    config = load_config(rig / "config.yaml")
+    sure = msgspec.structs.replace(config.reference, revision=1, covariance=tuple((1e-12 * np.eye(6)).ravel().tolist()))
+    for each in (config, dataclasses.replace(config, reference=sure)):
+        assert each.taught_edges is not None
+        error = each.taught_edges.reference_error
+        np.testing.assert_allclose(error.T @ error, np.reshape(config.reference.covariance, (6, 6)), atol=1e-16)
 
 
 def test_an_image_that_is_left_out_is_named_and_not_in_the_file(rig: Path, tmp_path: Path, capsys):

@@ -211,6 +211,7 @@ def _field(name: str, kind: pa.DataType, text: str) -> pa.Field:
 
 
 _F, _I, _S = pa.float64(), pa.int64(), pa.string()
+_RUNS = pa.list_(pa.list_(_I))
 SCHEMA = pa.schema(
     [
         _field("episode", _S, "path below the dataset; of LeRobot with # and its number"),
@@ -227,11 +228,12 @@ SCHEMA = pa.schema(
             for name in POSE_NAMES
         ),
         _field("covariance", pa.list_(_F), "6 x 6 by rows, position (m) then rotation (rad), camera axes"),
-        _field("protection_m", _F, "bound on the position error in each frame of the stretch; null: none"),
+        _field("protection_m", _F, "bound on the position error in each valid frame of the stretch; null: none"),
         _field("protection_rad", _F, "bound on the rotation error"),
         _field("integrity_risk", _F, "probability per frame that the error exceeds a bound"),
         _field("moved", pa.bool_(), "the camera moved within this episode, at once or slowly"),
         _field("crept_m", _F, "from the stretch's first half to its second, on average; null: not beyond chance"),
+        _field("not_valid_ns", _RUNS, "first and last stamp of each run of frames in which it isn't valid"),
         _field("motion_ns", _I, "when the camera moved, before this stretch; null: it is the first"),
         _field("motion_earliest_ns", _I, "it had not moved by then, in 95 of 100 cases"),
         _field("motion_latest_ns", _I, "it had moved by then"),
@@ -267,6 +269,7 @@ def _row(measured: Measured, number: int, stretch: Stretch | None, mounting: int
         "verdict": stretch.verdict, "mounting": mounting if mounting >= 0 else None, "start_ns": stretch.start_ns,
         "end_ns": stretch.end_ns, "frames": stretch.frames, "measured_share": stretch.measured / count,
         "valid_share": stretch.valid / count, "covariance": stretch.covariance, "crept_m": stretch.crept_m,
+        "not_valid_ns": stretch.not_valid_ns,
         "protection_m": stretch.protection_m, "protection_rad": stretch.protection_rad,
         "integrity_risk": stretch.integrity_risk, "reason": stretch.reasons or None, "moved": moved(measured.stretches),
         "picture": measured.pictures[shown] if 0 <= shown < len(measured.pictures) else None,

@@ -110,11 +110,16 @@ def _json_schema() -> dict[str, Any]:
     for field in SCHEMA:
         if field.name == "picture":
             continue
-        kind = "array" if pa.types.is_list(field.type) else _JSON_TYPES.get(field.type, "number")
-        items = {"items": {"type": "number"}} if kind == "array" else {}
+        kind = _json_type(field.type)
         text = field.metadata[b"description"].decode()
-        properties[field.name] = {"type": [kind, "null"], "description": text} | items
+        properties[field.name] = kind | {"type": [kind["type"], "null"], "description": text}
     return {"title": "gripmon.Stretch", "type": "object", "properties": properties}
+
+
+def _json_type(kind: pa.DataType) -> dict[str, Any]:
+    if pa.types.is_list(kind):
+        return {"type": "array", "items": _json_type(kind.value_type)}
+    return {"type": _JSON_TYPES.get(kind, "number")}
 
 
 def _target(dataset: LeRobotDataset, cameras: Sequence[str], target: str) -> Path:
@@ -184,14 +189,16 @@ class _Steps:
         self._rows = [row for row in made if row["start_ns"] is not None and row["cam_T_grip_tx_m"] is not None]
 
     def at(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transforms (n, 7), all 0 where unknown, and flags (n,), 1 where usable.  While the camera may have moved, the
-        transforms of neither side are usable.
+        """Transforms (n, 7), all 0 where unknown, and flags (n,), 1 in frames in which a row is valid.  While the
+        camera may have moved, the transforms of neither side are usable.
         """
         pose, usable = np.zeros((len(stamps_ns), 7), np.float32), np.zeros(len(stamps_ns), np.float32)
         for row in self._rows:
             inside = (stamps_ns >= row["start_ns"]) & (stamps_ns <= row["end_ns"])
             pose[inside] = [row[f"cam_T_grip_{name}"] for name in POSE_NAMES]
             usable[inside] = row["verdict"] == Verdict.VALID.value
+            for first, last in row["not_valid_ns"]:
+                usable[(stamps_ns >= first) & (stamps_ns <= last)] = 0.0
         for row in self._rows:
             if row["motion_earliest_ns"] is not None:
                 usable[(stamps_ns > row["motion_earliest_ns"]) & (stamps_ns < row["motion_latest_ns"])] = 0.0

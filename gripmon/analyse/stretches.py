@@ -17,8 +17,9 @@ from gripmon.analyse.corrected import correct_table
 from gripmon.analyse.correction import ChangePoint, Correction
 from gripmon.analyse.vectors import to_vectors
 from gripmon.calibrate.verify import CHANCE, compare_hand_eye, mean_of_one_scene
+from gripmon.judge.policy import PolicySettings, past_alert_limit
 from gripmon.model.geometry import to_record
-from gripmon.model.records import Alert, Array, Verdict
+from gripmon.model.records import Alert, Array, Protection, Verdict
 from gripmon.record.table import FrameTable
 
 _NUMBER = re.compile(r"\d[\d.e+-]*")
@@ -50,22 +51,25 @@ class Stretch(msgspec.Struct, frozen=True, kw_only=True):
     frames: int
     measured: Annotated[int, _is("frames with a transform of their own")]
     valid: Annotated[int, _is("frames whose transform was valid")]
-    verdict: Annotated[str, _is("valid: it comes from valid frames; suspect: there were none; unknown: not measured")]
+    verdict: Annotated[
+        str, _is("valid: it comes from valid frames; suspect: it doesn't, or is off; unknown: not measured")
+    ]
     cam_T_grip: Annotated[tuple[float, ...] | None, _is("x, y, z (m), quaternion x, y, z, w; null: unknown")] = None
     covariance: Annotated[tuple[float, ...] | None, _is("36 values; a single frame's, not a mean's")] = None
-    protection_m: Annotated[float | None, _is("bound on its position error in each of these frames; null: none")] = None
+    protection_m: Annotated[float | None, _is("bound on its position error in each valid frame; null: none")] = None
     protection_rad: float | None = None
     integrity_risk: Annotated[float | None, _is("probability per frame that a bound is exceeded")] = None
     crept_m: Annotated[float | None, _is("from its first half to its second; null: not beyond chance")] = None
+    not_valid_ns: Annotated[tuple[tuple[int, int], ...], _is("first and last of frames in which it isn't valid")] = ()
     motion: Annotated[Motion | None, _is("null: the episode begins with it")] = None
     reasons: Annotated[str, _is("why frames weren't valid, the most frequent first")] = ""
 
 
 def stretches_of(
-    table: FrameTable, alerts: Sequence[tuple[int, Alert]], reasons: Sequence[str | None]
+    table: FrameTable, alerts: Sequence[tuple[int, Alert]], reasons: Sequence[str | None], policy: PolicySettings
 ) -> list[Stretch]:
     """The stretches of one episode, in order; ``alerts`` with their stamps (ns); ``reasons`` (n,): why frames weren't
-    valid.
+    valid; ``policy``: with the alert limits, which bound a stretch's error as they do a frame's.
 
     The camera moved where the off-line smoother finds a change point and the transforms before and after it differ by
     ``verify``'s test at :data:`CHANCE`; otherwise it is one stretch.  Raises ValueError if too little was measured.
@@ -82,7 +86,7 @@ def stretches_of(
             motions.append(motion)
     ends = [*begins[1:], len(table)]
     return [
-        _stretch(table, correction, poses, valid, measured, slice(begin, end), motion, reasons)
+        _stretch(table, correction, poses, valid, measured, slice(begin, end), motion, reasons, policy)
         for begin, end, motion in zip(begins, ends, motions, strict=True)
     ]
 
@@ -139,6 +143,7 @@ def _stretch(
     part: slice,
     motion: Motion | None,
     reasons: Sequence[str | None],
+    policy: PolicySettings,
 ) -> Stretch:
     # Numbers differ from frame to frame, and so does text in brackets.
     why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in reasons[part] if reason)
@@ -146,33 +151,62 @@ def _stretch(
     plain = {
         "start_ns": int(table.stamp_ns[part.start]), "end_ns": int(table.stamp_ns[part.stop - 1]),
         "frames": part.stop - part.start, "measured": int(measured[part].sum()), "valid": int(valid[part].sum()),
-        "motion": motion, "reasons": counted,
+        "motion": motion, "not_valid_ns": _runs(table.stamp_ns[part], np.ones(part.stop - part.start, dtype=bool)),
     }  # fmt: skip
     used = _used(valid, measured, part)
     if not len(used):
-        return Stretch(verdict=Verdict.UNKNOWN.value, **plain)
+        return Stretch(verdict=Verdict.UNKNOWN.value, reasons=counted, **plain)
     mean, covariance = mean_of_one_scene(list(poses[used]), list(table.covariance[used]))
     away = to_vectors(mean, poses[used])
-    bounds = [
+    bounds = np.column_stack([
         table.protection_m[used] + np.linalg.norm(away[:, :3], axis=1),
         table.protection_rad[used] + np.linalg.norm(away[:, 3:], axis=1),
-    ]
+    ])  # fmt: skip
     record = to_record(mean)
     halves = [used[: (len(used) + 1) // 2], used[len(used) // 2 :]]
     (a, A), (b, B) = (
         mean_of_one_scene(list(correction.cam_T_grip[half]), list(correction.covariance[half])) for half in halves
     )
     crept = compare_hand_eye(a, A, b, B)
+    moved = crept.p_value < CHANCE
+    holds = valid[used] & _within(bounds, policy, all_or_none=moved)
+    if holds.any():
+        bounds = bounds[holds]
+    elif valid[used].all():
+        beyond = _past_limit(bounds.max(axis=0), policy)
+        counted = "; ".join(text for text in (f"as one transform {beyond}", counted) if text)
+    out = np.ones(len(table), dtype=bool)
+    out[used[holds]] = False
+    plain |= {"not_valid_ns": _runs(table.stamp_ns[part], out[part]), "reasons": counted}
     return Stretch(
-        verdict=Verdict.VALID.value if valid[used].all() else Verdict.SUSPECT.value,
+        verdict=Verdict.VALID.value if holds.any() else Verdict.SUSPECT.value,
         cam_T_grip=(*record.translation_m, *record.rotation_xyzw),
         covariance=tuple(covariance.ravel().tolist()),
-        protection_m=_largest(bounds[0]),
-        protection_rad=_largest(bounds[1]),
+        protection_m=_largest(bounds[:, 0]),
+        protection_rad=_largest(bounds[:, 1]),
         integrity_risk=_largest(table.integrity_risk[used]),
-        crept_m=float(np.linalg.norm(crept.position_m)) if crept.p_value < CHANCE else None,
+        crept_m=float(np.linalg.norm(crept.position_m)) if moved else None,
         **plain,
     )
+
+
+def _within(bounds: Array, policy: PolicySettings, *, all_or_none: bool) -> Bools:
+    """(n,) frames whose bounds (n, 2), m and rad, are within the alert limits.  With ``all_or_none``, for a camera that
+    crept, none is unless all are: those who join frames to its one transform are told that they are several.
+    """
+    within = np.array([_past_limit(bound, policy) is None for bound in bounds])
+    return within & (within.all() or not all_or_none)
+
+
+def _past_limit(bound: Array, policy: PolicySettings) -> str | None:
+    position_m, rotation_rad = bound.tolist()
+    return past_alert_limit(Protection(position_m, rotation_rad, 0.0), policy)
+
+
+def _runs(stamp_ns: NDArray[np.int64], chosen: Bools) -> tuple[tuple[int, int], ...]:
+    """First and last stamp of each run of chosen frames."""
+    changes = np.flatnonzero(np.diff(chosen, prepend=False, append=False))
+    return tuple(zip(stamp_ns[changes[::2]].tolist(), stamp_ns[changes[1::2] - 1].tolist(), strict=True))
 
 
 def _largest(values: Array) -> float | None:

@@ -75,10 +75,14 @@ class Config:
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
-        """The taught edges for the monitor; None without a taught model."""
-        return (
-            None if self.taught is None else TaughtEdges.of_model(self.taught, self.gripper, self.reference.covariance)
-        )
+        """The taught edges for the monitor; None without a taught model.
+
+        The error that they carry is that of the reference in the file, which they were taught at, and not of one that
+        has replaced it here since (:attr:`reference`).
+        """
+        if self.taught is None:
+            return None
+        return TaughtEdges.of_model(self.taught, self.gripper, covariance_of(self.settings.reference))
 
     @property
     def taught_path(self) -> Path | None:

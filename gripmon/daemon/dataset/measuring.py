@@ -104,7 +104,7 @@ def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
         gripper=config.gripper_path.stem, lens="configuration" if from_file is None else "file",
     )  # fmt: skip
     try:
-        stretches = tuple(stretches_of(table, run.alerts, run.reasons))
+        stretches = tuple(stretches_of(table, run.alerts, run.reasons, config.settings.monitor.policy))
     except ValueError as error:
         why = Counter(reason for reason in run.reasons if reason).most_common(1)
         return msgspec.structs.replace(plain, fault=f"{error}{f' ({why[0][1]} times: {why[0][0]})' if why else ''}")

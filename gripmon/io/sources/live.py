@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
+import statistics
 import threading
 import time
+from collections import deque
 from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
@@ -159,12 +162,18 @@ class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 class LiveCamera(NewestFrame):
     """The newest frame of a camera; while there is none it retries forever, and ``read`` returns :class:`Waiting`.
 
-    ``stamp_ns`` is the Unix time of the frame's arrival here, before decoding.  ``seq`` counts arrivals, so dropped
-    frames leave gaps.  Images are BGR as OpenCV delivers them.
+    ``stamp_ns`` is the Unix time of the frame's arrival here, before decoding; frames that queued up on the way while
+    the camera was silent are dropped (:class:`Backlog`).  ``seq`` counts arrivals, so dropped frames leave gaps.
+    Images are BGR as OpenCV delivers them.
     """
 
     def __init__(self, settings: LiveSettings) -> None:
-        super().__init__(_CaptureReader(settings), name="camera")
+        self._camera = _CaptureReader(settings)
+        super().__init__(self._camera, name="camera")
+
+    @property
+    def dropped(self) -> int:
+        return super().dropped + self._camera.queued
 
 
 class Backoff:
@@ -183,6 +192,50 @@ class Backoff:
         self._next_s = self._first_s
 
 
+GAP_S = 0.1
+_USUAL, _FEWEST, _NEWEST = 30, 5, 3
+
+
+class Backlog:
+    """Tells frames that waited in a queue (of the network, the driver, a suspended machine) from those that have just
+    been taken: OpenCV gives them no time of capture, and all are read as soon as the silence ends.
+
+    After a silence of three usual periods and :data:`GAP_S`, a frame counts as queued until as many have come as fit
+    into the time since, or until the newest three came at the usual rate: then the others were lost, or never taken.
+    Where reading a frame takes three quarters of the period or more, the two can't be told apart.
+    """
+
+    def __init__(self) -> None:
+        self._periods_s: deque[float] = deque(maxlen=_USUAL)
+        self._newest_s: deque[float] = deque(maxlen=_NEWEST)
+        self._last_s: float | None = None
+        self._began_s: float | None = None
+        self._count = 0
+
+    def queued(self, now_s: float) -> bool:
+        """Whether the frame read at ``now_s`` was taken long before."""
+        last_s, self._last_s = self._last_s, now_s
+        if last_s is None:
+            return False
+        period_s = now_s - last_s
+        usual_s = statistics.fmean(self._periods_s) if len(self._periods_s) >= _FEWEST else math.inf
+        if self._began_s is None:
+            if period_s <= max(3.0 * usual_s, GAP_S):
+                self._periods_s.append(period_s)
+                return False
+            self._began_s, self._count = last_s, 0
+            self._newest_s.clear()
+        else:
+            self._newest_s.append(period_s)
+        self._count += 1
+        at_rate = len(self._newest_s) == _NEWEST and sum(self._newest_s) > 0.75 * _NEWEST * usual_s
+        if at_rate or now_s - self._began_s < (self._count + 1) * usual_s:
+            self._began_s = None
+            self._periods_s.extend(self._newest_s if at_rate else ())
+            return False
+        return True
+
+
 class _CaptureReader:
     """The blocking part: opens, reads, and opens again after a pause."""
 
@@ -196,6 +249,9 @@ class _CaptureReader:
         self._next_try_s = 0.0
         self._waiting = Waiting(f"{self._name}: connecting")
         self._seq = 0
+        self.queued = 0
+        """Frames that were dropped because they had queued up."""
+        self._backlog = Backlog()
         self._delivers = False
 
     @property
@@ -219,6 +275,10 @@ class _CaptureReader:
         if not self._capture.grab():
             return self._lost("delivers no frames" if self._delivers else "opens, but delivers no frame")
         stamp_ns, arrived_ns = time.time_ns(), time.monotonic_ns()
+        if self._backlog.queued(1e-9 * stamp_ns):  # not by the monotonic clock, which stands still in suspend
+            self._seq += 1
+            self.queued += 1
+            return Waiting(f"{self._name}: old frames that queued up are passed over")
         decoded, image = self._capture.retrieve()
         if not self._delivers:
             self._delivers = True
@@ -243,7 +303,7 @@ class _CaptureReader:
         if not capture.isOpened():
             capture.release()
             return False
-        self._capture = capture
+        self._capture, self._backlog = capture, Backlog()
         self._ask_for_options()
         return True
 
