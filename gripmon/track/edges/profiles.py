@@ -92,7 +92,7 @@ def read_profiles(
         _pixels(image),
         np.ascontiguousarray(map_x, np.float32),
         np.ascontiguousarray(map_y, np.float32),
-        full_scale(image),
+        _largest(image.dtype),
     )
     if response == "linear":
         return profiles
