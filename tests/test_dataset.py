@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import re
 import subprocess
@@ -10,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -19,6 +20,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
+from support import dataset_scenes
 from support.dataset_scenes import FPS, MOTION_M, OF_BAGS, Truth, make_bags, make_lerobot, write_config
 from support.episode_files import WRIST, Shots, write_lerobot, write_mcap
 from support.playback_runs import table_of
@@ -28,15 +30,15 @@ from gripmon.analyse.dataset import Journal, Measured
 from gripmon.analyse.stretches import Stretch, mountings_of, stretches_of
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.daemon.dataset import engines, measure_dataset
+from gripmon.daemon.dataset import engines, measure_dataset, measuring
 from gripmon.daemon.dataset.engines import DIED, local
 from gripmon.daemon.dataset.measuring import measure
 from gripmon.io.sources import BagSettings, SourceError
 from gripmon.io.sources.episodes import Episode, find_episodes
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.errors import InputError
-from gripmon.model.geometry import perturb
-from gripmon.model.records import Protection, Verdict
+from gripmon.model.geometry import perturb, to_record
+from gripmon.model.records import Frame, Protection, ReferenceRecord, Verdict
 
 NS = 1_000_000_000
 SMALL = [(0, False), (1, True), (2, False), (0, False)]
@@ -269,6 +271,30 @@ def test_every_kind_of_episode_is_found(tmp_path: Path):
         find_episodes(str(tmp_path / "images"), ["front"])
     with pytest.raises(SourceError, match="nothing in"):
         find_episodes(str(tmp_path / "nowhere"))
+
+
+def test_reference_of_after_a_motion_is_not_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The monitor recalibrates only after the camera was knocked by 4.5 mm: its frames before that are valid all the
+    same, as of an episode that isn't recalibrated.
+    """
+    monkeypatch.setattr(dataset_scenes, "MOTION_M", (0.0, 0.0045, 0.0006))
+    config = write_config(tmp_path / "c.yaml", OF_BAGS)
+    shots, truth = dataset_scenes.episode(config, 0, 0, moves=True)
+    write_mcap(tmp_path / "a.mcap", shots)
+    covariance = tuple(np.diag([1e-9] * 3 + [1e-6] * 3).ravel().tolist())
+    last = to_record(truth.last_T)
+    late = msgspec.structs.replace(config.reference, revision=1, cam_T_grip=last, covariance=covariance)
+
+    def until_renewed(run: measuring._Run, frames: Iterator[Frame]) -> ReferenceRecord:
+        run.whole(itertools.islice(frames, 70))
+        return late
+
+    monkeypatch.setattr(measuring._Run, "until_renewed", until_renewed)
+    source = msgspec.structs.replace(config.settings.source, path=str(tmp_path / "a.mcap"))
+    found = measure((config,), Episode("a", source, ""))
+    assert [stretch.verdict for stretch in found.stretches] == ["valid", "valid"]
+    assert not found.own_reference and found.frames == dataset_scenes.MOVED_FRAMES
+    assert found.stretches[0].valid >= 0.9 * found.stretches[0].frames
 
 
 def one_stretch(x_mm: np.ndarray, bounds_m: np.ndarray, valid: np.ndarray) -> tuple[Stretch, np.ndarray]:

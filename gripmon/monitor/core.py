@@ -117,6 +117,11 @@ class Monitor:
         return self._renewal.book.current
 
     @property
+    def displaced_at_start(self) -> bool:
+        """Whether the gripper was first seen elsewhere than expected, and there has been no new reference since."""
+        return self._trust.unexplained is not None
+
+    @property
     def look_refused(self) -> str | None:
         """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
         return self._trust.look_refused

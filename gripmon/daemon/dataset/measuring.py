@@ -48,7 +48,8 @@ def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
     Uses the one of ``configs`` whose gripper the episode shows; there is no result if several or none of them fit.
 
     The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
-    starts again from the new reference; if it isn't recalibrated, the configuration's reference stays.  ``lens``:
+    starts again from the new reference; if it isn't recalibrated, or only after a motion, the configuration's reference
+    stays.  ``lens``:
     "file" for the camera calibration that comes with the frames, if any; "config" for the configuration's in any case.
     """
     try:
@@ -91,16 +92,16 @@ def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
         config, source = configs[found], open_source(episode.source)
     elif from_file is not None and (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
         raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
-    run = _Run(config)
-    renewed = run.until_renewed(_frames(source))
+    run, coming, own = _Run(config), _frames(source), False
+    renewed = run.until_renewed(coming)
     if renewed is not None:
-        source.close()
-        run = _Run(dataclasses.replace(config, reference=renewed))
-        for frame in _frames(open_source(episode.source)):
-            run.process(frame)
+        anew = _Run(dataclasses.replace(config, reference=renewed)).whole(_frames(open_source(episode.source)))
+        own = anew.began_at_reference
+        run = anew if own else run.whole(coming)  # a reference of after a motion doesn't fit what was before
+    source.close()
     table = run.table()
     plain = Measured(
-        episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=renewed is not None,
+        episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=own,
         gripper=config.gripper_path.stem, lens="configuration" if from_file is None else "file",
     )  # fmt: skip
     try:
@@ -126,6 +127,7 @@ class _Run:
         self._monitor, self._builder = Monitor(config), TableBuilder()
         self.alerts: list[tuple[int, Alert]] = []
         self.reasons: list[str | None] = []
+        self.began_at_reference = True
         self._first: Pictured | None = None
         self._last: Pictured | None = None
 
@@ -144,8 +146,15 @@ class _Run:
                 return self._monitor.reference
         return None
 
+    def whole(self, frames: Iterator[Frame]) -> _Run:
+        """The run after all of ``frames``."""
+        for frame in frames:
+            self.process(frame)
+        return self
+
     def process(self, frame: Frame) -> FrameRecord:
         record = self._monitor.process(frame)
+        self.began_at_reference &= not self._monitor.displaced_at_start
         self._builder.add(record)
         self.alerts += [(record.stamp_ns, alert) for alert in record.alerts]
         self.reasons.append(record.reason)
