@@ -82,6 +82,12 @@ class Witness:
                     references.append(answer.reference_id)
                     self.answered += 1
 
+    def accept(self) -> bool:
+        """Accept whatever is proposed."""
+        replies = self._session.get(f"{PREFIX}/cmd/accept", timeout=1.0)
+        answers = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        return any(msgspec.json.decode(answer, type=CommandReply).done for answer in answers)
+
     def _reference(self, sample: zenoh.Sample) -> None:
         record = msgspec.json.decode(sample.payload.to_bytes(), type=ReferenceRecord)
         if self.published.setdefault(record.revision, record) != record:
@@ -135,7 +141,9 @@ def forks(config: Path) -> Iterator[Forks]:
 
 @pytest.mark.slow("15 s; killed at any moment is in the default run")
 def test_killed_while_it_calibrates_anew_it_goes_on_from_the_newest_reference(tmp_path: Path):
-    """The same without commands: the camera is knocked to and fro, and past the limit each time."""
+    """The same, though an operator only accepts: the camera is knocked to and fro, and past the limit each time.  After
+    a restart it is elsewhere than when the last transform was kept, which only a person can explain.
+    """
     endpoint = free_endpoint()
     policy = {"limit_m": 0.001, "settle_frames": 4, "confirm_frames": 1}
     config = configuration(
@@ -150,7 +158,7 @@ def test_killed_while_it_calibrates_anew_it_goes_on_from_the_newest_reference(tm
         newest = 0
         for _ in range(6):
             pid = monitors.start()
-            wait_until(lambda newest=newest: witness.newest > newest, "a recalibration", 60.0)
+            wait_until(lambda newest=newest: witness.accept() or witness.newest > newest, "a recalibration", 60.0)
             time.sleep(chance.uniform(0.0, 0.5))
             monitors.kill(pid)
             kept = witness.compare(tmp_path / "kept.json")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE_SQUARE
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 from gripmon.teach.inset import INSET_SIGMA_M
 from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
@@ -339,7 +340,10 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         likelier_first = faults if moved.usual_own_m[0] <= opened.usual_own_m[0] else faults[::-1]
         raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}")
     away_px = max(float(np.abs(e.sampled.rows[:, :6] @ pose).max()) * e.sampled.per_m for e in lines.values())
-    x, y, z, *rotation = (round(v, 9) for v in pose.tolist())
+    turn = pose[3:]
+    if turn @ np.linalg.solve(covariance[3:, 3:], turn) <= chi_square_limit(0.05, 3):
+        turn = np.zeros(3)  # a turn within its noise says nothing of the reference
+    x, y, z, *rotation = (round(v, 9) for v in (*pose[:3].tolist(), *turn.tolist()))
     offset = (x, y, z, rotation[0], rotation[1], rotation[2])
     if away_px <= NOTED_PX:
         return offset, None
