@@ -297,6 +297,20 @@ def test_reference_of_after_a_motion_is_not_the_episodes(tmp_path: Path, monkeyp
     assert found.stretches[0].valid >= 0.9 * found.stretches[0].frames
 
 
+def test_a_mounting_beyond_the_references_sigma_is_measured_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """By 9 mm, at 1 mm: a monitor would ask a person, which a survey of mountings is there to answer."""
+    monkeypatch.setattr(dataset_scenes, "MOUNTINGS", np.array([[0.009, 0.0, 0.0, 0.0, 0.0, 0.01]]))
+    config = write_config(tmp_path / "c.yaml", OF_BAGS)
+    shots, truth = dataset_scenes.episode(config, 0, 0)
+    write_mcap(tmp_path / "a.mcap", shots)
+    found = measure(
+        (config,), Episode("a", msgspec.structs.replace(config.settings.source, path=str(tmp_path / "a.mcap")), "")
+    )
+    [stretch] = found.stretches
+    assert found.own_reference and stretch.verdict == "valid" and stretch.cam_T_grip is not None
+    assert np.linalg.norm(np.subtract(stretch.cam_T_grip[:3], truth.first_T[:3, 3])) < stretch.protection_m
+
+
 def one_stretch(x_mm: np.ndarray, bounds_m: np.ndarray, valid: np.ndarray) -> tuple[Stretch, np.ndarray]:
     """The stretch of frames in which the TCP is at ``x_mm``, all to be valid up to 1 mm, and their stamps (n,)."""
     made = [

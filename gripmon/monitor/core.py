@@ -118,7 +118,7 @@ class Monitor:
 
     @property
     def displaced_at_start(self) -> bool:
-        """Whether the gripper was first seen elsewhere than expected, and there has been no new reference since."""
+        """Whether the gripper was first seen elsewhere than expected, and no operator has accepted a new reference."""
         return self._trust.unexplained is not None
 
     @property

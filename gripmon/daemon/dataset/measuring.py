@@ -17,6 +17,7 @@ from gripmon.daemon.config.checks import view_fault
 from gripmon.daemon.dataset.fitting import chosen, fit_of, spread
 from gripmon.io.sources import FolderSettings, Source, SourceError, VideoSettings, open_source
 from gripmon.io.sources.episodes import Episode
+from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.references import CommandRefused
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import in_short
@@ -49,8 +50,7 @@ def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
 
     The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
     starts again from the new reference; if it isn't recalibrated, or only after a motion, the configuration's reference
-    stays.  ``lens``:
-    "file" for the camera calibration that comes with the frames, if any; "config" for the configuration's in any case.
+    stays.  ``lens``: "file" for the camera calibration that comes with the frames, if any; "config" for the configuration's in any case.
     """
     try:
         return _measured(configs, episode, lens)
@@ -142,6 +142,10 @@ class _Run:
                     self._monitor.command(Command(CommandName.RECALIBRATE, ""), record.stamp_ns)
                 except CommandRefused:
                     continue
+            found = self._monitor.recalibration
+            if self._monitor.proposal is not None and isinstance(found, Proposal) and found.needs_person is None:
+                # That the camera may be elsewhere than the configuration's reference has it is why this was asked for.
+                self._monitor.command(Command(CommandName.ACCEPT, ""), record.stamp_ns)
             if self._monitor.reference.revision != revision:
                 return self._monitor.reference
         return None
