@@ -303,9 +303,8 @@ def test_a_mounting_beyond_the_references_sigma_is_measured_too(tmp_path: Path, 
     config = write_config(tmp_path / "c.yaml", OF_BAGS)
     shots, truth = dataset_scenes.episode(config, 0, 0)
     write_mcap(tmp_path / "a.mcap", shots)
-    found = measure(
-        (config,), Episode("a", msgspec.structs.replace(config.settings.source, path=str(tmp_path / "a.mcap")), "")
-    )
+    source = msgspec.structs.replace(config.settings.source, path=str(tmp_path / "a.mcap"))
+    found = measure((config,), Episode("a", source, ""))
     [stretch] = found.stretches
     assert found.own_reference and stretch.verdict == "valid" and stretch.cam_T_grip is not None
     assert np.linalg.norm(np.subtract(stretch.cam_T_grip[:3], truth.first_T[:3, 3])) < stretch.protection_m

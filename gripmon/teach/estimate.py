@@ -343,8 +343,8 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
     turn = pose[3:]
     if turn @ np.linalg.solve(covariance[3:, 3:], turn) <= chi_square_limit(0.05, 3):
         turn = np.zeros(3)  # a turn within its noise says nothing of the reference
-    x, y, z, *rotation = (round(v, 9) for v in (*pose[:3].tolist(), *turn.tolist()))
-    offset = (x, y, z, rotation[0], rotation[1], rotation[2])
+    x, y, z, about_x, about_y, about_z = (round(v, 9) for v in (*pose[:3].tolist(), *turn.tolist()))
+    offset = (x, y, z, about_x, about_y, about_z)
     if away_px <= NOTED_PX:
         return offset, None
     return offset, (

@@ -34,9 +34,7 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
         paths["camera"] = named_file(path, "camera", values["camera"], _INTRINSICS, _OR)
         values["camera"] = _as_read(read_camera(paths["camera"]).camera)
     if isinstance(values.get("reference"), str):
-        paths["reference"] = named_file(
-            path, "reference", values["reference"], "a file of gripmon calibrate plane", _OR
-        )
+        paths["reference"] = named_file(path, "reference", values["reference"], _PLANE, _OR)
         hand_eye = read_document(paths["reference"], HandEyeCalibration)
         values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
     return values, CalibrationFiles(paths, hand_eye)

@@ -144,7 +144,7 @@ class _Run:
                     continue
             found = self._monitor.recalibration
             if self._monitor.proposal is not None and isinstance(found, Proposal) and found.needs_person is None:
-                # That the camera may be elsewhere than the configuration's reference has it is why this was asked for.
+                # The camera may be elsewhere than the configuration's reference has it: that is why this was asked for.
                 self._monitor.command(Command(CommandName.ACCEPT, ""), record.stamp_ns)
             if self._monitor.reference.revision != revision:
                 return self._monitor.reference
