@@ -50,7 +50,8 @@ def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
 
     The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
     starts again from the new reference; if it isn't recalibrated, or only after a motion, the configuration's reference
-    stays.  ``lens``: "file" for the camera calibration that comes with the frames, if any; "config" for the configuration's in any case.
+    stays.  ``lens``: "file" for the camera calibration that comes with the frames, if any; "config" for the
+    configuration's in any case.
     """
     try:
         return _measured(configs, episode, lens)
