@@ -20,7 +20,18 @@ from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, follow, telling, with_and_without
+from gripmon.track.integrity import (
+    Doubts,
+    Hypotheses,
+    Knocks,
+    Separation,
+    Sums,
+    after_jumps,
+    follow,
+    jumped,
+    telling,
+    with_and_without,
+)
 
 SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
@@ -111,22 +122,21 @@ class ModelError(NamedTuple):
         return self.common.reaching(Doubts.of(name, prior, self.common.on(fits, cam_T_grip), SIGMA_INFLATION))
 
 
-def protection_of(doubts: Doubts, risk: float) -> Protection:
-    """The protection levels at an integrity ``risk``."""
-    position_m, rotation_rad, name = doubts.levels(risk)
+def protection_of(doubts: Doubts, risk: float, left_out: float = 0.0) -> Protection:
+    """The protection levels at an integrity ``risk``, of which what isn't among the doubts takes the part ``left_out``;
+    where that is more than half of it, there is no bound.
+    """
+    if left_out > 0.5 * risk:
+        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "too much may be wrong at once")
+    position_m, rotation_rad, name = doubts.levels(risk - left_out)
     return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, name)
 
 
 class Refits:
-    """One measurement's fits under h hypotheses, alone and with the anchor as a ``known`` measurement."""
+    """One measurement's fits under h hypotheses, alone and with what is ``known`` of the pose from before."""
 
     def __init__(
-        self,
-        measurement: Measurement,
-        hypotheses: Hypotheses,
-        floor: Array,
-        model: ModelError,
-        known: Known | None = None,
+        self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError, known: Known
     ):
         """``floor`` (6, 6): covariance of the error that no averaging removes."""
         self.hypotheses, self.model, self._floor = hypotheses, model, floor
@@ -143,15 +153,11 @@ class Refits:
         longer = normal.information[:, :, :3] @ (self._fit_T[:3, :3] @ (model.sigma_m * model.axis_grip))
         of_model = longer, model.finger[normal.edge], model.fingers
         of = normal.pull, normal.information, normal.middle, of_model, hypotheses.keep, held, pull
-        self.anchored: Anchored | None = None
-        """The same with the anchor; None without one."""
-        if known is None:
-            self._free = Sums.of_kept(*of).fits()
-        else:
-            at, covariance = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor
-            # The free fit's distance from the anchor, in units of both covariances.
-            self._free, fits, square = with_and_without(*of, at, covariance, known.of_model, SIGMA_INFLATION**2)
-            self.anchored = Anchored(fits, square)
+        self.known = known
+        self._known = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor, known.of_model
+        # The free fit's distance from what is known, in units of both covariances.
+        self._free, fits, square = with_and_without(*of, *self._known, SIGMA_INFLATION**2)
+        self.anchored = Anchored(fits, square)
         self.covariance: Array = self._free.covariance + self._floor
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
@@ -174,6 +180,27 @@ class Refits:
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
         return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip)
+
+    def knocked(
+        self, cam_T_grip: Array, prior: Array, knocks: Knocks, probable: Array, stays: NDArray[np.bool_], least: float
+    ) -> tuple[Doubts, float]:
+        """What may be wrong with a published pose (4, 4) if the mount was knocked since the pose that is known.
+
+        ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether the fit
+        under it is where the pose was.  Those less probable than ``least``, given the fits, are left out; also returns
+        their probability together.
+        """
+        at, covariance, of_model = self._known
+        share = probable[:, None] * knocks.share
+        given = jumped(self._free, at, covariance, knocks.covariance, share, stays, SIGMA_INFLATION**2)
+        weight = prior[:, None] * given
+        counts = weight > least
+        fit, jump = np.nonzero(counts)
+        fits = after_jumps(self._free, at, covariance, of_model, knocks.covariance, fit, jump)
+        away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
+        name = tuple(self.hypotheses.name[k] for k in fit.tolist())
+        fits = Separation(away, fits.covariance + self._floor, fits.of_model)
+        return self.model.doubts(name, weight[counts], fits, cam_T_grip), float(weight[~counts].sum())
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
@@ -230,13 +257,22 @@ def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[
 
 
 class Anchor:
-    """The average of the proven poses, from the first one on."""
+    """The average of the proven poses, from the first one on.  ``origin``: what was known of the pose before that one,
+    a pose (4, 4) and its covariance (6, 6): it stays the prior of what the frames don't show.
+    """
 
     def __init__(
-        self, lasting: Lasting, base_T: Array, fits: Refits, rows: NDArray[np.intp], now_s: float, knocked: bool = False
+        self,
+        lasting: Lasting,
+        base_T: Array,
+        fits: Refits,
+        rows: NDArray[np.intp],
+        now_s: float,
+        origin: tuple[Array, Array],
+        knocked: bool = False,
     ):
         """``knocked``: the first pose differs from the one expected before."""
-        self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
+        self._lasting, self._base_T, self._origin, self.now_s = lasting, base_T, origin, now_s
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
@@ -286,11 +322,20 @@ class Anchor:
         variance of the motion since the anchor.
 
         Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
+        What neither shows is known as it was at the origin.
         """
         at = perturbation_between(self._base_T, cam_T_grip)
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
+        origin_T, covariance = self._origin
+        count = len(told.shift)
+        before = Separation(
+            np.tile(perturbation_between(cam_T_grip, origin_T), (count, 1)),
+            np.tile(covariance, (count, 1, 1)),
+            np.zeros_like(told.of_model),
+        )
+        told, _ = follow(told, before, wander / SIGMA_INFLATION**2)
         return fits.model.doubts(self._lasting.name, self._lasting.prior, told, cam_T_grip)
 
 

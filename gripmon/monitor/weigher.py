@@ -35,7 +35,8 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges, sides
-from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
+from gripmon.track.integrity import Doubts, Hypotheses, Knocks, bounds, hypotheses_of
+from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
 
 VIBRATION_FRAMES = 20.0
@@ -54,10 +55,14 @@ JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
 exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
-KNOCK_UNSEEN_PROBABILITY = 5e-4
-"""Probability that the mount is knocked while something hides the fingers' ends: the gripper touches things then, so
-that the average rate of knocks is too low.
+KNOCK_UNSEEN_PROBABILITY = 1e-3
+"""Probability that the mount was knocked where nothing has shown it: while something hides the fingers' ends, since the
+gripper touches things then, and between the reference's images and the first frame.  A policy, once for each such
+occlusion, since the average rate of knocks is too low for both (docs/integrity.md).
 """
+
+LEAST_WEIGHT_RATIO = 1e-3
+"""Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
@@ -155,39 +160,35 @@ class Weigher:
         proven = not slid and _proven(ends, displaced and not seen_along, again)
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven and not may_have_slid else 1.0 if slid else self._misread(measurement, ends, kept)
-        # The priors: only that of the ends depends on the frame.  Then the probability that only the frame shows where
-        # the fingers are along their direction.
+        misread = 1.0 if slid else self._misread(measurement, ends, kept)
+        # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
-        alone = 1.0
-        if anchor is not None and not (displaced or may_have_slid):
-            alone = self._knocked(now_s - anchor.now_s, hidden=True)
-        jumped = alone * prior[hypotheses.ends] > risk
-        # Lasting hypotheses: from the frame, or from the anchor, whose place the ends confirm then.
+        # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
+        unseen = 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
+        knocks = Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis)
+        jumped = unseen * float(knocks.share[knocks.along].sum()) * prior[hypotheses.ends] > risk
+        doubts, left_out, without = self._doubts_of_knocks(
+            measurement, fits, prior, holds, knocks, unseen, cam_T_grip, now_s, displaced
+        )
+        doubts = fits.doubts(cam_T_grip, prior, anchored).among(holds) + doubts
         made_of = fits
-        if displaced or jumped or anchor is None:
-            all_along, without = self._doubts_of_frame(measurement, fits, prior, cam_T_grip, alone if jumped else None)
-            if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
-                proven, made_of = True, without
-        else:
-            all_along = anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
+            proven, made_of = True, without
+        if anchor is not None and not displaced:
+            doubts = doubts + anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        protection = protection_of(doubts, risk, left_out)
+        if anchor is None and displaced:
+            away = perturbation_between(self._expected[0], cam_T_grip)
+            protection = larger(protection, self._not_as_expected(away))
+        if self.unexplained is not None:
+            protection = larger(protection, self._not_as_expected(self.unexplained))
         if anchor is None:
-            protection = protection_of(all_along, risk)
-            if displaced:
-                away = perturbation_between(self._expected[0], cam_T_grip)
-                protection = larger(protection, self._not_as_expected(away))
-            if self.unexplained is not None:
-                protection = larger(protection, self._not_as_expected(self.unexplained))
             return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
-        # Hypotheses since the anchor, and the most probable one.
+        # The most probable hypothesis since the anchor.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
-        since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
-        protection = protection_of(all_along + since, risk)
-        if self.unexplained is not None:
-            protection = larger(protection, self._not_as_expected(self.unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
@@ -198,26 +199,43 @@ class Weigher:
             protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
         return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
 
-    def _doubts_of_frame(
-        self, measurement: Measurement, fits: Refits, prior: Array, cam_T_grip: Array, alone: float | None
-    ) -> tuple[Doubts, Refits | None]:
-        """The lasting hypotheses from this frame's ``fits`` alone, with probabilities ``prior`` (h,).
+    def _doubts_of_knocks(
+        self,
+        measurement: Measurement,
+        fits: Refits,
+        prior: Array,
+        holds: NDArray[np.bool_],
+        knocks: Knocks,
+        unseen: float,
+        cam_T_grip: Array,
+        now_s: float,
+        displaced: bool,
+    ) -> tuple[Doubts, float, Refits | None]:
+        """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
 
-        ``alone``: the probability that only this frame shows where the fingers' ends are, if they may be something
-        else; then the fits without the ends are returned as well.
+        ``prior`` (h,) of the hypotheses, ``holds`` (h,) those under which it may have stayed; ``unseen``: probability
+        of a knock that only the ends would show.  Also returns the fits without any of them, if they count.
         """
-        hypotheses = fits.hypotheses
-        # A knock of the mount may bend a finger, too; but fingers are assumed straight at first.
-        counts = ~hypotheses.sudden if self.anchor is None else np.ones_like(hypotheses.sudden)
-        rows = counts.copy()
-        rows[hypotheses.ends] = True
-        doubts = fits.doubts(cam_T_grip, prior).among(rows)
-        if alone is None:
-            return doubts, None
-        endless, more = hypotheses.without_ends()
-        without = Refits(measurement, endless, self._tracker.floor, self._model)
-        besides = alone * prior[hypotheses.ends] * hypotheses.prior
-        return doubts + without.doubts(cam_T_grip, besides).among(counts & more), without
+        hypotheses, edges = fits.hypotheses, fits.edges
+        least = LEAST_WEIGHT_RATIO * self._policy.integrity_risk
+        across = ~self._along[edges]
+        endless = (hypotheses.keep[:, across] == 0.0).all(axis=1)
+        probable = np.where(endless, unseen, self._knocked(now_s, hidden=False))
+        if not across.any():
+            probable[hypotheses.ends] = 0.0  # the same as that nothing is wrong
+        doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, least)
+        besides = unseen * prior[hypotheses.ends]
+        without = None
+        if across.any() and (displaced or besides * WRONG_EDGE > least):
+            endless_too, more = hypotheses.without_ends()
+            without = Refits(measurement, endless_too, self._tracker.floor, self._model, fits.known)
+            both = prior[hypotheses.ends] * hypotheses.prior * more
+            stays = without.anchored.square <= CONTRADICTION_SQUARE
+            of_both, more_out = without.knocked(
+                cam_T_grip, both, knocks, np.full(len(both), unseen), stays, least
+            )
+            doubts, left_out = doubts + of_both, left_out + more_out
+        return doubts, left_out, without
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """Add a proven pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it."""
@@ -232,7 +250,11 @@ class Weigher:
             self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
             self.question = Question(self.unexplained, self._revision)
         if self.anchor is None or trust.displaced:
-            self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
+            expected_T, covariance = self.expected
+            if trust.displaced:
+                covariance = covariance + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
+            origin = expected_T, covariance
+            self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, origin, trust.displaced)
         else:
             self._in_place = True
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
@@ -257,7 +279,7 @@ class Weigher:
         ``growth``.  ``hidden``: the image is good, but the gripper isn't seen in it.
         """
         risk = protection.risk
-        if self._knocked(unseen_s, hidden) > risk:
+        if max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0) > risk:
             why = "the mount was knocked while nothing is seen of the gripper"
             return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
         position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
@@ -265,9 +287,13 @@ class Weigher:
             protection.position_m + position_m, protection.rotation_rad + rotation_rad, risk, protection.hypothesis
         )
 
-    def _knocked(self, unseen_s: float, hidden: bool) -> float:
-        """Probability that the mount was knocked within ``unseen_s``; ``hidden``: something hides the gripper."""
-        return max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
+    def _knocked(self, now_s: float, hidden: bool) -> float:
+        """Probability that the mount was knocked since the pose was last proven, or since the reference's images;
+        ``hidden``: something hides what would show it.
+        """
+        if self.anchor is None:
+            return KNOCK_UNSEEN_PROBABILITY
+        return max(self._jumps_per_s * (now_s - self.anchor.now_s), KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """How many times the fingers' ends are seen where the pose has them: once for each finger by its edges, and
@@ -305,9 +331,7 @@ class Weigher:
         """
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
-        unseen_s = 0.0 if self.anchor is None else now_s - self.anchor.now_s
-        knocked = self._knocked(unseen_s, hidden=True)
-        return knocked * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
+        return self._knocked(now_s, hidden=True) * MISREAD_PROBABILITY**sides <= self._policy.integrity_risk
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
@@ -399,5 +423,7 @@ def foresee_protection(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
     model = _model_error(tracker, gripper)
-    doubts = Refits(measurement, hypotheses, tracker.floor, model).doubts(measurement.cam_T_grip, hypotheses.prior)
+    nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
+    fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
+    doubts = fits.doubts(measurement.cam_T_grip, hypotheses.prior)
     return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)

@@ -1,12 +1,15 @@
 """What may be promised of a transform: bounds on its error under everything that may be wrong, at a stated risk."""
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
+from gripmon.track.integrity.knocks import Knocks
 from gripmon.track.integrity.separation import (
     Doubts,
     Separation,
     Sums,
+    after_jumps,
     bounds,
     follow,
+    jumped,
     telling,
     warm_up,
     with_and_without,
@@ -15,11 +18,14 @@ from gripmon.track.integrity.separation import (
 __all__ = [
     "Doubts",
     "Hypotheses",
+    "Knocks",
     "Separation",
     "Sums",
+    "after_jumps",
     "bounds",
     "follow",
     "hypotheses_of",
+    "jumped",
     "telling",
     "warm_up",
     "with_and_without",

@@ -216,6 +216,97 @@ def with_and_without(
 
 
 @compiled
+def jumped(
+    shift: Array, covariance: Array, at: Array, known: Array, jumps: Array, prior: Array, stays: Bools, times: float
+) -> Array:
+    """Probabilities (h, c) of the jumps that may have carried a pose away from where it is known to have been, given
+    a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6).
+
+    ``at`` (6,) with its covariance ``known`` C (6, 6): the pose before; ``jumps`` J (c, 6, 6), of the probability
+    ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a jump's probability is its
+    prior times the normal density of the fit with ``times`` R + C + J, over the sum of these and of having stayed.
+    """
+    count, kinds = prior.shape
+    root, white, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    log_density, out = np.empty(kinds + 1), np.zeros((count, kinds))
+    for h in range(count):
+        highest, stay = -math.inf, 1.0
+        for c in range(kinds + 1):
+            log_density[c] = -math.inf
+            if stays[h] if c == kinds else prior[h, c] > 0.0:
+                for i in range(6):
+                    for j in range(6):
+                        jump = jumps[c, i, j] if c < kinds else 0.0
+                        both[i, j] = times * covariance[h, i, j] + known[i, j] + jump
+                log_density[c] = -0.5 * _square(both, shift[h] - at, root, white)
+                for i in range(6):
+                    log_density[c] += math.log(root[i, i])
+            highest = max(highest, log_density[c])
+        total = 0.0
+        for c in range(kinds):
+            stay -= prior[h, c]
+            if prior[h, c] > 0.0:
+                out[h, c] = prior[h, c] * math.exp(log_density[c] - highest)
+                total += out[h, c]
+        if stays[h]:
+            total += max(stay, 0.0) * math.exp(log_density[kinds] - highest)
+        if total > 0.0:
+            out[h] /= total
+    return out
+
+
+@compiled
+def after_jumps(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    fit: Ints,
+    jump: Ints,
+) -> tuple[Array, Array, Array]:
+    """The poses after r of the jumps of :func:`jumped`, by the fits and what was known: with P = C + J and the gain
+    K = P (P + R)^-1 the shift at + K (shift - at) (r, 6), covariance P - K P (r, 6, 6), and errors by the model
+    known_off + K (off - known_off) (r, f, 6), ``off`` (h, f, 6) and ``known_off`` (f or 1, 6).  ``fit`` and ``jump``
+    (r,): the number of each.
+    """
+    count, fingers = len(fit), off.shape[1]
+    shifts, covariances, offs = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, fingers, 6))
+    before, both, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    root, between, gain = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    for r in range(count):
+        h, c = fit[r], jump[r]
+        for i in range(6):
+            for j in range(6):
+                before[i, j] = known[i, j] + jumps[c, i, j]
+                both[i, j] = before[i, j] + covariance[h, i, j]
+        _inverse(both, inverse, root, between)
+        for i in range(6):
+            shifts[r, i] = at[i]
+            for f in range(fingers):
+                offs[r, f, i] = known_off[min(f, len(known_off) - 1), i]
+            for j in range(6):
+                total = 0.0
+                for k in range(6):
+                    total += before[i, k] * inverse[k, j]
+                gain[i, j] = total
+                shifts[r, i] += total * (shift[h, j] - at[j])
+                for f in range(fingers):
+                    offs[r, f, i] += total * (off[h, f, j] - known_off[min(f, len(known_off) - 1), j])
+        for i in range(6):
+            for j in range(6):
+                total = before[i, j]
+                for k in range(6):
+                    total -= gain[i, k] * before[k, j]
+                between[i, j] = total
+        for i in range(6):
+            for j in range(6):
+                covariances[r, i, j] = 0.5 * (between[i, j] + between[j, i])
+    return shifts, covariances, offs
+
+@compiled
 def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
     """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
 

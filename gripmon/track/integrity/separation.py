@@ -145,6 +145,31 @@ def telling(
     return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
 
 
+def jumped(
+    frame: Separation, at: Array, known: Array, jumps: Array, prior: Array, stays: NDArray[np.bool_], times: float
+) -> Array:
+    """Probabilities (h, c) that under each hypothesis the pose, known to have been ``at`` (6,) but for a covariance
+    ``known`` (6, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior`` (h, c), given the frame's fits;
+    ``stays`` (h,): whether it may as well have stayed.  ``times``: factor on the fits' covariances for their tails.
+    """
+    return kernel.jumped(frame.shift, frame.covariance, at, known, jumps, prior, stays, times)
+
+
+def after_jumps(
+    frame: Separation,
+    at: Array,
+    known: Array,
+    of_model: Array,
+    jumps: Array,
+    fit: NDArray[np.intp],
+    jump: NDArray[np.intp],
+) -> Separation:
+    """The fits ``fit`` (r,) of a frame joined with the pose known before, once it has made the jumps ``jump`` (r,);
+    ``of_model`` (f or 1, 6) as of the pose known before.
+    """
+    return Separation(*kernel.after_jumps(*frame, at, known, of_model, jumps, fit, jump))
+
+
 class Tails(NamedTuple):
     """How probably normal vectors are longer than something: ``sigma`` (...,) along the longest axis of each, and the
     power of ten ``factor`` (...,) by which the two others raise the tail of that one.
@@ -241,5 +266,7 @@ def warm_up() -> None:
         fits = Sums.of_kept(*of).fits()
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
+    jumped(fits, none, np.eye(6), each[:, :6, :6], np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0)
+    after_jumps(fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.arange(2), np.arange(2))
     told = telling(averages, none, none, fits, np.arange(2), 1.0)
     Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import multivariate_normal
 
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
@@ -68,6 +69,39 @@ def with_and_without(
     alone = separate(*sums, 6)
     together = separate(*with_pose(*sums, at, covariance, off), 6)
     return alone, together, squares(alone[0], at, alone[1], times, covariance)
+
+
+def jumped(
+    shift: Array, covariance: Array, at: Array, known: Array, jumps: Array, prior: Array, stays: Array, times: float
+) -> tuple[Array]:
+    every = np.concatenate([jumps, np.zeros((1, 6, 6))])
+    share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
+    density = [[multivariate_normal.pdf(z, at, times * R + known + J) for J in every] for z, R in zip(shift, covariance)]
+    weight = share * np.array(density)
+    return ((weight / weight.sum(axis=1, keepdims=True))[:, :-1],)
+
+
+def after_jumps(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    fit: Ints,
+    jump: Ints,
+) -> tuple[Array, Array, Array]:
+    before = known + jumps[jump]
+    inverse, information = np.linalg.inv(covariance[fit]), np.linalg.inv(before)
+    after = np.linalg.inv(inverse + information)
+    own, other = after @ inverse, after @ information
+    known_off = np.broadcast_to(known_off, off[fit].shape)
+    return (
+        np.einsum("rij,rj->ri", own, shift[fit]) + other @ at,
+        after,
+        np.einsum("rij,rfj->rfi", own, off[fit]) + np.einsum("rij,rfj->rfi", other, known_off),
+    )
 
 
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
