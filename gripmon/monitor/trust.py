@@ -6,7 +6,6 @@ learned look doesn't contradict: mounts are knocked rarely, objects hide fingers
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -69,7 +68,6 @@ class Integrity:
         self._learn_from: tuple[Image, Array, float, float] | None = None
         self._frames = 0
         self._elsewhere = 0
-        self._slid_until_s = -math.inf
         self._believed = False
         self._ends_seen = False
 
@@ -206,16 +204,12 @@ class Integrity:
         """
         weigher, (measurement, cam_T_grip, _, along, trust) = self._weigher, here
         if along.slide_m is not None:
-            self._slid_until_s = now_s + self._policy.hold_s
             slid_T = cam_T_grip.copy()
             slid_T[:3, 3] += cam_T_grip[:3, :3] @ along.slide_m
             again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
             if again is not None and again.along.slide_m is None:
                 return again
-        elif along.here and not trust.displaced:
-            self._slid_until_s = -math.inf  # something in front of the fingers looked like a slide
-            return here
-        elif not along.undecided and (trust.displaced or now_s >= self._slid_until_s):
+        elif not along.undecided:
             return here
         return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
 
@@ -257,7 +251,7 @@ class Integrity:
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
-        slid = there.along.slide_m is not None or there.along.undecided or now_s < self._slid_until_s
+        slid = there.along.slide_m is not None or there.along.undecided
         return there if there.along.here or not slid else None
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
@@ -287,8 +281,6 @@ class Integrity:
         unproven = self._weigher.anchor is not None and not settles
         if settles:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
-            if knocked:
-                self._slid_until_s = -math.inf
             if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
@@ -323,7 +315,7 @@ class Integrity:
         measurement, _, _, along, trust = candidate
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
-        slid = along.undecided or now_s < self._slid_until_s
+        slid = along.undecided
         seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
         at = measurement, cam_T_grip, covariance, trust.protection

@@ -118,6 +118,7 @@ class Weigher:
             self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
         self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
+        self._misread_ever = 1.0  # how probably what looked like the ends was something else in all proven frames
 
     @property
     def expected(self) -> tuple[Array, Array]:

@@ -46,6 +46,11 @@ NODE_PX = 16
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
+FEWEST_POINTS = 40
+"""Independent points of the fingers in view below which strips say nothing: two faces of each of two fingers that show
+50 px.  Fewer look alike elsewhere by chance, and an exposure that changes moves them as much as a slide would.
+"""
+
 ONE_EDGE_PX = 2
 """Edges of an image that are nearer to each other are one, and fitted ten times better: no mark on a finger is taken
 for its end then, and a slide up to this can't be seen.
@@ -161,7 +166,7 @@ class FingerStrips:
         # Gain and brightness are free: light changes.
         there = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m), -most, most) * layout.within
         alike_here = float((there * learnt).sum()) / math.sqrt(float(np.square(there).sum()) * own + 1e-12)
-        independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
+        independent = _independent(layout.within)
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
         farther = self._farther
@@ -236,11 +241,17 @@ class FingerStrips:
         # What the filters take in at the first point must be the finger, not what lies behind its end.
         start, length_m = start + FILTERED_PX * pitch_m * way, length_m - FILTERED_PX * pitch_m
         long_enough = length_m >= 4.0 * INDEPENDENT_PX * pitch_m  # four independent points
-        if not long_enough.any():
-            return
         within = (np.arange(LENGTH_PX) * pitch_m < length_m[long_enough, None]).astype(np.float32)
+        start, way, finger = start[long_enough], way[long_enough], finger[long_enough]
+        along_m = start[:, None] + np.arange(LENGTH_PX)[:, None] * pitch_m * way[:, None]
+        # Beyond the image there is nothing to see of a finger.
+        uv_px = self._camera.project((along_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]).reshape(-1, 3))
+        last_px = np.array([self._camera.width_px - 1.0, self._camera.height_px - 1.0])
+        within *= ((uv_px >= 0.0) & (uv_px <= last_px)).all(axis=1).reshape(within.shape)
+        if _independent(within) < FEWEST_POINTS:
+            return
         fingers_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
-        self._layout = _Layout(start[long_enough], pitch_m * way[long_enough], within, finger[long_enough], fingers_m)
+        self._layout = _Layout(start, pitch_m * way, within, finger, fingers_m)
         self._mean = np.zeros_like(within)
 
     def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
@@ -294,6 +305,11 @@ class FingerStrips:
             passed |= further
             begin += sorted(further)
         return out
+
+
+def _independent(within: NDArray[np.float32]) -> float:
+    """Number of independent points ``within`` (n, LENGTH_PX) the fingers; strips side by side show the same."""
+    return float(within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
 
 
 def _farther_on(alike: Array) -> Array:
