@@ -25,7 +25,6 @@ from gripmon.track.integrity import (
     Hypotheses,
     Knocks,
     Separation,
-    Sums,
     after_jumps,
     follow,
     jumped,
@@ -45,6 +44,11 @@ PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 YOUNG_VARIANCE_RATIO = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and averaging more than five frames
 would gain little, given the least variance that an average may claim.
+"""
+
+LEFT_WITH_BACKGROUND, ATTACHED_SHARE = 0.3, 1e-2
+"""Share of the things that were taken for an edge that still are before another background; and of those that always
+are, being attached to the gripper: a cable, a strip of tape.  Assumed, not measured.
 """
 
 CONFIRMING_FRAMES = 5
@@ -135,9 +139,7 @@ def protection_of(doubts: Doubts, risk: float, left_out: float = 0.0) -> Protect
 class Refits:
     """One measurement's fits under h hypotheses, alone and with what is ``known`` of the pose from before."""
 
-    def __init__(
-        self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError, known: Known
-    ):
+    def __init__(self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError, known: Known):
         """``floor`` (6, 6): covariance of the error that no averaging removes."""
         self.hypotheses, self.model, self._floor = hypotheses, model, floor
         normal = self._normal = measurement.normal
@@ -233,10 +235,19 @@ class Lasting(NamedTuple):
     prior: Array
     doubted: tuple[frozenset[int], ...]
 
+    def priors(self, misread: float, backgrounds: Array) -> Array:
+        """(g,) after so many ``backgrounds`` (e,) before which each edge stood in its place: what isn't the gripper's
+        mostly leaves with its background, unless it is attached.
+        ``misread``: of all ends, as the clearest frame has it.
+        """
+        prior = np.append(self.prior[:-1], misread)
+        seen = np.array([max((backgrounds[e] for e in doubted if e >= 0), default=0.0) for doubted in self.doubted])
+        return np.asarray(prior * np.maximum(LEFT_WITH_BACKGROUND**seen, ATTACHED_SHARE))
+
     @classmethod
     def of(cls, every: Hypotheses) -> Lasting:
-        """Those of the hypotheses about all edges that aren't sudden."""
-        rows = np.flatnonzero(~every.sudden)
+        """Those of the hypotheses about all edges that aren't sudden, and last that no end is what it seems."""
+        rows = np.append(np.flatnonzero(~every.sudden), every.ends)
         doubted = _doubted(every, np.arange(every.keep.shape[1]))
         return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
 
@@ -269,9 +280,13 @@ class Anchor:
         rows: NDArray[np.intp],
         now_s: float,
         origin: tuple[Array, Array],
+        misread: float,
         knocked: bool = False,
     ):
-        """``knocked``: the first pose differs from the one expected before."""
+        """``knocked``: the first pose differs from the one expected before; ``misread``: probability that what looked
+        like the fingers' ends there was something else.
+        """
+        self._misread = misread
         self._lasting, self._base_T, self._origin, self.now_s = lasting, base_T, origin, now_s
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
@@ -285,11 +300,12 @@ class Anchor:
         """Whether enough frames have proven the place since a knock; later ones need a weaker proof."""
         return self._to_confirm <= 0
 
-    def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float) -> None:
+    def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float, misread: float) -> None:
         """Add a proven pose, given by its frame's fits, ``rows`` (g,) of them; ``creep`` (6,): variances of the motion
-        since the last one.
+        since the last one; ``misread`` as at first.
         """
         self.now_s = now_s
+        self._misread = min(self._misread, misread)
         self._to_confirm -= 1
         frame = _chosen(fits, rows, self._base_T)
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
@@ -317,9 +333,11 @@ class Anchor:
         self.covariance: Array = self._claimed[0]
         self.of_model: Array = self._filters.of_model[0]
 
-    def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
+    def doubts(
+        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, backgrounds: Array
+    ) -> Doubts:
         """The lasting hypotheses about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of them; ``wander`` (6,):
-        variance of the motion since the anchor.
+        variance of the motion since the anchor; ``backgrounds`` (e,) before which each edge was seen.
 
         Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
         What neither shows is known as it was at the origin.
@@ -336,7 +354,7 @@ class Anchor:
             np.zeros_like(told.of_model),
         )
         told, _ = follow(told, before, wander / SIGMA_INFLATION**2)
-        return fits.model.doubts(self._lasting.name, self._lasting.prior, told, cam_T_grip)
+        return fits.model.doubts(self._lasting.name, self._lasting.priors(self._misread, backgrounds), told, cam_T_grip)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

@@ -20,7 +20,8 @@ class Trust:
     may explain that; ``grasped``: an object between the fingers may.  ``may_have_slid``: a lone finger may have moved
     along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
     hypothesis; None where all are excluded.  ``ends``: as they were seen.  ``fits``: those behind the bound, without
-    the ends where they aren't needed; None where no edge is seen.
+    the ends where they aren't needed; None where no edge is seen.  ``misread``: probability that what looks like the
+    fingers' ends is something else.
     """
 
     protection: Protection
@@ -32,6 +33,7 @@ class Trust:
     most_probable: tuple[Anchored, int] | None = None
     ends: FingerEndsSeen | None = None
     fits: Refits | None = None
+    misread: float = 1.0
 
     @property
     def instead(self) -> tuple[int, Array, Array] | None:

@@ -277,10 +277,12 @@ class Integrity:
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px, along.here)
         knocked = moved and beside_px >= ONE_EDGE_PX
-        settles = trust.proven and (moved or not trust.displaced)
+        # A place that the prior and the edges bound as the task needs it is proven without the ends.
+        sure = past_alert_limit(trust.protection, self._policy) is None
+        settles = (trust.proven and moved) or (not trust.displaced and (trust.proven or sure))
         unproven = self._weigher.anchor is not None and not settles
         if settles:
-            self._weigher.settle(trust, cam_T_grip, covariance, now_s)
+            self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
             if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s

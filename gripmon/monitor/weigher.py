@@ -34,7 +34,15 @@ from gripmon.monitor.refits import (
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges, sides
+from gripmon.track.edges import (
+    FingerEndsSeen,
+    Measurement,
+    edges_at_ends,
+    has_lone_end,
+    inner_edges,
+    own_steps,
+    sides,
+)
 from gripmon.track.integrity import Doubts, Hypotheses, Knocks, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
@@ -64,11 +72,39 @@ occlusion, since the average rate of knocks is too low for both (docs/integrity.
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
+ANOTHER_STEP_RATIO = 0.25
+"""Change of an edge's step, over that of all edges in common, from which it stands before another background: assumed,
+and far above the noise of an edge of forty profiles.
+"""
+
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
 
 CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers."""
+
+
+class Backgrounds:
+    """Before how many different backgrounds each edge of a gripper has stood in its place: ``seen`` (e,).
+
+    A background of another brightness changes the height of the edge's step; light changes those of all edges alike.
+    """
+
+    def __init__(self, edges: int):
+        self.seen: Array = np.zeros(edges)
+        self._step = np.full(edges, np.nan)
+
+    def add(self, edges: NDArray[np.intp], step: Array) -> None:
+        """Add a frame that shows ``edges`` (v,), each with its mean ``step`` (e,) in grey levels."""
+        before, now = self._step[edges], step[edges]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = now / before
+        known = np.isfinite(ratio)
+        if known.any():
+            ratio[known] /= np.median(ratio[known])
+        another = known & (np.abs(ratio - 1.0) > ANOTHER_STEP_RATIO)
+        self.seen[edges[another]] += 1.0
+        self._step[edges[another | ~known]] = now[another | ~known]
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
@@ -102,6 +138,7 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
+        self._backgrounds = Backgrounds(len(every))
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
@@ -118,7 +155,6 @@ class Weigher:
             self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
         self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
-        self._misread_ever = 1.0  # how probably what looked like the ends was something else in all proven frames
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -177,7 +213,7 @@ class Weigher:
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
         if anchor is not None and not displaced:
-            doubts = doubts + anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+            doubts = doubts + anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander, self._backgrounds.seen)
         protection = protection_of(doubts, risk, left_out)
         if anchor is None and displaced:
             away = perturbation_between(self._expected[0], cam_T_grip)
@@ -185,7 +221,9 @@ class Weigher:
         if self.unexplained is not None:
             protection = larger(protection, self._not_as_expected(self.unexplained))
         if anchor is None:
-            return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
+            return Trust(
+                protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread
+            )
         # The most probable hypothesis since the anchor.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
@@ -198,7 +236,9 @@ class Weigher:
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
             protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
-        return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
+        return Trust(
+            protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of, misread
+        )
 
     def _doubts_of_knocks(
         self,
@@ -232,15 +272,16 @@ class Weigher:
             without = Refits(measurement, endless_too, self._tracker.floor, self._model, fits.known)
             both = prior[hypotheses.ends] * hypotheses.prior * more
             stays = without.anchored.square <= CONTRADICTION_SQUARE
-            of_both, more_out = without.knocked(
-                cam_T_grip, both, knocks, np.full(len(both), unseen), stays, least
-            )
+            of_both, more_out = without.knocked(cam_T_grip, both, knocks, np.full(len(both), unseen), stays, least)
             doubts, left_out = doubts + of_both, left_out + more_out
         return doubts, left_out, without
 
-    def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
+    def settle(
+        self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
+    ) -> None:
         """Add a proven pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it."""
         assert trust.fits is not None
+        self._backgrounds.add(trust.fits.edges, own_steps(measurement))
         rows = self._about(trust.fits.edges)[1]
         self._slid = trust.may_have_slid
         if self.anchor is not None:
@@ -255,10 +296,12 @@ class Weigher:
             if trust.displaced:
                 covariance = covariance + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
             origin = expected_T, covariance
-            self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, origin, trust.displaced)
+            self.anchor = Anchor(
+                self._lasting, cam_T_grip, trust.fits, rows, now_s, origin, trust.misread, trust.displaced
+            )
         else:
             self._in_place = True
-            self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
+            self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s, trust.misread)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
         """Whether a lone finger may have slid along itself though corners are seen: they may belong to a mark on it or

@@ -306,6 +306,7 @@ def after_jumps(
                 covariances[r, i, j] = 0.5 * (between[i, j] + between[j, i])
     return shifts, covariances, offs
 
+
 @compiled
 def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
     """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.

@@ -42,9 +42,7 @@ class Knocks(NamedTuple):
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; none: all knocks go anywhere."""
         length = float(np.linalg.norm(axis_cam))
-        anywhere = [
-            np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M
-        ]
+        anywhere = [np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M]
         if length == 0.0:
             return cls(np.array(ANY_SHARE), np.stack(anywhere), np.zeros(len(ANY_SHARE), dtype=bool))
         way = axis_cam / length

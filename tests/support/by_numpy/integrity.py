@@ -76,7 +76,9 @@ def jumped(
 ) -> tuple[Array]:
     every = np.concatenate([jumps, np.zeros((1, 6, 6))])
     share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
-    density = [[multivariate_normal.pdf(z, at, times * R + known + J) for J in every] for z, R in zip(shift, covariance)]
+    density = [
+        [multivariate_normal.pdf(z, at, times * R + known + J) for J in every] for z, R in zip(shift, covariance)
+    ]
     weight = share * np.array(density)
     return ((weight / weight.sum(axis=1, keepdims=True))[:, :-1],)
 
