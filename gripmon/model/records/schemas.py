@@ -6,11 +6,11 @@ and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reade
 
 from __future__ import annotations
 
-import functools
 from typing import TypeVar
 
 import msgspec
 
+from gripmon.model.decoding import decoder_of
 from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
 from gripmon.model.records.frames import FrameRecord
 from gripmon.model.records.laser import LaserPulse, SpotRecord
@@ -54,6 +54,11 @@ class _Tag(msgspec.Struct, frozen=True):
     schema: str = ""
 
 
+decoder_of(_Tag)
+for _message in MESSAGES.values():
+    decoder_of(_message)  # before threads of Zenoh's decode their first messages, however they do it
+
+
 def from_json(payload: bytes, message: type[_T]) -> _T:
     """Decode a payload from the network as the type that is expected there.
 
@@ -63,7 +68,7 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     if len(payload) > largest_bytes(message):
         raise MessageRefused(f"{len(payload)} bytes; at most {largest_bytes(message)}")
     try:
-        return _decoder(message).decode(payload)
+        return decoder_of(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
@@ -78,14 +83,9 @@ def schema_name(message: type[msgspec.Struct]) -> str:
     return str(message.__struct_config__.tag)
 
 
-@functools.cache
-def _decoder(message: type[_T]) -> msgspec.json.Decoder[_T]:
-    return msgspec.json.Decoder(message)
-
-
 def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Exception) -> str:
     try:
-        schema = msgspec.json.decode(payload, type=_Tag).schema
+        schema = decoder_of(_Tag).decode(payload).schema
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         schema = ""
     if schema and schema != (known := schema_name(message)):
