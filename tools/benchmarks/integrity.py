@@ -22,7 +22,8 @@ Runs the monitor over random scenes of every condition (free view, clutter, ligh
 run like the fingers', jumps, wrong models ...) and over the rendered sequences beside the checkout, if they are there.
 Counts misleading frames (valid and the error exceeds the alert limit, or the frame's own protection level), and how
 often the transform is valid where the gripper shows enough. The worst frames are named so that exactly their scenes
-can be run again: --only NAME --seed S --scene N prints each frame of one scene.  The alert limits are data, fixed beforehand.
+can be run again: --only NAME --seed S --scene N prints each frame of one scene.  The alert limits are data,
+fixed beforehand.
 A page to compare two revisions: each run with --resume FILE and the same --seed, the second with --against FIRST.
 Daily: some scenes of each condition; to judge: --scenes 27 --resume FILE, which may be interrupted."""
 SCENES, FRAMES, QUICK_SCENES = 4, 96, 1
@@ -32,7 +33,7 @@ _CODE = (
     "gripmon/**/*.py",
     "configs/grippers/*.yaml",
     "tools/benchmarks/data/integrity_limits.json",
-    *(f"tools/benchmarks/integrity_{part}.py" for part in ("conditions", "draft", "limits", "misleading", "new")),
+    *(f"tools/benchmarks/integrity_{part}.py" for part in ("conditions", "draft", "limits", "misleading", "practice")),
     *(f"tools/benchmarks/{name}.py" for name in ("integrity_runs", "integrity_scenes", "outline_seen", "rendered")),
     *(f"tools/benchmarks/{name}.py" for name in ("padded", "rounded", "scenes")),
 )

@@ -11,11 +11,11 @@ from benchmarks.integrity_stats import collect, figures
 from benchmarks.integrity_table import aligned, number, percent
 
 _HEAD = ("frames", "> AL", "> PL", "err/PL", "asked %", "valid %", "PL mm", "first", "knock")
-LEGEND = (
-    "> AL, > PL: valid frames beyond the alert limit, beyond their bound; err/PL: the largest of valid frames; asked %: "
-    "valid of those that show enough; valid %: of all; PL mm: median of valid frames; first: median of frames until the "
-    "first valid; knock: medians of frames until it is said, until it is found, and from then until valid (x: never)"
-)
+LEGEND = """\
+> AL, > PL: valid frames beyond the alert limit, beyond their bound; err/PL: the largest of valid frames
+asked %: valid of those that show enough; valid %: of all; PL mm: median of valid frames
+first: median of frames until the first valid; knock: medians of frames until it is said, until it is found, and from
+then until valid (x: never)"""
 _GREY_DN = 0.05
 """By how much the mean grey of the first image may differ where two runs saw the same scene."""
 
@@ -33,13 +33,13 @@ def as_text(lines: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
     ]
     here, there = collect(ours).valid, collect(theirs).valid
     left_out = len(lines) - len(ours)
+    counts = [int(which.sum()) for which in (here & there, there & ~here, here & ~there, ~here & ~there)]
     parts = [
         "",
         f"{_named(theirs)} → {_named(ours)}, seed {ours[0]['seed']}, {len(ours)} scenes of both",
         aligned([["condition", *_HEAD], *rows]),
         LEGEND,
-        f"valid in both {int((here & there).sum())}, only before {int((there & ~here).sum())}, "
-        f"only after {int((here & ~there).sum())}, in neither {int((~here & ~there).sum())}",
+        "valid in both {}, only before {}, only after {}, in neither {}".format(*counts),
     ]
     strange = [one for one, other in zip(ours, theirs, strict=True) if not _same_scene(one, other)]
     if strange:

@@ -10,15 +10,16 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from scipy import stats
 
 from benchmarks import rendered
+from benchmarks.integrity_draft import Fingers
 from benchmarks.integrity_limits import AlertLimits, frozen_limits
-from benchmarks.integrity_misleading import CONDITIONS
+from benchmarks.integrity_practice import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.outline_seen import outline_seen
@@ -87,6 +88,7 @@ class Watched:
     inside: bool
     looks: Iterable[Look]
     limits: AlertLimits
+    response: Literal["linear", "srgb"] = "linear"
     knock: tuple[int, float] | None = None
     """The first frame after the mount's jump, and its size at the TCP (m)."""
 
@@ -254,6 +256,8 @@ def _settings(watched: Watched) -> MonitorSettings:
     settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps))
     if watched.jaw_sigma_m is not None:
         settings = msgspec.structs.replace(settings, jaw_sigma_m=watched.jaw_sigma_m)
+    edges = msgspec.structs.replace(settings.corners.edges, response=watched.response)
+    settings = msgspec.structs.replace(settings, corners=msgspec.structs.replace(settings.corners, edges=edges))
     limits = watched.limits
     policy = msgspec.structs.replace(
         settings.policy, alert_limit_m=limits.position_m, alert_limit_rad=limits.rotation_rad
@@ -295,6 +299,11 @@ def _simulated(scene: IntegrityScene) -> Watched:
     )
 
 
+def _limits_of(scene: IntegrityScene) -> str:
+    """Whose alert limits: of a gripper, or of what the border leaves of any."""
+    return Fingers.SHORT.value if scene.condition.fingers is Fingers.SHORT else scene.gripper.name
+
+
 def _px_per_mm(camera: Camera, cam_T_grip: Array) -> float:
     return 1e-3 * camera.fx_px / float(cam_T_grip[2, 3])
 
@@ -324,7 +333,11 @@ def _view(scene: IntegrityScene, index: int) -> View:
     seen = outline_seen(scene.simulator, index)
     if (seen.tips > _WHOLE).all() and (seen.edges > _WHOLE).all():
         return View.FREE
-    return _by_tips(int((seen.tips >= TIP_SEEN).sum()))
+    # A pad is a body of its own, named after its finger.
+    tips: dict[str, list[float]] = {}
+    for name, share in zip(scene.simulator.gripper.finger_ids, seen.tips.tolist(), strict=True):
+        tips.setdefault(name.removesuffix(" pad"), []).append(share)
+    return _by_tips(sum(np.mean(shares) >= TIP_SEEN for shares in tips.values()))
 
 
 def _by_tips(tips: int) -> View:

@@ -48,7 +48,7 @@ class Frames:
     error_m: NDArray[np.float64]
     level_m: NDArray[np.float64]
     within: NDArray[np.bool_]
-    """(n, len(POSITIONS_M)): the frame would be valid with this alert limit of the position, as far as its bound says."""
+    """(n, len(POSITIONS_M)): the frame would be valid with this alert limit of the position, by its bound."""
     both_m: NDArray[np.float64]
     """(n, 2): position's bound since the reference, and the absolute one."""
     possible: NDArray[np.bool_]
