@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.integrity_stats import collect, figures
-from benchmarks.integrity_table import aligned, number, percent
+from benchmarks.integrity_table import aligned, knock, number, percent
 
 _HEAD = ("frames", "> AL", "> PL", "err/PL", "asked %", "valid %", "PL mm", "first", "knock")
 LEGEND = """\
@@ -94,11 +94,5 @@ def _row(name: str, lines: list[dict[str, Any]]) -> list[str]:
         percent(row["valid_share"]),
         "–" if level_m is None else f"{1e3 * level_m:.3g}",
         "never" if np.isinf(row["first_valid"]) else f"{row['first_valid']:g}",
-        _knock(row),
+        knock(row),
     ]
-
-
-def _knock(row: dict[str, Any]) -> str:
-    if not row["knocks"]:
-        return "–"
-    return "/".join("x" if math.isinf(v) else f"{v:g}" for v in (row[f"knock_{k}"] for k in ("said", "found", "valid")))
