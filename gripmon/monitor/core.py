@@ -226,7 +226,8 @@ class Monitor:
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The measured pose is believed: update the averages and what is learnt."""
-        self._tracker.learn(standing.measurement, opening=not standing.grasped)
+        proven = standing.where_it_was and not standing.unproven
+        self._tracker.learn(standing.measurement, opening=not standing.grasped, proven=proven)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()
