@@ -359,7 +359,6 @@ def refresh(
     times: Array,
     rare: Ints,
     reference: Array,
-    lasting: Array,
     known: Bools,
     plain: Array,
     mean_covariance: Array,
@@ -374,8 +373,7 @@ def refresh(
     often as to be always there what is missing of ``reported`` (s, 6, 6) comes on top, direction by direction.
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
-    (k,): length from which on noise is rare; ``lasting`` (k, 6, 6): what differences have on top.  The rest is
-    overwritten.  LinAlgError if rounding leaves no root.
+    (k,): length from which on noise is rare.  The rest is overwritten.  LinAlgError if rounding leaves no root.
     """
     lengths, streams = learnt.shape
     total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
@@ -398,7 +396,7 @@ def refresh(
             way = 2 if known[0, k, s] else 0
             _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s])
             way = 2 if known[1, k, s] else 0
-            missing[:] = 2.0 * missing + lasting[k]
+            missing[:] = 2.0 * missing
             _whiten(times[way, k, s] * of_difference[k, s] + missing, root, whitening[1, k, s])
             _whiten(of_difference[k, s], root, learnt_whitening[k, s])
             if k < plain.shape[1]:
