@@ -163,7 +163,6 @@ class Monitor:
         isn't used afterwards.
         """
         self.learn()
-        self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         opening: object = frame.jaw_opening_m
@@ -294,7 +293,6 @@ class Monitor:
         configured = book.in_force == book.configured
         self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
         self._analysis.rebase(self.reference, configured)
-        self._trust.refer(self.reference)
         self._trust.rebase(book.in_force)
 
     def _unmeasured(

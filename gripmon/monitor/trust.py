@@ -17,8 +17,7 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
-from gripmon.monitor.finer import FinerLook
+from gripmon.model.records import Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.refits import reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Question, Standing, Trust
@@ -60,10 +59,6 @@ class Integrity:
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
-        self._finer = None
-        if settings.look.enabled:
-            self._finer = FinerLook(camera, gripper, self._look, tracker.floor, reference, tracker.taught_digest)
-        self._finer_swing: Array | None = None
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
@@ -78,8 +73,7 @@ class Integrity:
         record = self._look.state(reference.reference_id)
         if record is None:
             return None
-        strips, finer = self._strips.state(), None if self._finer is None else self._finer.state()
-        return msgspec.structs.replace(record, strips=strips or msgspec.UNSET, finer=finer or msgspec.UNSET)
+        return msgspec.structs.replace(record, strips=self._strips.state() or msgspec.UNSET)
 
     @property
     def unexplained(self) -> Array | None:
@@ -95,13 +89,8 @@ class Integrity:
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the vibration between proven poses, m² and rad²; of refined poses if the newest is one."""
-        return self._weigher.swing if self._finer_swing is None else self._finer_swing
-
-    def refer(self, reference: ReferenceRecord) -> None:
-        """Pass the reference in force to the look."""
-        if self._finer is not None:
-            self._finer.refer(reference)
+        """(6,) variance of the vibration between proven poses, m² and rad²."""
+        return self._weigher.swing
 
     def rebase(self, reference: ReferenceRecord) -> None:
         """Expect the gripper at a new reference."""
@@ -120,8 +109,6 @@ class Integrity:
                 self._look.restore(state.look, reference.reference_id)
                 if state.look.strips is not msgspec.UNSET:
                     self._strips.restore(state.look.strips)
-                if self._finer is not None and state.look.finer is not msgspec.UNSET:
-                    self._finer.restore(state.look.finer)
             except LookRefused as refused:
                 self.look_refused = str(refused)
 
@@ -131,12 +118,6 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
-        if self._finer is not None:
-            self._finer.learn()
-
-    def take_alerts(self) -> list[Alert]:
-        """Alerts about the gripper's look since the last call."""
-        return [] if self._finer is None else self._finer.take_alerts()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
@@ -163,17 +144,7 @@ class Integrity:
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
-        if self._finer is not None and standing is not None:
-            standing = self._refined(self._finer, frame, standing, now_s)
         return standing
-
-    def _refined(self, look: FinerLook, frame: Frame, standing: Standing, now_s: float) -> Standing:
-        """The pose refined by the look, unless that puts a protection level past its alert limit."""
-        finer = look.refine(frame, standing, now_s, self._weigher.swing)
-        if past_alert_limit(finer.protection, self._policy) and not past_alert_limit(standing.protection, self._policy):
-            finer = standing
-        self._finer_swing = None if finer.finer is None else look.swing
-        return finer
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
         weigh = self._weigher.weigh
