@@ -29,6 +29,7 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.answers import gripper_astray
 from gripmon.monitor.refits import reaching
+from gripmon.monitor.since import Bounds
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.weigher import swinging
 from gripmon.track.edges import agreeing_fingers
@@ -154,8 +155,8 @@ class FinerLook:
             self.swing = swinging(self.swing, way, 2.0 * refined.of_change.diagonal())
         self._last_T = pose
         away = perturbation_between(standing.cam_T_grip, pose)
-        wider = reaching(standing.protection, away, standing.protection.hypothesis)
-        return replace(standing, cam_T_grip=pose, protection=wider, finer=refined)
+        wider = Bounds(*(reaching(each, away, each.hypothesis) for each in standing.bounds))
+        return replace(standing, cam_T_grip=pose, bounds=wider, finer=refined)
 
     def learn(self) -> None:
         """Learn from the newest frame if its background is a new one."""
