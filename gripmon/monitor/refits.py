@@ -8,7 +8,7 @@ in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
+from gripmon.model.geometry import log_rotation
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
+from gripmon.monitor.since import AtReference, Bounds, Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.track.integrity import (
     Doubts,
@@ -107,10 +109,35 @@ class CommonError(NamedTuple):
         lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
         return replace(doubts, away=doubts.away + lengths[:, None])
 
+    def of_motion(self, motion: Array, at_T: Array) -> Array:
+        """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T
+        (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
+        """
+        rows = np.vstack([self.taught, self.offset])
+        share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
+        moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
+        return np.diag(share * np.repeat([moved, turned], 3))
+
+
+@dataclass(frozen=True, slots=True)
+class TwoDoubts:
+    """What may be wrong with a measured pose, and with the motion since the reference that it shows."""
+
+    absolute: Doubts
+    since: Doubts
+
+    def among(self, chosen: NDArray[np.bool_]) -> TwoDoubts:
+        """Those that are ``chosen`` (h,)."""
+        return TwoDoubts(self.absolute.among(chosen), self.since.among(chosen))
+
+    def __add__(self, other: TwoDoubts) -> TwoDoubts:
+        return TwoDoubts(self.absolute + other.absolute, self.since + other.since)
+
 
 class ModelError(NamedTuple):
     """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
     (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to; ``common``: None where there is no such error.
+    ``first``: what was measured at the reference, None until a frame proves a pose, and the reference (4, 4).
     """
 
     sigma_m: float
@@ -118,12 +145,53 @@ class ModelError(NamedTuple):
     finger: NDArray[np.intp]
     fingers: int
     common: CommonError | None
+    first: tuple[AtReference | None, Array] = (None, np.eye(4))
 
-    def doubts(self, name: tuple[str, ...], prior: Array, fits: Separation, cam_T_grip: Array) -> Doubts:
+    def doubts(
+        self,
+        name: tuple[str, ...],
+        prior: Array,
+        fits: Separation,
+        cam_T_grip: Array,
+        opened: Opened,
+    ) -> TwoDoubts:
         """The doubts about a pose (4, 4) under the hypotheses of these fits, with what is common to all of them."""
-        if self.common is None:
-            return Doubts.of(name, prior, fits, SIGMA_INFLATION)
-        return self.common.reaching(Doubts.of(name, prior, self.common.on(fits, cam_T_grip), SIGMA_INFLATION))
+        common = self.common
+        if common is None:
+            absolute = Doubts.of(name, prior, fits, SIGMA_INFLATION)
+        else:
+            absolute = common.reaching(Doubts.of(name, prior, common.on(fits, cam_T_grip), SIGMA_INFLATION))
+        none = np.zeros(len(prior), dtype=np.intp)
+        return TwoDoubts(absolute, self.since(name, prior, fits, cam_T_grip, opened, none))
+
+    def since(
+        self,
+        name: tuple[str, ...],
+        prior: Array,
+        fits: Separation,
+        cam_T_grip: Array,
+        opened: Opened,
+        lasting: NDArray[np.intp],
+        staying: Array | None = None,
+    ) -> Doubts:
+        """The doubts about the motion since the reference.  ``lasting`` (h,): which of the lasting hypotheses each is,
+        that held in the reference's frames, too; 0 for none.  ``staying`` (6, 6): covariance of the motion that a mount
+        makes, where the fits don't contain that.
+        """
+        first, reference_T = self.first
+        if first is None:
+            # This frame is the first one: as uncertain again.
+            motion = fits._replace(covariance=2.0 * fits.covariance, of_model=np.zeros_like(fits.of_model))
+        else:
+            motion = first.of_motion(fits, cam_T_grip, reference_T, lasting, opened, self.common)
+            if staying is not None:
+                motion = first.staying(motion, cam_T_grip, reference_T, staying)
+        return Doubts.of(name, prior, motion, SIGMA_INFLATION)
+
+
+def bounds_of(doubts: TwoDoubts, risk: float, left_out: float = 0.0) -> Bounds:
+    """The protection levels of both at an integrity ``risk``, of which ``left_out`` is as for :func:`protection_of`."""
+    return Bounds(protection_of(doubts.absolute, risk, left_out), protection_of(doubts.since, risk, left_out))
 
 
 def protection_of(doubts: Doubts, risk: float, left_out: float = 0.0) -> Protection:
@@ -164,6 +232,9 @@ class Refits:
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
         """(h, f, 6) their errors if a finger is longer by its standard deviation."""
+        jaw = measurement.covariance
+        rate = jaw[:6, 6] / jaw[6, 6] if m == 7 and jaw[6, 6] > 0.0 else np.zeros(6)
+        self.opened = Opened(measurement.jaw_opening_m, rate)
 
     @property
     def edges(self) -> NDArray[np.intp]:
@@ -174,18 +245,45 @@ class Refits:
         """(h, 6) perturbations from a pose (4, 4) near by to the fits by the frame alone."""
         return perturbation_between(base_T, self._fit_T) + self._free.shift
 
-    def doubts(self, cam_T_grip: Array, prior: Array, anchored: Anchored | None = None) -> Doubts:
+    def doubts(
+        self,
+        cam_T_grip: Array,
+        prior: Array,
+        anchored: Anchored | None = None,
+    ) -> TwoDoubts:
         """What may be wrong with a published pose (4, 4) under hypotheses of probability ``prior`` (h,), by the frame
         alone or by the anchor too.
         """
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
-        return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip)
+        return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip, self.opened)
+
+    def with_first(
+        self,
+        doubts: TwoDoubts,
+        lasting: Lasting,
+        prior: Array,
+        cam_T_grip: Array,
+        anchored: Anchored | None,
+        staying: Array,
+    ) -> TwoDoubts:
+        """The doubts with those about the motion since the reference that a lasting hypothesis held in the reference's
+        frames, each of the ``prior`` (g,), and no longer does.  ``anchored``: None where the pose (4, 4) rests on the frame alone;
+        ``staying`` as for :meth:`ModelError.since`.
+        """
+        first, reference_T = self.model.first
+        if first is None:
+            return doubts
+        fits = self._free if anchored is None else anchored.fits
+        now = Separation(fits.shift[:1], fits.covariance[:1] + self._floor, fits.of_model[:1])
+        wrong = first.staying(first.wrong_at_first(now, cam_T_grip, reference_T), cam_T_grip, reference_T, staying)
+        name = tuple(f"{each}, in the frames of the reference" for each in lasting.name[1:])
+        return replace(doubts, since=doubts.since + Doubts.of(name, prior[1:], wrong, SIGMA_INFLATION))
 
     def knocked(
         self, cam_T_grip: Array, prior: Array, knocks: Knocks, probable: Array, stays: NDArray[np.bool_], least: float
-    ) -> tuple[Doubts, float]:
+    ) -> tuple[TwoDoubts, float]:
         """What may be wrong with a published pose (4, 4) if the mount was knocked since the pose that is known.
 
         ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether the fit
@@ -202,7 +300,7 @@ class Refits:
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         name = tuple(self.hypotheses.name[k] for k in fit.tolist())
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
-        return self.model.doubts(name, weight[counts], fits, cam_T_grip), float(weight[~counts].sum())
+        return self.model.doubts(name, weight[counts], fits, cam_T_grip, self.opened), float(weight[~counts].sum())
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
@@ -286,8 +384,9 @@ class Anchor:
         """``knocked``: the first pose differs from the one expected before; ``misread``: probability that what looked
         like the fingers' ends there was something else.
         """
-        self._misread = misread
-        self._lasting, self._base_T, self._origin, self.now_s = lasting, base_T, origin, now_s
+        self.misread = misread
+        self._lasting, self._base_T, self._origin = lasting, base_T, origin
+        self.began_s, self.now_s, self.frames, self.knocked = now_s, now_s, 1, knocked
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
@@ -305,7 +404,8 @@ class Anchor:
         since the last one; ``misread`` as at first.
         """
         self.now_s = now_s
-        self._misread = min(self._misread, misread)
+        self.misread = min(self.misread, misread)
+        self.frames += 1
         self._to_confirm -= 1
         frame = _chosen(fits, rows, self._base_T)
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
@@ -333,9 +433,20 @@ class Anchor:
         self.covariance: Array = self._claimed[0]
         self.of_model: Array = self._filters.of_model[0]
 
+    def fits(self) -> Separation:
+        """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
+        shift = self._filters.shift - perturbation_between(self._base_T, self.cam_T_grip)
+        return Separation(shift, self._claimed, self._filters.of_model)
+
     def doubts(
-        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, backgrounds: Array
-    ) -> Doubts:
+        self,
+        cam_T_grip: Array,
+        fits: Refits,
+        rows: NDArray[np.intp],
+        wander: Array,
+        backgrounds: Array,
+        staying: Array,
+    ) -> TwoDoubts:
         """The lasting hypotheses about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of them; ``wander`` (6,):
         variance of the motion since the anchor; ``backgrounds`` (e,) before which each edge was seen.
 
@@ -347,14 +458,17 @@ class Anchor:
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
         origin_T, covariance = self._origin
-        count = len(told.shift)
+        count, every = len(told.shift), np.arange(len(self._lasting.name))
         before = Separation(
             np.tile(perturbation_between(cam_T_grip, origin_T), (count, 1)),
             np.tile(covariance, (count, 1, 1)),
             np.zeros_like(told.of_model),
         )
-        told, _ = follow(told, before, wander / SIGMA_INFLATION**2)
-        return fits.model.doubts(self._lasting.name, self._lasting.priors(self._misread, backgrounds), told, cam_T_grip)
+        absolute, _ = follow(told, before, wander / SIGMA_INFLATION**2)
+        prior = self._lasting.priors(self.misread, backgrounds)
+        doubts = fits.model.doubts(self._lasting.name, prior, absolute, cam_T_grip, fits.opened)
+        since = fits.model.since(self._lasting.name, prior, told, cam_T_grip, fits.opened, every, staying)
+        return replace(doubts, since=since)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

@@ -16,7 +16,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import NOTHING_WRONG, Array, Protection, ReferenceRecord
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -27,11 +27,13 @@ from gripmon.monitor.refits import (
     Lasting,
     ModelError,
     Refits,
+    TwoDoubts,
+    bounds_of,
     larger,
-    protection_of,
     reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import (
@@ -43,7 +45,7 @@ from gripmon.track.edges import (
     own_steps,
     sides,
 )
-from gripmon.track.integrity import Doubts, Hypotheses, Knocks, bounds, hypotheses_of
+from gripmon.track.integrity import Hypotheses, Knocks, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
 
@@ -119,7 +121,15 @@ def swinging(swing: Array, way: Array, noise: Array) -> Array:
 class Weigher:
     """Protection levels of one monitor's measurements, and the anchor that they rest on."""
 
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+    def __init__(
+        self,
+        tracker: Tracker,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+        since: AtReferences,
+    ):
+        """``since``: what was measured at the reference in force."""
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._along = tracker.along  # (e,) which edges run along the fingers
         self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
@@ -127,7 +137,7 @@ class Weigher:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / (30.0 * 86_400.0)
-        self._model = _model_error(tracker, gripper)
+        self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
@@ -155,6 +165,10 @@ class Weigher:
             self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
         self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
+
+    def restore(self, records: tuple[AtReferenceRecord, ...]) -> str | None:
+        """See :meth:`AtReferences.restore`."""
+        return self._since.restore(records, len(self._lasting.name), self._model.fingers)
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -185,7 +199,8 @@ class Weigher:
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
-            return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG), False)
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG)
+            return Trust(Bounds(unbounded, unbounded), False)
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses, anchor = fits.hypotheses, self.anchor
@@ -212,18 +227,21 @@ class Weigher:
         made_of = fits
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
+        staying = self._staying(now_s, knocks, displaced)
         if anchor is not None and not displaced:
-            doubts = doubts + anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander, self._backgrounds.seen)
-        protection = protection_of(doubts, risk, left_out)
+            rows = self._about(edges)[1]
+            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, wander, self._backgrounds.seen, staying)
+        ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
+        at_first = self._lasting.priors(ever, self._backgrounds.seen)
+        alone = None if displaced else anchored
+        doubts = fits.with_first(doubts, self._lasting, at_first, cam_T_grip, alone, staying)
+        both = bounds_of(doubts, risk, left_out)
         if anchor is None and displaced:
             away = perturbation_between(self._expected[0], cam_T_grip)
-            protection = larger(protection, self._not_as_expected(away))
-        if self.unexplained is not None:
-            protection = larger(protection, self._not_as_expected(self.unexplained))
+            both = both._replace(absolute=larger(both.absolute, self._not_as_expected(away)))
+        both = self._with_question(both)
         if anchor is None:
-            return Trust(
-                protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread
-            )
+            return Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         # The most probable hypothesis since the anchor.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
@@ -235,10 +253,24 @@ class Weigher:
             # A knock doesn't move the jaw: flexing fingers and shadows beside them look like both at once.
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
-            protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
-        return Trust(
-            protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of, misread
-        )
+            away = perturbation_between(self.expected[0], cam_T_grip)
+            both = Bounds(*(reaching(each, away, why) for each in both))
+        return Trust(both, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of, misread)
+
+    def _with_question(self, both: Bounds) -> Bounds:
+        """The bounds while it is open why the first frames differed from the reference: that is no motion since them."""
+        if self.unexplained is None:
+            return both
+        return both._replace(absolute=larger(both.absolute, self._not_as_expected(self.unexplained)))
+
+    def _staying(self, now_s: float, knocks: Knocks, displaced: bool) -> Array:
+        """(6, 6) covariance of the motion since the first proven frames that isn't excluded: of a mount that creeps and
+        vibrates, and after a knock by what a knock moves it.
+        """
+        elapsed_s = 0.0 if self.anchor is None else max(now_s - self.anchor.began_s, 0.0)
+        covariance = np.diag(self._creep * elapsed_s + self.swing) + self._tracker.floor
+        knocked = displaced or (self.anchor is not None and self.anchor.knocked)
+        return covariance + knocks.spread if knocked else covariance
 
     def _doubts_of_knocks(
         self,
@@ -251,7 +283,7 @@ class Weigher:
         cam_T_grip: Array,
         now_s: float,
         displaced: bool,
-    ) -> tuple[Doubts, float, Refits | None]:
+    ) -> tuple[TwoDoubts, float, Refits | None]:
         """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
 
         ``prior`` (h,) of the hypotheses, ``holds`` (h,) those under which it may have stayed; ``unseen``: probability
@@ -269,7 +301,7 @@ class Weigher:
         without = None
         if across.any() and (displaced or besides * WRONG_EDGE > least):
             endless_too, more = hypotheses.without_ends()
-            without = Refits(measurement, endless_too, self._tracker.floor, self._model, fits.known)
+            without = Refits(measurement, endless_too, self._tracker.floor, fits.model, fits.known)
             both = prior[hypotheses.ends] * hypotheses.prior * more
             stays = without.anchored.square <= CONTRADICTION_SQUARE
             of_both, more_out = without.knocked(cam_T_grip, both, knocks, np.full(len(both), unseen), stays, least)
@@ -318,17 +350,18 @@ class Weigher:
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
         return bool(self._slid) or (displaced and measurement.prediction.moved_px(way) >= ONE_EDGE_PX)
 
-    def held(self, protection: Protection, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The protection level of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
+    def held(self, both: Bounds, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
+        """The protection levels of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
         ``growth``.  ``hidden``: the image is good, but the gripper isn't seen in it.
         """
-        risk = protection.risk
+        risk = self._policy.integrity_risk
         if max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0) > risk:
             why = "the mount was knocked while nothing is seen of the gripper"
-            return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
+            return Bounds(unbounded, unbounded)
         position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
-        return Protection(
-            protection.position_m + position_m, protection.rotation_rad + rotation_rad, risk, protection.hypothesis
+        return Bounds(
+            *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
 
     def _knocked(self, now_s: float, hidden: bool) -> float:
@@ -381,8 +414,8 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
-        return past_alert_limit(bound, self._policy) is None
+        both = bounds_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
+        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
@@ -408,7 +441,8 @@ class Weigher:
             covariance = covariance.copy()
             covariance.flat[::7] += wander
             known = Known(expected_T, covariance, of_model)
-            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, self._model, known)
+            model = self._model._replace(first=self._since.published_by)
+            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, model, known)
             self._newest = measurement, now_s, fits
         fits = self._newest[2]
         assert fits.anchored is not None
@@ -457,12 +491,13 @@ def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
     return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids), common)
 
 
-def foresee_protection(
-    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
-) -> Protection:
-    """The protection level of a single frame with the given measurement and proven fingers' ends."""
+def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement) -> Bounds:
+    """The protection levels of a single frame with the given measurement and proven fingers' ends, where the frames of
+    the reference show no more.
+    """
     if not len(measurement.normal.edge):
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
+        unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
+        return Bounds(unbounded, unbounded)
     hypotheses = _hypotheses_about(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
@@ -470,4 +505,4 @@ def foresee_protection(
     nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
     doubts = fits.doubts(measurement.cam_T_grip, hypotheses.prior)
-    return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
+    return bounds_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)

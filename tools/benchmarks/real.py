@@ -32,7 +32,7 @@ LEAST_VALID = {"xarm": 12, "piper": 9}
 PLAY_M = 0.9e-3
 """Largest play of these fingers: how far a still may really be from where it was."""
 PROPOSED = (0.8, 1.5)
-"""``check``'s proposal over the smallest limit within which nine of ten stills are."""
+"""``check``'s proposal over the smallest limit within which the bounds of nine of ten stills are (no unit)."""
 
 
 def add_parser(commands: Any) -> None:
@@ -51,7 +51,7 @@ def add_parser(commands: Any) -> None:
         nargs="*",
         type=Path,
         metavar="FOLDER",
-        help=f"with stills and a config.yaml (default: all in {FOLDER})",
+        help="with stills and a config.yaml (default: all of ../shared/data/real)",
     )
     parser.add_argument("--against", metavar="REV", help="also replay with gripmon of this commit, beside it")
     parser.add_argument(
@@ -160,11 +160,10 @@ def missed(found: list[tuple[Run, Figures]]) -> list[str]:
                 out.append(f"{what}: {len(far)} stills beyond their bound by more than play")
             if figures.alerts:
                 out.append(f"{what}: alerts that the mount moved: {_counts(figures.alerts)}")
-            if math.isfinite(figures.proposed[0]):
-                ratio = float(figures.proposed[0] / figures.least[0])
-                if not PROPOSED[0] <= ratio <= PROPOSED[1]:
-                    low, high = PROPOSED
-                    out.append(f"{what}: check proposes {ratio:.2g} of the limit that is needed; {low:g} to {high:g}")
+            ratios = figures.proposed / figures.least
+            if not all(PROPOSED[0] <= ratio <= PROPOSED[1] for ratio in ratios):
+                proposal = f"{ratios[0]:.2g} (position) and {ratios[1]:.2g} (rotation) of the limits that are needed"
+                out.append(f"{what}: check proposes {proposal}; {PROPOSED[0]:g} to {PROPOSED[1]:g}")
     return out
 
 
@@ -220,7 +219,7 @@ def _why(run: Run, figures: Figures, revision: str) -> list[str]:
     out = [f"{what}: the bound is as large since it can't be excluded: {_counts(figures.hypotheses)}"]
     if figures.reasons:
         out.append(f"{what}: not measured: {_counts(figures.reasons)}")
-    return out + [f"{what}: {refused}" for refused in figures.refused]
+    return out + [f"{what}: {each}" for each in figures.teaching]
 
 
 def _way(run: Run) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.real_runs import Run, Still
+from benchmarks.real_runs import Part, Run, Still
 from gripmon.model.geometry import make_transform, perturbation_between, rotation_from_xyzw
 from gripmon.model.records import Array
 
@@ -23,16 +23,17 @@ SHARE = 0.9
 class Figures:
     """Of the stills that count; vectors are (position, rotation) about the camera's axes, m and rad.
 
-    ``bound`` (2,): median of the bounds; ``least`` (2,): the smallest limits within which each of them would be in nine
-    of ten stills; a still that wasn't measured has none, which is infinite.  ``proposed`` (2,): what ``check`` promises,
-    the larger of the halves.
+    ``bound`` (2,): median of the measured ones' bounds; ``least`` (2,): the smallest limits, each by itself, within
+    which those of nine of ten stills are, infinite for one that wasn't measured; ``proposed`` (2,): what ``check``
+    promises, the larger of the halves.
 
     Of the measured ones ``scatter`` (6,): standard deviation; ``chi2_scatter``: mean squared deviation from their
     median, in units of the published covariance and per degree of freedom; ``chi2_motion``: the same of the motion
-    since the reference.  ``beyond``: by how much (m, rad) the deviation from the median is more than the bounds, of each
-    still of which it is; ``moved_beyond``: the same of the motion since the reference.
+    since the reference.  ``beyond``: of each still that deviates from the median by more than its bounds, by how much
+    more (m, rad); ``moved_beyond``: the same of the motion since the reference.
 
-    ``alerts``: of all stills, also those that don't count; ``hypotheses``: what makes the bound as large.
+    ``alerts``: of all stills, also those that don't count; ``hypotheses``: what makes the bound as large; ``reasons``:
+    why stills aren't measured; ``teaching``: what was left out, or refused.
     """
 
     stills: int
@@ -49,7 +50,7 @@ class Figures:
     alerts: Counter[str]
     hypotheses: Counter[str]
     reasons: Counter[str]
-    refused: tuple[str, ...]
+    teaching: tuple[str, ...]
 
 
 def figures_of(run: Run) -> Figures:
@@ -67,7 +68,7 @@ def figures_of(run: Run) -> Figures:
         stills=total,
         measured=len(measured),
         valid=sum(still.valid for still in counted),
-        bound=np.median(bounds, axis=0),
+        bound=np.median(bounds[: len(measured)], axis=0) if measured else np.full(2, np.inf),
         least=np.sort(bounds, axis=0)[math.ceil(SHARE * total) - 1],
         proposed=np.max(proposals, axis=0) if proposals else np.full(2, np.nan),
         scatter=away.std(axis=0, ddof=1) if len(away) > 1 else np.full(6, np.nan),
@@ -78,8 +79,17 @@ def figures_of(run: Run) -> Figures:
         alerts=Counter(kind for p in run.parts for s in p.stills for kind in s.alerts if kind in MOVED),
         hypotheses=Counter(still.hypothesis for still in measured),
         reasons=Counter((still.reason or "").partition(":")[0] for still in counted if not still.measured),
-        refused=tuple(f"taught from the {p.taught} stills: {p.refused}" for p in run.parts if p.refused is not None),
+        teaching=tuple(filter(None, map(_teaching, run.parts))),
     )
+
+
+def _teaching(part: Part) -> str:
+    """What a half could teach, in words."""
+    if part.taught is None:
+        return ""
+    if part.refused is not None:
+        return f"nothing is taught from the {part.taught} stills: {part.refused.removeprefix('teach: ')}"
+    return f"taught from the {part.taught} stills, {part.left_out} of which are left out" if part.left_out else ""
 
 
 def motions(run: Run, measured: Sequence[Still]) -> Array:
@@ -97,8 +107,8 @@ def _chi2(motion: Array, measured: Sequence[Still]) -> float:
     """Per degree of freedom, of which each still has six."""
     if not len(motion):
         return math.nan
-    covariances = [np.reshape(still.covariance, (6, 6)) for still in measured]
-    return float(np.mean([d @ np.linalg.solve(c, d) for d, c in zip(motion, covariances, strict=True)])) / 6.0
+    covariances = np.array([still.covariance for still in measured]).reshape(-1, 6, 6)
+    return float(np.einsum("ni,ni->n", motion, np.linalg.solve(covariances, motion[:, :, None])[:, :, 0]).mean()) / 6.0
 
 
 def _beyond(motion: Array, bounds: Array) -> tuple[tuple[float, float], ...]:

@@ -36,6 +36,11 @@ class Limit(NamedTuple):
     rotation_rad: float
 
 
+class _Model(NamedTuple):
+    path: Path
+    left_out: int
+
+
 class Still(msgspec.Struct, frozen=True):
     """What was decided about one image: pose (m; x, y, z, w) and covariance (36,) where it was measured, bounds (m,
     rad) where there are any; ``alerts``: kinds that were raised.
@@ -56,13 +61,14 @@ class Still(msgspec.Struct, frozen=True):
 
 class Part(msgspec.Struct, frozen=True):
     """Stills that were replayed in one run, the first ``uncounted`` of them to begin with; ``proposed_m``,
-    ``proposed_rad``: the bounds that ``check`` promises.  ``refused``: why nothing was taught from the ``taught``
-    stills; then nothing was replayed.
+    ``proposed_rad``: the bounds that ``check`` promises.  ``taught``: the half that was taught from, without those
+    ``left_out``; ``refused``: why nothing could be, and nothing was replayed.
     """
 
     names: tuple[str, ...]
     uncounted: int
     taught: str | None = None
+    left_out: int = 0
     refused: str | None = None
     stills: tuple[Still, ...] = ()
     proposed_m: float | None = None
@@ -134,7 +140,7 @@ class _Project:
         self._openings = _openings(folder / _STAMPS)
         self._values = yaml.safe_load((folder / CONFIG).read_text())
         self._values.pop("taught", None)
-        self._files: dict[str, Path | str] = {}  # taught model, or why there is none, by half
+        self._models: dict[str, _Model | str] = {}  # or why there is none, by half
         for path in folder.iterdir():
             if path not in self._images and path.name not in (CONFIG, _STAMPS):
                 (place / path.name).symlink_to(path.resolve())
@@ -158,26 +164,28 @@ class _Project:
         images, config = self._images[judged], self.config(bound, taught)
         with gripmon.open_source(self._stills(images), fps=1.0 / APART_S) as source:
             stills = tuple(_still(record) for record in gripmon.replay(source, config))
+        proposed_m, proposed_rad = proposed_by_check(config)
         names = tuple(path.name for path in images)
-        return Part(names, uncounted, None, None, stills, *proposed_by_check(config))
+        return Part(names, uncounted, stills=stills, proposed_m=proposed_m, proposed_rad=proposed_rad)
 
     def taught(self, bound: str, half: str) -> Part:
         """The other half, with what one half taught."""
         learnt_from, judged = _HALVES[half]
-        model = self._files[half] = self._files.get(half) or self._teach(half, learnt_from)
+        model = self._models[half] = self._models.get(half) or self._teach(half, learnt_from)
         if isinstance(model, str):
-            return Part(tuple(path.name for path in self._images[judged]), 1, half, model)
-        return msgspec.structs.replace(self.replayed(bound, judged, 1, model), taught=half)
+            return Part(tuple(path.name for path in self._images[judged]), 1, half, refused=model)
+        part = self.replayed(bound, judged, 1, model.path)
+        return msgspec.structs.replace(part, taught=half, left_out=model.left_out)
 
-    def _teach(self, half: str, learnt_from: slice) -> Path | str:
+    def _teach(self, half: str, learnt_from: slice) -> _Model | str:
         folder = self._stills(self._images[learnt_from])
         try:
-            text = gripmon.teach_edges(self.config(bound_names()[-1]), [folder]).text()
+            teaching = gripmon.teach_edges(self.config(bound_names()[-1]), [folder])
         except gripmon.NoResultError as refused:
             return str(refused).replace(f"{folder}/", "")  # files by their names
         path = self._place / f"taught_{half}.yaml"
-        path.write_text(text)
-        return path
+        path.write_text(teaching.text())
+        return _Model(path, len(teaching.taught.left_out))
 
     def _stills(self, images: Sequence[Path]) -> Path:
         """A folder with these images alone."""
