@@ -269,6 +269,12 @@ class TaughtEdges:
         opening_m = float(np.mean(openings)) if openings else None
         return cls.of(model.edges, gripper, taught_pose(model), opening_m, covariance, model.reference.offset)
 
+    @property
+    def digest(self) -> str:
+        """Digest of the edges' shifts, to the nanometre."""
+        places = np.rint(1e9 * self.shift_grip_m).astype("<i8")
+        return hashlib.sha256(self.known.tobytes() + places.tobytes()).hexdigest()[:16]
+
     def shift_at_m(self, edge: NDArray[np.intp], fraction: Array) -> Array:
         """Shift (n, 3), gripper frame, of points on edges (n,) at fractions (n,) between their two ends."""
         shift_m = self.shift_grip_m[edge]
