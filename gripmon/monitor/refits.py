@@ -366,8 +366,9 @@ def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[
 
 
 class Anchor:
-    """The average of the proven poses, from the first one on.  ``origin``: what was known of the pose before that one,
-    a pose (4, 4) and its covariance (6, 6): it stays the prior of what the frames don't show.
+    """The average of the proven poses, from the first one on; before one is ``proven``, of what edges show without the
+    fingers' ends.  ``origin``: what was known of the pose before, (4, 4) and its covariance (6, 6): it stays the prior of
+    what the frames don't show.
     """
 
     def __init__(
@@ -379,12 +380,13 @@ class Anchor:
         now_s: float,
         origin: tuple[Array, Array],
         misread: float,
+        proven: bool = True,
         knocked: bool = False,
     ):
         """``knocked``: the first pose differs from the one expected before; ``misread``: probability that what looked
         like the fingers' ends there was something else.
         """
-        self.misread = misread
+        self.misread, self.proven = misread, proven
         self._lasting, self._base_T, self._origin = lasting, base_T, origin
         self.began_s, self.now_s, self.frames, self.knocked = now_s, now_s, 1, knocked
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
@@ -429,9 +431,11 @@ class Anchor:
         kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT_RATIO * self._scatter)
         scale = np.sqrt(kept / young)
         self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
-        self.cam_T_grip = perturb(self._base_T, self._filters.shift[0])
-        self.covariance: Array = self._claimed[0]
-        self.of_model: Array = self._filters.of_model[0]
+        whole = Separation(self._filters.shift[:1], self._claimed[:1], self._filters.of_model[:1])
+        (shift,), (covariance,), (of_model,) = _with_origin(whole, self._base_T, self._origin, np.zeros(6))
+        self.cam_T_grip = perturb(self._base_T, shift)
+        self.covariance: Array = covariance
+        self.of_model: Array = of_model
 
     def fits(self) -> Separation:
         """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
@@ -457,18 +461,24 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
-        origin_T, covariance = self._origin
-        count, every = len(told.shift), np.arange(len(self._lasting.name))
-        before = Separation(
-            np.tile(perturbation_between(cam_T_grip, origin_T), (count, 1)),
-            np.tile(covariance, (count, 1, 1)),
-            np.zeros_like(told.of_model),
-        )
-        absolute, _ = follow(told, before, wander / SIGMA_INFLATION**2)
+        absolute = _with_origin(told, cam_T_grip, self._origin, wander / SIGMA_INFLATION**2)
         prior = self._lasting.priors(self.misread, backgrounds)
         doubts = fits.model.doubts(self._lasting.name, prior, absolute, cam_T_grip, fits.opened)
-        since = fits.model.since(self._lasting.name, prior, told, cam_T_grip, fits.opened, every, staying)
+        since = fits.model.since(
+            self._lasting.name, prior, told, cam_T_grip, fits.opened, np.arange(len(prior)), staying
+        )
         return replace(doubts, since=since)
+
+
+def _with_origin(fits: Separation, at_T: Array, origin: tuple[Array, Array], wander: Array) -> Separation:
+    """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before them."""
+    (origin_T, covariance), count = origin, len(fits.shift)
+    before = Separation(
+        np.tile(perturbation_between(at_T, origin_T), (count, 1)),
+        np.tile(covariance, (count, 1, 1)),
+        np.zeros_like(fits.of_model),
+    )
+    return follow(fits, before, wander)[0]
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

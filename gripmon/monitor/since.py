@@ -233,6 +233,11 @@ class AtReferences:
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
 
+    def forget(self) -> None:
+        """Begin again at the reference in force."""
+        self._known.pop(self._id, None)
+        self._growing = None
+
     def _end(self) -> None:
         self._growing = None
         self._keep(self._id, self._known[self._id])

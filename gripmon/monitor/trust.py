@@ -139,12 +139,12 @@ class Integrity:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
         pose that nothing proved mustn't be what a restart expects.
         """
-        return cam_T_grip if self._believed and self._weigher.anchor is not None else self._weigher.expected[0]
+        return cam_T_grip if self._believed and self._weigher.proved else self._weigher.expected[0]
 
     def rivals(self, ref_cam_T_grip: Array) -> tuple[Array, ...]:
         """Where else the gripper may be: at the anchor, and where the reference has it."""
         anchor = self._weigher.anchor
-        return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
+        return (ref_cam_T_grip,) if anchor is None or not anchor.proven else (anchor.cam_T_grip, ref_cam_T_grip)
 
     def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
         """The bounds of a pose measured ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
@@ -177,7 +177,7 @@ class Integrity:
         trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
-        if due or self._past_limit(trust.bounds) or trust.displaced or self._weigher.anchor is None:
+        if due or self._past_limit(trust.bounds) or trust.displaced or not self._weigher.proved:
             ends = self._tracker.ends(frame, measurement)
             trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
             self._ends_seen = trust.proven
@@ -234,7 +234,7 @@ class Integrity:
         """For a frame in which the gripper wasn't found: the measurement at the anchor.  None without an anchor, where
         too little is seen there, or where the bound is past an alert limit.
         """
-        there = None if self._weigher.anchor is None else self._at_its_place(frame, now_s)
+        there = None if not self._weigher.proved else self._at_its_place(frame, now_s)
         if there is None:
             return None
         standing = self._conclude(frame, there, now_s)
@@ -270,19 +270,20 @@ class Integrity:
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or self._past_limit(trust.bounds)):
             return self._by_anchor(frame, candidate, now_s)
-        where_it_was = self._weigher.anchor is not None and not trust.displaced
+        where_it_was = self._weigher.proved and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px, along.here)
         knocked = moved and beside_px >= ONE_EDGE_PX
-        # A place that the prior and the edges bound as the task needs it is proven without the ends.
-        sure = not self._past_limit(trust.bounds)
-        settles = (trust.proven and moved) or (not trust.displaced and (trust.proven or sure))
-        unproven = self._weigher.anchor is not None and not settles
-        if settles:
+        proves = trust.proven and (moved or not trust.displaced)
+        unproven, anchor = self._weigher.proved and not proves, self._weigher.anchor
+        if trust.fits is not None and (proves or not (trust.displaced or self._weigher.proved)):
             self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
             assert self._weigher.anchor is not None
+            if proves and anchor is not None and not anchor.proven:
+                self.since.forget()  # what was known until now was so without the fingers' ends
             self._jaw_opening_m = measurement.jaw_opening_m
             self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
+        if proves:
             if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
@@ -307,7 +308,7 @@ class Integrity:
         self._elsewhere = self._elsewhere + 1 if trust.displaced and not trust.ambiguous else 0
         if beside_px < ONE_EDGE_PX or seen_along:
             return self._elsewhere >= 1
-        unknown = self._weigher.anchor is not None and self._strips.awaited
+        unknown = self._weigher.proved and self._strips.awaited
         return self._elsewhere >= self._policy.confirm_frames and not unknown
 
     def _by_anchor(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:

@@ -175,6 +175,11 @@ class Weigher:
         """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
         return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
 
+    @property
+    def proved(self) -> bool:
+        """Whether a frame has proven a pose."""
+        return self.anchor is not None and self.anchor.proven
+
     def sigma(self, now_s: float) -> Array:
         """(6,) standard deviations of where it is expected, m and rad."""
         return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._tracker.floor.diagonal()))
@@ -224,7 +229,7 @@ class Weigher:
             measurement, fits, prior, holds, knocks, unseen, cam_T_grip, now_s, displaced
         )
         doubts = fits.doubts(cam_T_grip, prior, anchored).among(holds) + doubts
-        made_of = fits
+        made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
         staying = self._staying(now_s, knocks, displaced)
@@ -299,7 +304,7 @@ class Weigher:
         doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, least)
         besides = unseen * prior[hypotheses.ends]
         without = None
-        if across.any() and (displaced or besides * WRONG_EDGE > least):
+        if across.any() and (displaced or not self.proved or besides * WRONG_EDGE > least):
             endless_too, more = hypotheses.without_ends()
             without = Refits(measurement, endless_too, self._tracker.floor, fits.model, fits.known)
             both = prior[hypotheses.ends] * hypotheses.prior * more
@@ -311,28 +316,33 @@ class Weigher:
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
     ) -> None:
-        """Add a proven pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it."""
+        """Add a pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it.  One that isn't
+        proven counts until another one is, by its fits without the fingers' ends.
+        """
         assert trust.fits is not None
+        proven = trust.proven
+        if self.proved and not proven:
+            return
         self._backgrounds.add(trust.fits.edges, own_steps(measurement))
         rows = self._about(trust.fits.edges)[1]
-        self._slid = trust.may_have_slid
-        if self.anchor is not None:
+        if proven:
+            self._slid = trust.may_have_slid
+        if self.proved:
+            assert self.anchor is not None
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
             self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
             self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
             self.question = Question(self.unexplained, self._revision)
-        if self.anchor is None or trust.displaced:
-            expected_T, covariance = self.expected
+        if self.anchor is None or trust.displaced or proven > self.anchor.proven:
+            origin_T, covariance = self.expected if self.proved else self._expected
             if trust.displaced:
                 covariance = covariance + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
-            origin = expected_T, covariance
-            self.anchor = Anchor(
-                self._lasting, cam_T_grip, trust.fits, rows, now_s, origin, trust.misread, trust.displaced
-            )
+            at = cam_T_grip, trust.fits, rows, now_s, (origin_T, covariance)
+            self.anchor = Anchor(self._lasting, *at, trust.misread, proven, trust.displaced)
         else:
-            self._in_place = True
+            self._in_place = proven
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s, trust.misread)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
