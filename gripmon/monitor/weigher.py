@@ -111,11 +111,11 @@ class Backgrounds:
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
     """(6,) variance of the mount's vibration after one more ``way`` (6,) between consecutive poses; ``noise`` (6,):
-    variances that the poses' own errors add to it.
+    variances that the poses' own errors add to it, which is taken off.  Negative where there happens to be less.
     """
     # A knock is not a vibration, but what rings after it is.
-    most = CONTRADICTION_SQUARE * (noise + swing)
-    return np.asarray(swing + (np.minimum(np.square(way), most) - swing) / VIBRATION_FRAMES)
+    most = CONTRADICTION_SQUARE * (noise + np.maximum(swing, 0.0))
+    return np.asarray(swing + (np.minimum(np.square(way), most) - noise - swing) / VIBRATION_FRAMES)
 
 
 class Weigher:
@@ -143,8 +143,7 @@ class Weigher:
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
         self._newest: tuple[Measurement, float, Refits] | None = None
-        self.swing: Array = np.zeros(6)
-        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
+        self._swing = np.zeros(6)
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
@@ -174,6 +173,11 @@ class Weigher:
     def expected(self) -> tuple[Array, Array]:
         """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
         return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
+
+    @property
+    def swing(self) -> Array:
+        """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
+        return np.maximum(self._swing, 0.0)
 
     @property
     def proved(self) -> bool:
@@ -330,7 +334,7 @@ class Weigher:
         if self.proved:
             assert self.anchor is not None
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
-            self.swing = swinging(self.swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
+            self._swing = swinging(self._swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
             self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
