@@ -52,14 +52,14 @@ def normal_equations(rng: np.random.Generator, m: int) -> tuple:
     """Of edges that each see one direction well, as kept under hypotheses that leave out some, and a prior."""
     rows = rng.normal(size=(EDGES, 5, m)) / SIZE[:m]
     information = np.einsum("vri,vrj->vij", rows, rows)
-    pull, model = np.einsum("vri,vr->vi", rows, rng.normal(size=(EDGES, 5))), rng.normal(size=(EDGES, m)) / SIZE[:m]
+    pull, model = np.einsum("vri,vr->vi", rows, rng.normal(size=(EDGES, 5))), rng.normal(size=(2, EDGES, m)) / SIZE[:m]
     keep = (rng.uniform(size=(HYPOTHESES, EDGES)) < 0.8).astype(float)
     keep[0], keep[1] = 1.0, 0.0
     known = np.tile(np.diag(0.1 / SIZE[:m] ** 2), (HYPOTHESES, 1, 1))
-    finger = rng.integers(0, FINGERS, EDGES)
+    part = rng.integers(0, FINGERS, (2, EDGES))
     middle = information * rng.uniform(0.5, 3.0, (EDGES, 1, 1))
     known_pull = rng.normal(size=(HYPOTHESES, m)) / SIZE[:m]
-    return pull, information, middle, model, finger, FINGERS, keep, known, known_pull
+    return pull, information, middle, model, part, FINGERS, keep, known, known_pull
 
 
 @pytest.mark.parametrize("m", [6, 7])
@@ -90,8 +90,21 @@ def test_averages_are_those_of_numpy(seed: int):
     agree(kernel.telling(*average, at, wander, *frame, rows, 12.0), told)
     by_frame = (told[1] == frame.covariance[rows]).all(axis=(1, 2))
     assert 0 < by_frame.sum() < HYPOTHESES and not by_frame[rows < 0].any()
-    of = frame.shift, at, frame.covariance, 1.44, covariances(rng, 1)[0]
+    of = frame.shift, at, frame.covariance, frame.of_model, 1.44, covariances(rng, 1)[0], average.of_model[0]
     agree((kernel.squares(*of),), (by_numpy.squares(*of),))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_jumps_are_those_of_numpy(seed: int):
+    rng = np.random.default_rng(seed)
+    frame, at, known, jumps = fits(rng), shifts(rng, 1)[0], covariances(rng, 1)[0], 3.0 * covariances(rng, 4)
+    prior, stays = rng.uniform(0.0, 0.2, (HYPOTHESES, 4)), rng.uniform(size=HYPOTHESES) < 0.6
+    for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
+        of = *frame, at, known, off, jumps, prior, stays, 1.44
+        np.testing.assert_allclose(kernel.jumped(*of), by_numpy.jumped(*of), rtol=1e-8)
+        fit, jump = rng.integers(0, HYPOTHESES, 9), rng.integers(0, 4, 9)
+        after = *frame, at, known, off, jumps, fit, jump
+        agree(kernel.after_jumps(*after), by_numpy.after_jumps(*after))
 
 
 def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:
@@ -145,7 +158,7 @@ def test_what_has_no_root_is_inverted_all_the_same():
     average, frame = fits(rng), fits(rng)
     frame.covariance[3] *= -1.0
     rows, none = np.arange(HYPOTHESES), np.zeros(6)
-    of = frame.shift, none, frame.covariance, 1.0, np.zeros((6, 6))
+    of = frame.shift, none, frame.covariance, np.zeros_like(frame.of_model), 1.0, np.zeros((6, 6)), np.zeros((1, 6))
     found = kernel.squares(*of)
     assert found[3] < 0.0
     agree((found,), (by_numpy.squares(*of),))

@@ -147,6 +147,11 @@ class ModelError(NamedTuple):
     common: CommonError | None
     first: tuple[AtReference | None, Array] = (None, np.eye(4))
 
+    @property
+    def parts(self) -> int:
+        """Number of the gripper's parts that may be off: its fingers, and its edges each by itself."""
+        return self.fingers + len(self.finger)
+
     def doubts(
         self,
         name: tuple[str, ...],
@@ -221,7 +226,9 @@ class Refits:
             pull[:, 6] = held[:, 6, 6] * (measurement.jaw_known_m - fitted_m)
         # A longer finger pulls at a fit by all its edges together.
         longer = normal.information[:, :, :3] @ (self._fit_T[:3, :3] @ (model.sigma_m * model.axis_grip))
-        of_model = longer, model.finger[normal.edge], model.fingers
+        # An edge that lies beside its place pulls by itself, alike in every frame.
+        part = np.stack([model.finger[normal.edge], model.fingers + normal.edge])
+        of_model = np.stack([longer, normal.lasting]), part, model.parts
         of = normal.pull, normal.information, normal.middle, of_model, hypotheses.keep, held, pull
         self.known = known
         self._known = perturbation_between(self._fit_T, known.anchor_T), known.covariance + floor, known.of_model
@@ -292,7 +299,7 @@ class Refits:
         """
         at, covariance, of_model = self._known
         share = probable[:, None] * knocks.share
-        given = jumped(self._free, at, covariance, knocks.covariance, share, stays, SIGMA_INFLATION**2)
+        given = jumped(self._free, at, covariance, of_model, knocks.covariance, share, stays, SIGMA_INFLATION**2)
         weight = prior[:, None] * given
         counts = weight > least
         fit, jump = np.nonzero(counts)

@@ -167,7 +167,7 @@ class Weigher:
 
     def restore(self, records: tuple[AtReferenceRecord, ...]) -> str | None:
         """See :meth:`AtReferences.restore`."""
-        return self._since.restore(records, len(self._lasting.name), self._model.fingers)
+        return self._since.restore(records, len(self._lasting.name), self._model.parts)
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -186,7 +186,10 @@ class Weigher:
 
     def sigma(self, now_s: float) -> Array:
         """(6,) standard deviations of where it is expected, m and rad."""
-        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._tracker.floor.diagonal()))
+        variance = self.expected[1].diagonal() + self._wander(now_s) + self._tracker.floor.diagonal()
+        if self.anchor is not None:
+            variance = variance + np.square(self.anchor.of_model).sum(axis=0)
+        return np.sqrt(variance)
 
     def weigh(
         self,

@@ -338,8 +338,8 @@ def assess(
     stretch: Any, edge_spread_px: Any, cut_off_px: Any, prior: Any, expected_shared_px: float,
 ) -> Any:  # fmt: skip
     """The covariance of ``robust_fit.assess``, which gives the equation: whether it could be solved, then
-    covariance, line weights, shared spread and contradiction, and edge, pull, information and middle of the
-    ``NormalEquations``.
+    covariance, line weights, shared spread and contradiction, and edge, pull, information, middle and lasting of
+    the ``NormalEquations``.
     """
     unknowns, line_weight = len(prior), np.zeros(len(weight))
     worth = _worth(sample, weight, edge, edge_spread_px)
@@ -382,17 +382,23 @@ def assess(
             for j in range(i + 1):
                 middle[of_edge[g], i, j] += shared * pulls[g, i] * pulls[g, j]
     for v in range(last):
-        spread_px = math.sqrt(edge_spread_px[seen[v]] ** 2 + cut_off_px[seen[v]] ** 2)
         for i in range(unknowns):
             for j in range(i + 1):
-                of_whole = (stiffness * spread_px) ** 2 * whole[v, i] * whole[v, j]
+                of_whole = (stiffness * cut_off_px[seen[v]]) ** 2 * whole[v, i] * whole[v, j]
                 middle[v, i, j] += scatter * worth[seen[v]] * of_points[v, i, j] + of_whole
                 middle[v, i, j] *= student
                 of_points[v, i, j] *= stiffness
                 middle[v, j, i], of_points[v, j, i] = middle[v, i, j], of_points[v, i, j]
-    solved, covariance = _sandwich(stiffness, information, prior, middle)
+        for i in range(unknowns):
+            whole[v, i] *= math.sqrt(student) * stiffness * edge_spread_px[seen[v]]
+    filled = middle.copy()
+    for v in range(last):
+        for i in range(unknowns):
+            for j in range(unknowns):
+                filled[v, i, j] += whole[v, i] * whole[v, j]
+    solved, covariance = _sandwich(stiffness, information, prior, filled)
     shared_px = math.sqrt(shared) / stiffness
-    return solved, (covariance, line_weight, shared_px, contradiction), (seen, pull, of_points, middle)
+    return solved, (covariance, line_weight, shared_px, contradiction), (seen, pull, of_points, middle, whole)
 
 
 @compiled

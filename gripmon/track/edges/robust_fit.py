@@ -78,14 +78,16 @@ class NormalEquations:
     """What each edge adds to the fit's normal equations; v edges with agreed points, m unknowns.
 
     ``edge`` (v,) of the gripper; ``pull`` (v, m): sum of weight times Jacobian times residual at the fit;
-    ``information`` (v, m, m): by how much that grows with a step; ``middle`` (v, m, m): its covariance.  A fit without
-    some of them is these sums without theirs.
+    ``information`` (v, m, m): by how much that grows with a step; ``middle`` (v, m, m): its covariance in one frame;
+    ``lasting`` (v, m): what comes on top in every frame alike if the edge lies beside its place by its standard
+    deviation.  A fit without some of them is these sums without theirs.
     """
 
     edge: NDArray[np.intp]
     pull: Array
     information: Array
     middle: Array
+    lasting: Array
 
 
 @dataclass(frozen=True, slots=True)

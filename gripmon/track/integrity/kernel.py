@@ -97,25 +97,26 @@ def add_up(
     information: Array,
     middle: Array,
     model: Array,
-    finger: Ints,
-    fingers: int,
+    part: Ints,
+    parts: int,
     keep: Array,
     known: Array,
     known_pull: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """Sums over the kept edges, ``keep`` (h, v) of 0 and 1, and what is known besides: pull (h, m), normal matrix and
-    spread (h, m, m), and pulls by the model (h, f, m), each edge's by its ``finger`` (v,).
+    spread (h, m, m), and pulls by the model (h, f, m): each edge's ``model`` (p, v, m) by the ``part`` (p, v) of it.
     """
     count, (edges, m) = len(keep), pull.shape
     sums, normal, spread = known_pull.copy(), known.copy(), known.copy()
-    of_model = np.zeros((count, fingers, m))
+    of_model = np.zeros((count, parts, m))
     for h in range(count):
         for v in range(edges):
             if keep[h, v] == 0.0:
                 continue
             for i in range(m):
                 sums[h, i] += pull[v, i]
-                of_model[h, finger[v], i] += model[v, i]
+                for p in range(len(part)):
+                    of_model[h, part[p, v], i] += model[p, v, i]
                 for j in range(i + 1):
                     normal[h, i, j] += information[v, i, j]
                     spread[h, i, j] += middle[v, i, j]
@@ -181,13 +182,26 @@ def with_pose(
 
 
 @compiled
-def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> Array:
-    """Normalised squares (h,) of shifts (h, 6) from ``at`` (6,), by ``times`` the covariances (h, 6, 6) and ``more``
-    (6, 6).
+def between(covariance: Array, off: Array, more: Array, other: Array, times: float, out: Array) -> None:
+    """``out`` (6, 6): covariance of the difference of two poses, ``times`` the one's ``covariance`` and ``more``, and
+    what their errors by the model, ``off`` (f, 6) and ``other`` (f or 1, 6), have not in common.
     """
-    out, root, white = np.empty(len(shift)), np.empty((6, 6)), np.empty(6)
+    for i in range(6):
+        for j in range(i + 1):
+            out[i, j] = times * covariance[i, j] + more[i, j]
+            for f in range(len(off)):
+                g = min(f, len(other) - 1)
+                out[i, j] += (off[f, i] - other[g, i]) * (off[f, j] - other[g, j])
+            out[j, i] = out[i, j]
+
+
+@compiled
+def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float, more: Array, other: Array) -> Array:
+    """Normalised squares (h,) of shifts (h, 6) from ``at`` (6,), by :func:`between`."""
+    out, root, white, both = np.empty(len(shift)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for h in range(len(shift)):
-        out[h] = _square(times * covariance[h] + more, shift[h] - at, root, white)
+        between(covariance[h], off[h], more, other, times, both)
+        out[h] = _square(both, shift[h] - at, root, white)
     return out
 
 
@@ -197,8 +211,8 @@ def with_and_without(
     information: Array,
     middle: Array,
     model: Array,
-    finger: Ints,
-    fingers: int,
+    part: Ints,
+    parts: int,
     keep: Array,
     known: Array,
     known_pull: Array,
@@ -211,24 +225,33 @@ def with_and_without(
     besides, and the normalised squares (h,) of the former's distance from that.
     """
     sums, normal, spread, of_model = add_up(
-        pull, information, middle, model, finger, fingers, keep, known, known_pull
+        pull, information, middle, model, part, parts, keep, known, known_pull
     )  # fmt: skip
     alone = separate(sums, normal, spread, of_model, 6)
     sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
     together = separate(sums, normal, spread, of_model, 6)
-    return alone, together, squares(alone[0], at, alone[1], times, covariance)
+    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
 
 
 @compiled
 def jumped(
-    shift: Array, covariance: Array, at: Array, known: Array, jumps: Array, prior: Array, stays: Bools, times: float
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    prior: Array,
+    stays: Bools,
+    times: float,
 ) -> Array:
     """Probabilities (h, c) of the jumps that may have carried a pose away from where it is known to have been, given
-    a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6).
+    a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6) and errors by the model, ``off`` (h, f, 6).
 
-    ``at`` (6,) with its covariance ``known`` C (6, 6): the pose before; ``jumps`` J (c, 6, 6), of the probability
+    ``at`` (6,) with its covariance ``known`` C (6, 6) and ``known_off`` (f or 1, 6): the pose before; ``jumps`` J (c, 6, 6), of the probability
     ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a jump's probability is its
-    prior times the normal density of the fit with ``times`` R + C + J, over the sum of these and of having stayed.
+    prior times the normal density of the fit with ``times`` R + C + J (and :func:`between`), over the sum of these and of having stayed.
     """
     count, kinds = prior.shape
     root, white, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6))
@@ -238,10 +261,11 @@ def jumped(
         for c in range(kinds + 1):
             log_density[c] = -math.inf
             if stays[h] if c == kinds else prior[h, c] > 0.0:
-                for i in range(6):
-                    for j in range(6):
-                        jump = jumps[c, i, j] if c < kinds else 0.0
-                        both[i, j] = times * covariance[h, i, j] + known[i, j] + jump
+                between(covariance[h], off[h], known, known_off, times, both)
+                if c < kinds:
+                    for i in range(6):
+                        for j in range(6):
+                            both[i, j] += jumps[c, i, j]
                 log_density[c] = -0.5 * _square(both, shift[h] - at, root, white)
                 for i in range(6):
                     log_density[c] += math.log(root[i, i])

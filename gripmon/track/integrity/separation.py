@@ -93,7 +93,8 @@ class Sums(NamedTuple):
         """Of the kept edges among v.
 
         ``pull`` (v, m), ``information`` and ``middle`` (v, m, m) as the fit has them at its solution; ``model``: how
-        each edge pulls (v, m) where its part of the gripper is off, which part (v,) that is, and how many there are;
+        each edge pulls (p, v, m) where its parts of the gripper are off, which parts (p, v) these are, and how many
+        there are;
         ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
         """
         pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
@@ -146,13 +147,20 @@ def telling(
 
 
 def jumped(
-    frame: Separation, at: Array, known: Array, jumps: Array, prior: Array, stays: NDArray[np.bool_], times: float
+    frame: Separation,
+    at: Array,
+    known: Array,
+    of_model: Array,
+    jumps: Array,
+    prior: Array,
+    stays: NDArray[np.bool_],
+    times: float,
 ) -> Array:
     """Probabilities (h, c) that under each hypothesis the pose, known to have been ``at`` (6,) but for a covariance
-    ``known`` (6, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior`` (h, c), given the frame's fits;
+    ``known`` (6, 6) and ``of_model`` (f or 1, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior`` (h, c), given the frame's fits;
     ``stays`` (h,): whether it may as well have stayed.  ``times``: factor on the fits' covariances for their tails.
     """
-    return kernel.jumped(frame.shift, frame.covariance, at, known, jumps, prior, stays, times)
+    return kernel.jumped(*frame, at, known, of_model, jumps, prior, stays, times)
 
 
 def after_jumps(
@@ -261,12 +269,14 @@ def warm_up() -> None:
     whole, none = np.ones((2, 2)), np.zeros(6)
     for m in (6, 7):
         each = np.tile(np.eye(m), (2, 1, 1))
-        model = np.zeros((2, m)), np.zeros(2, dtype=np.intp), 1
+        model = np.zeros((2, 2, m)), np.zeros((2, 2), dtype=np.intp), 1
         of = np.zeros((2, m)), each, each, model, whole, each, np.zeros((2, m))
         fits = Sums.of_kept(*of).fits()
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
-    jumped(fits, none, np.eye(6), each[:, :6, :6], np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0)
+    jumped(
+        fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0
+    )
     after_jumps(fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.arange(2), np.arange(2))
     told = telling(averages, none, none, fits, np.arange(2), 1.0)
     Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)

@@ -221,7 +221,10 @@ def assess(
     unknowns = len(consensus.xi)
     if not len(inlier):
         nothing = NormalEquations(
-            np.zeros(0, dtype=np.intp), np.zeros((0, unknowns)), *np.zeros((2, 0, unknowns, unknowns))
+            np.zeros(0, dtype=np.intp),
+            np.zeros((0, unknowns)),
+            *np.zeros((2, 0, unknowns, unknowns)),
+            np.zeros((0, unknowns)),
         )
         return Uncertainty(0.5 * (inverse + inverse.T), np.zeros(len(consensus.weight)), 0.0, 1.0, nothing)
     prediction = edgels.prediction
@@ -250,17 +253,20 @@ def assess(
     # Sums over each edge: of points, of stretches, and of the edge as a whole.
     information = np.add.reduceat(weighted[:, None] * jacobian, at_edge, axis=2).transpose(2, 0, 1)
     by_stretch = np.add.reduceat(pulls[:, None] * pulls, begin, axis=2).transpose(2, 0, 1)
-    spread_px = np.hypot(edgels.edge_spread_px, edgels.cut_off_px)
-    whole = (np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[seen])).T
+    lasting, cut_off = (
+        (np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[seen])).T
+        for spread_px in (edgels.edge_spread_px, edgels.cut_off_px)
+    )
     middles = scatter * worth[seen][:, None, None] * information + shared * by_stretch
-    middles += whole[:, :, None] * whole[:, None, :]
+    middles += cut_off[:, :, None] * cut_off[:, None, :]
     # A scatter that is itself estimated from few stretches makes Student's distribution, with this variance.
-    middles *= freedom / (freedom - 2.0) if freedom >= FEWEST_FREE else FEWEST_FREE
-    middle = middles.sum(axis=0)
+    student = freedom / (freedom - 2.0) if freedom >= FEWEST_FREE else FEWEST_FREE
+    middles, lasting = student * middles, np.sqrt(student) * lasting
+    middle = middles.sum(axis=0) + lasting.T @ lasting
     middle.flat[:: len(middle) + 1] += prior_information
     covariance = inverse @ middle @ inverse
     pull = np.add.reduceat(weighted * residual_px, at_edge, axis=1).T
-    normal = NormalEquations(seen, pull, stiffness * information, middles)
+    normal = NormalEquations(seen, pull, stiffness * information, middles, lasting)
     line_weight = np.zeros(len(consensus.weight))
     counts = np.diff(np.append(first, len(inlier)))
     line_weight[inlier] = alone * np.repeat(stiffness**2 / (scatter + shared * total), counts)

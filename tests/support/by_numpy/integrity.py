@@ -15,16 +15,16 @@ def add_up(
     information: Array,
     middle: Array,
     model: Array,
-    finger: Ints,
-    fingers: int,
+    part: Ints,
+    parts: int,
     keep: Array,
     known: Array,
     known_pull: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    (edges, m), own = pull.shape, finger == np.arange(fingers)[:, None]
+    (edges, m), own = pull.shape, part == np.arange(parts)[:, None, None]
     normal = (keep @ information.reshape(edges, -1)).reshape(-1, m, m) + known
     spread = (keep @ middle.reshape(edges, -1)).reshape(-1, m, m) + known
-    return keep @ pull + known_pull, normal, spread, np.einsum("hv,fvi->hfi", keep, own[:, :, None] * model)
+    return keep @ pull + known_pull, normal, spread, np.einsum("hv,fpv,pvi->hfi", keep, own, model)
 
 
 def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int) -> tuple[Array, Array, Array]:
@@ -45,9 +45,13 @@ def with_pose(
     return sums, normal, spread, of_model
 
 
-def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[Array]:
-    away = shift - at
-    return np.einsum("hi,hi->h", away, np.linalg.solve(times * covariance + more, away[:, :, None])[:, :, 0])
+def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float, more: Array, other: Array) -> Array:
+    away, both = shift - at, times * covariance + more + squared(off - other)
+    return np.asarray(np.einsum("hi,hi->h", away, np.linalg.solve(both, away[:, :, None])[:, :, 0]))
+
+
+def squared(off: Array) -> Array:
+    return np.asarray(np.einsum("...fi,...fj->...ij", off, off))
 
 
 def with_and_without(
@@ -55,8 +59,8 @@ def with_and_without(
     information: Array,
     middle: Array,
     model: Array,
-    finger: Ints,
-    fingers: int,
+    part: Ints,
+    parts: int,
     keep: Array,
     known: Array,
     known_pull: Array,
@@ -65,22 +69,35 @@ def with_and_without(
     off: Array,
     times: float,
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
-    sums = add_up(pull, information, middle, model, finger, fingers, keep, known, known_pull)
+    sums = add_up(pull, information, middle, model, part, parts, keep, known, known_pull)
     alone = separate(*sums, 6)
     together = separate(*with_pose(*sums, at, covariance, off), 6)
-    return alone, together, squares(alone[0], at, alone[1], times, covariance)
+    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
 
 
 def jumped(
-    shift: Array, covariance: Array, at: Array, known: Array, jumps: Array, prior: Array, stays: Array, times: float
-) -> tuple[Array]:
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    prior: Array,
+    stays: Array,
+    times: float,
+) -> Array:
     every = np.concatenate([jumps, np.zeros((1, 6, 6))])
     share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
-    density = [
-        [multivariate_normal.pdf(z, at, times * R + known + J) for J in every] for z, R in zip(shift, covariance)
+    spread = times * covariance + known + squared(off - known_off)
+    unit = np.sqrt(known.diagonal())  # so that densities are numbers of everyday size
+    both = (spread[:, None] + every) / np.outer(unit, unit)
+    log_density = [
+        [multivariate_normal.logpdf(z, at / unit, S, allow_singular=True) for S in row]
+        for z, row in zip(shift / unit, both, strict=True)
     ]
-    weight = share * np.array(density)
-    return ((weight / weight.sum(axis=1, keepdims=True))[:, :-1],)
+    weight = share * np.exp(log_density - np.max(log_density, axis=1, keepdims=True))
+    return np.asarray((weight / weight.sum(axis=1, keepdims=True))[:, :-1])
 
 
 def after_jumps(
