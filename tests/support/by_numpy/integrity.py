@@ -184,7 +184,8 @@ def telling(
 ) -> tuple[Array, Array, Array]:
     mean, covariance = mean - at, covariance + np.diag(wander)
     shift, of_frame, of_model = shift[rows], of_frame[rows], of_model[rows]
-    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 1.0, np.zeros((6, 6))) > limit
+    none = np.zeros((1, 6))
+    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 0.0 * off, 1.0, np.zeros((6, 6)), none) > limit
     frame |= np.einsum("gii->g", of_frame[:, :3, :3]) < np.einsum("gii->g", covariance[:, :3, :3])
     frame &= rows >= 0
     each = frame[:, None, None]
