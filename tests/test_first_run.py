@@ -1,5 +1,5 @@
-"""A newcomer without hardware copies commands: those of the tutorial and of the README's section, just as printed, each
-page in an empty folder.  Files are held against the simulator's truth, what is printed against what the page shows.
+"""A newcomer without hardware copies commands: those of the tutorial and of the README's section, just as printed, in
+an empty folder.  Files are held against the simulator's truth, what is printed against what the page shows.
 """
 
 from __future__ import annotations
@@ -69,14 +69,18 @@ def without_numbers(text: str) -> str:
     return re.sub(r"\s+", " ", re.sub(r"[-+]?\d[\d.,:]*(?:e[-+]?\d+)?", "#", text))
 
 
-@pytest.fixture(scope="module", params=["docs/tutorials/first_run.md", "README.md"])
-def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder after all commands of a page."""
-    folder = tmp_path_factory.mktemp("first")
-    blocks = page(request.param)
+@dataclass(frozen=True)
+class Walked:
+    """The folder after all commands of a page, and what each of them printed."""
+
+    folder: Path
+    printed: dict[str, str]
+
+
+def walk(name: str, folder: Path) -> Walked:
+    blocks, printed = page(name), {}
     assert sum(len(block.commands) for block in blocks) >= 11
     for block in blocks:
-        printed = ""
         for command in block.commands:
             if command.startswith("gripmon run"):
                 wait_for_default_port()
@@ -84,10 +88,50 @@ def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             promised = re.search(r"# exit code (\d+)", command)
             assert code == (int(promised[1]) if promised else 0), f"{command}\n{out}"
             assert "Traceback" not in out
-            printed += out
-        for line in block.shown:
-            assert without_numbers(line).strip() in without_numbers(printed), f"{line}\nisn't in\n{printed}"
-    return folder
+            printed[as_typed(command)] = out
+        assert_shown(block, printed)
+    return Walked(folder, printed)
+
+
+def as_typed(command: str) -> str:
+    """Without the comment and what a continued line indents."""
+    return " ".join(command.partition("#")[0].split())
+
+
+def assert_shown(block: Block, printed: dict[str, str]) -> None:
+    """What a page shows of a block's output is what its commands printed."""
+    said = without_numbers("".join(printed[as_typed(command)] for command in block.commands))
+    for line in block.shown:
+        assert without_numbers(line).strip() in said, f"{line}\nisn't in\n{said}"
+
+
+@pytest.fixture(scope="module")
+def tutorial(tmp_path_factory: pytest.TempPathFactory) -> Walked:
+    return walk("docs/tutorials/first_run.md", tmp_path_factory.mktemp("first"))
+
+
+@pytest.fixture(scope="module")
+def walked(tutorial: Walked) -> Path:
+    return tutorial.folder
+
+
+def test_the_readme_shows_commands_of_the_tutorial_and_what_they_print(tutorial: Walked):
+    blocks = page("README.md")
+    assert sum(len(block.commands) for block in blocks) >= 11
+    for block in blocks:
+        assert_shown(block, tutorial.printed)
+    commands = [as_typed(command) for block in blocks for command in block.commands]
+    images, rest = ([c for c in commands if c.startswith("gripmon simulate") is made] for made in (True, False))
+    assert commands == images + rest, "images are there before they are needed"
+    assert rest == [command for command in tutorial.printed if command in rest], "and files, too"
+
+
+@pytest.mark.slow("100 s; the same commands, as the tutorial has them, are in the default run")
+def test_the_readme_is_walked_by_itself(tmp_path: Path):
+    folder = walk("README.md", tmp_path).folder
+    test_the_camera_is_the_true_one(folder)
+    test_gripper_and_hand_eye_are_the_true_ones(folder)
+    test_the_knock_is_noticed_and_measured(folder)
 
 
 def test_the_camera_is_the_true_one(walked: Path):
@@ -131,8 +175,6 @@ def test_the_knock_is_noticed_and_measured(walked: Path):
 
 
 def test_the_arm_and_the_second_camera_are_the_true_ones(walked: Path):
-    if not (walked / "robot_world").exists():
-        pytest.skip("this page ends before")
     found, true = read(walked / "robot_world.yaml"), read(walked / "robot_world" / "truth.json")
     error = np.concatenate(
         [

@@ -54,8 +54,10 @@ def find_inner_edges(camera: Camera, matte: Matte, mask: NDArray[np.bool_]) -> l
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     inside = np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderValue=1), np.uint8)
     fold = np.arange(len(matte.images)) % FOLDS
-    parts = [matte.images, *(matte.images[fold != f] for f in range(FOLDS))]
-    means = [np.asarray(np.mean(part, axis=0), np.float32) for part in parts]
+    sums = np.stack([np.sum(matte.images[fold == f], axis=0, dtype=float) for f in range(FOLDS)])
+    total, images = sums.sum(axis=0), np.bincount(fold, minlength=FOLDS)
+    left = [(total, len(fold)), *((total - sums[f], len(fold) - images[f]) for f in range(FOLDS))]
+    means = [np.asarray(part / count, np.float32) for part, count in left]
     grey = np.clip(cv2.GaussianBlur(matte.mean, (0, 0), 0.8), 0.0, 255.0).astype(np.uint8)
     segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     out: list[InnerEdge] = []
