@@ -52,7 +52,8 @@ class Standing:
     ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
     edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
     nothing in the frame proves the pose, though an earlier frame proved one.  ``finer``: the fusion of edges and look
-    behind the pose; None: it is from the edges alone.
+    behind the pose; None: it is from the edges alone.  ``old``: beside an edge there are only pixels of an earlier
+    frame.
     """
 
     measurement: Measurement
@@ -65,6 +66,7 @@ class Standing:
     knocked: bool = False
     unproven: bool = False
     finer: Fused | None = None
+    old: bool = False
 
 
 class Question(NamedTuple):

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from gripmon.judge import drift, smoothing, stream
+from gripmon.judge import drift, repeats, smoothing, stream
 from gripmon.model import poses
 from gripmon.track import edges, integrity, look
 
@@ -29,7 +29,7 @@ def warm_up() -> str:
     patience = threading.Timer(LOADED_WITHIN_S, _log.info, ["compiling what every frame needs: about a minute, once"])
     patience.daemon = True
     patience.start()
-    for part in (edges, integrity, look, drift, smoothing, stream, poses):
+    for part in (edges, integrity, look, drift, smoothing, stream, repeats, poses):
         unkept = _warm(part.warm_up) or unkept
     patience.cancel()
     took_s = time.perf_counter() - begin_s
