@@ -14,7 +14,7 @@ import pytest
 from support.watched import new_monitor, rendered
 
 from gripmon.judge import repeats
-from gripmon.judge.repeats import NEW, OLD, SILENT, TEXT, TILE_PX, repeated_edges
+from gripmon.judge.repeats import TEXT, TILE_PX, repeated_edges
 from gripmon.judge.stream import StreamSettings
 from gripmon.model.records import AlertKind, Cause, Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
@@ -22,6 +22,7 @@ from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Background, Bump, Sensor
 
 FPS = 15.0
+SILENT, NEW, OLD = "silent", "new", "old"
 QUIET = Sensor(read_noise_dn=0.2, shot_noise_dn=0.001)
 
 
@@ -91,17 +92,17 @@ def test_a_still_robot_as_h264_stays_valid_for_as_long_as_a_coder_may_leave_it_o
 ):
     """Eight seconds without a key frame, in which most pixels beside the edges are never sent."""
     frames, _ = rendered(scene(9.0, QUIET))
-    states: list[np.ndarray] = []
+    old: list[bool] = []
 
-    def spied(*args: object) -> np.ndarray:
-        states.append(repeated_edges(*args))
-        return states[-1]
+    def spied(*args: object) -> tuple[np.ndarray, np.ndarray]:
+        found = repeated_edges(*args)
+        old.append(bool(found[1].any()))
+        return found
 
     monkeypatch.setattr(repeats, "repeated_edges", spied)
     monitor = new_monitor(MonitorSettings(stream=StreamSettings(frozen_coded_s=frozen_coded_s)))
     records = watched(monitor, h264(frames, tmp_path / "still.mp4", 8.0))
-    old = np.array([bool((state == OLD).any()) for state in states])
-    assert old.sum() > 30  # else it would show nothing
+    assert sum(old) > 30  # else it would show nothing
     doubted = [record for record in records[5:] if record.verdict is not Verdict.VALID]
     assert (not doubted) == stays
     assert all(record.reason == TEXT or "frozen" in record.reason for record in doubted[:1])
@@ -139,15 +140,16 @@ class Edges:
         share = np.random.default_rng(seed).uniform(0.1, 0.9, self.shape)
         return (share * self.white).astype(self.dtype)
 
-    def states(self, image: np.ndarray) -> list[int]:
+    def states(self, image: np.ndarray) -> list[str]:
         self.slot = (self.slot + 1) % len(self.ring)
         bits = {"uint8": 255, "uint16": 65535, "float32": 0x3F800000}[self.dtype]
         pixels = np.ascontiguousarray(image).view(np.uint8).reshape(len(image), -1)
         count, none = len(self.edge), np.zeros((len(self.edge), 2))
         each = np.arange(count, dtype=np.intp), np.zeros(count), np.ones(count)
         sizes = image.itemsize, pixels.shape[1] // image.shape[1]
-        found = repeated_edges(pixels, *sizes, bits, self.uv_px, none, *each, self.edge, self.ring, self.slot, 3)
-        return found.tolist()
+        new, old = repeated_edges(pixels, *sizes, bits, self.uv_px, none, *each, self.edge, self.ring, self.slot, 3)
+        assert not (new & old).any()
+        return [NEW if n else OLD if o else SILENT for n, o in zip(new, old, strict=True)]
 
 
 @pytest.mark.parametrize(("dtype", "channels"), [("uint8", 1), ("uint8", 3), ("uint16", 1), ("float32", 1)])
@@ -169,7 +171,7 @@ def test_which_edges_lie_among_old_pixels(dtype: str, channels: int):
 
 
 @pytest.mark.parametrize(("ago", "state"), [(1, OLD), (8, OLD), (9, NEW)])
-def test_up_to_eight_frames_are_remembered(ago: int, state: int):
+def test_up_to_eight_frames_are_remembered(ago: int, state: str):
     edges = Edges("uint8", 1)
     images = [edges.noise(k) for k in range(ago)]
     for image in images:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.inspection import FULL_SCALE
 from gripmon.judge.stream import RING_FRAMES, StreamFault, StreamSettings
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Cause, Image
@@ -27,9 +28,6 @@ JPEG.
 """
 
 TEXT = "the image repeats an earlier one to the bit beside the gripper's edges: data are missing, or lost on the way"
-
-_WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535, np.dtype(np.float32): 0x3F800000}
-"""Full scale as an unsigned number of as many bits."""
 
 
 class RepeatWatch:
@@ -58,11 +56,11 @@ class RepeatWatch:
         pixels = np.ascontiguousarray(image).view(np.uint8).reshape(rows, -1)
         pixels.flags.writeable = False
         prediction, candidates = measurement.prediction, measurement.candidates
-        state = repeated_edges(
+        new, old = repeated_edges(
             pixels,
             image.itemsize,
             pixels.shape[1] // columns,
-            _WHITE[image.dtype],
+            int(np.array(FULL_SCALE[image.dtype], image.dtype).view(f"u{image.itemsize}")),
             prediction.uv_px,
             prediction.normal,
             candidates.sample,
@@ -73,8 +71,7 @@ class RepeatWatch:
             self._slot,
             len(self._new_s),
         )
-        old = state == OLD
-        self._new_s[~old & ((state == NEW) | np.isinf(self._new_s))] = now_s
+        self._new_s[new | (old & np.isinf(self._new_s))] = now_s
         longest_s = float((now_s - self._new_s[old]).max(initial=0.0))
         settings = self._settings
         late = longest_s > (settings.frozen_coded_s if coded else 0.0)
@@ -84,18 +81,16 @@ class RepeatWatch:
         return late
 
 
-SILENT, NEW, OLD = 0, 1, 2
-"""What an edge's tiles say: nothing, or not enough of them; one is new; all are those of one earlier frame."""
-
-
 @compiled
 def repeated_edges(
     pixels: Any, item: int, pixel: int, white: int, uv_px: Any, normal: Any, sample: Any, offset_px: Any, weight: Any,
     edge: Any, ring: Any, slot: int, edges: int,
 ) -> Any:  # fmt: skip
-    """(e,) whether each edge's points in use lie in tiles that repeat an earlier frame to the bit.
+    """(e,) which edges' points in use lie in tiles of which one is new, and (e,) which in tiles that all repeat one
+    earlier frame to the bit; an edge with too few tiles to tell does neither.
 
-    ``pixels`` (h, bytes of a row), of ``item`` bytes a value and ``pixel`` bytes a pixel; points (k,) ``offset_px``
+    ``pixels`` (h, bytes of a row), of ``item`` bytes a value, that of ``white`` as an unsigned number, and ``pixel``
+    bytes a pixel; points (k,) ``offset_px``
     along the normals of their search lines.  ``ring`` (frames, tiles): numbers of the tiles of earlier frames, 0 where
     nothing was in use, 1 where nothing but black and white; those of this frame are written to ``slot``.
     """
@@ -125,15 +120,13 @@ def repeated_edges(
             if frame != slot and ring[frame, tile] != 0:
                 known[e, frame] += 1
                 same[e, frame] += ring[frame, tile] == ring[slot, tile]
-    state = np.zeros(edges, np.int64)
+    new, old = told >= FEWEST_TILES, np.zeros(edges, np.bool_)
     for e in range(edges):
-        if told[e] < FEWEST_TILES:
-            continue
-        state[e] = NEW
         for frame in range(frames):
-            if known[e, frame] >= FEWEST_TILES and 2 * known[e, frame] >= told[e] and same[e, frame] == known[e, frame]:
-                state[e] = OLD
-    return state
+            enough = known[e, frame] >= FEWEST_TILES and 2 * known[e, frame] >= told[e]
+            if enough and same[e, frame] == known[e, frame]:
+                new[e], old[e] = False, True
+    return new, old
 
 
 @compiled
