@@ -12,7 +12,7 @@ import msgspec
 
 from gripmon.model.decoding import decoder_of
 from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
-from gripmon.model.records.frames import FrameRecord
+from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.laser import LaserPulse, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
 from gripmon.model.records.references import ReferenceRecord
@@ -34,6 +34,9 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "error": CommandError,
 }
 """All messages that go over the wire."""
+
+OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1}
+"""The previous major version of a message, which is read as well."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
@@ -70,6 +73,9 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     try:
         return decoder_of(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        older = OLDER.get(message)
+        if older is not None and _schema_of(payload) == schema_name(older):
+            return from_json(payload, older)  # type: ignore[return-value]  # a kind of the same message
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
@@ -84,10 +90,15 @@ def schema_name(message: type[msgspec.Struct]) -> str:
 
 
 def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Exception) -> str:
-    try:
-        schema = decoder_of(_Tag).decode(payload).schema
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        schema = ""
+    schema = _schema_of(payload)
     if schema and schema != (known := schema_name(message)):
         return f"its schema is {schema[:80]!r}, and this version of gripmon reads {known!r}; update the older one"
     return f"no message {schema_name(message)}: {str(error) or type(error).__name__}"
+
+
+def _schema_of(payload: bytes) -> str:
+    """The schema that a payload names; empty where it names none."""
+    try:
+        return decoder_of(_Tag).decode(payload).schema
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return ""
