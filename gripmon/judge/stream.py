@@ -99,7 +99,7 @@ class StreamFault(NamedTuple):
     over when it is reported; its cause is unknown: the camera was away, or its clock was set.
     """
 
-    kind: Literal["frozen", "replaced", "clock", "gap", "rate"]
+    kind: Literal["frozen", "repeated", "replaced", "clock", "gap", "rate"]
     cause: Cause
     text: str
 
@@ -135,6 +135,11 @@ class StreamWatch:
         return self._frozen.repeats
 
     @property
+    def coded(self) -> bool:
+        """Whether the stream has shown that its coder leaves out what stands still."""
+        return self._frozen.coded
+
+    @property
     def frames_per_s(self) -> float | None:
         """Rate at which frames arrive here, from the median interval of their stamps; None until known."""
         return self._rate.frames_per_s
@@ -159,6 +164,10 @@ class _Frozen:
     def repeats(self) -> bool:
         return self._run > 0
 
+    @property
+    def coded(self) -> bool:
+        return self._coded >= SURE_FRAMES
+
     def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
         image = frame.image
         if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
@@ -180,7 +189,7 @@ class _Frozen:
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
         enough = max(self._settings.frozen_frames, FREEZE_TO_USUAL_RATIO * self._longest)
         settings = self._settings
-        frozen_s = settings.frozen_s if self._coded < SURE_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
+        frozen_s = max(settings.frozen_s, settings.frozen_coded_s) if self.coded else settings.frozen_s
         self._frozen |= self._run >= enough and lasted_ns >= NS_PER_S * frozen_s
         if not self._frozen:
             return None

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.model.errors import InputError
+from gripmon.model.jpeg import jpeg_fault
 
 if TYPE_CHECKING:
     from gripmon.model.records import Image
@@ -110,8 +111,9 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
         return None, "the file is empty"
     if data.startswith(PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
         return None, "truncated, damaged or not an image"  # libpng would print its own message to stderr
+    if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
+        return None, fault
     try:
-        # Decoding from memory makes a truncated JPEG fail; reading from a file would fill the rest with grey.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         return None, f"not an image: {error.err}"

@@ -15,6 +15,7 @@ import numpy as np
 from gripmon.judge.causes import CauseJudge, Watches
 from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.judge.policy import Evidence
+from gripmon.judge.repeats import RepeatWatch
 from gripmon.judge.stream import CALM_FRAMES, StreamFault, StreamWatch
 from gripmon.model.camera import Camera
 from gripmon.model.errors import in_short
@@ -184,6 +185,7 @@ class FrameAnalysis:
         self._gripper, self._tracker, self._valid_by = gripper, tracker, settings.policy.valid_by
         self._reach_px = settings.corners.sampling.reach_px
         self.stream = StreamWatch(settings.stream)
+        self._repeats = RepeatWatch(settings.stream, len(gripper.edge_ids))
         self.watch = MotionWatch(settings.drift)
         jaw = settings.jaw_sigma_m, settings.jaw_offset_sigma_m
         self.causes = CauseAnalysis(CauseJudge(camera, gripper, settings.causes, np.zeros(6), *jaw))
@@ -211,6 +213,8 @@ class FrameAnalysis:
         """Return the stream's faults; pass its rate to the drift test, and use the cause analyses that are due."""
         self.causes.catch_up(now_s)
         faults = self.stream.add(frame)
+        if self._repeats.fault is not None:
+            faults = (*faults, self._repeats.fault)  # known from the frame before: it takes a measurement
         for fault in faults:
             if fault.kind == "gap":
                 self.causes.interrupted()
@@ -218,6 +222,13 @@ class FrameAnalysis:
         if frames_per_s is not None:
             self.watch.set_frames_per_s(frames_per_s)
         return faults
+
+    def checked(self, frame: Frame, standing: Standing, now_s: float) -> Standing:
+        """The same, not believed where it rests on pixels of an earlier frame."""
+        assert frame.image is not None
+        if self.stream.repeats or not self._repeats.add(frame.image, standing.measurement, self.stream.coded, now_s):
+            return standing
+        return replace(standing, believed=False, old=True)
 
     def evidence(
         self,
@@ -273,6 +284,7 @@ class FrameAnalysis:
             since_first=error is not None and bool(error.any()),
             unproven=standing.unproven,
             cut_off=2 * int(measurement.cut_off.sum()) > len(measurement.cut_off),
+            old=standing.old,
         )
 
     def _since_start(self, shift: Array, covariance: Array) -> Array | None:

@@ -185,6 +185,7 @@ class Monitor:
         if standing is None:
             explanation = self._analysis.explain(frame, self._newest, wrong=True, usual=False, now_s=self._now_s)
             return self._unmeasured(frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation)
+        standing = self._analysis.checked(frame, standing, self._now_s)
         self._standing, self._newest = standing, standing.measurement
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True

@@ -53,7 +53,8 @@ class Standing:
     ``believed``: averages, the drift test and learning use the pose.
     ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
     edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
-    nothing in the frame proves the pose, though an earlier frame proved one.
+    nothing in the frame proves the pose, though an earlier frame proved one.  ``old``: beside an edge there are only
+    pixels of an earlier frame.
     """
 
     measurement: Measurement
@@ -65,6 +66,7 @@ class Standing:
     grasped: bool = False
     knocked: bool = False
     unproven: bool = False
+    old: bool = False
 
 
 class Question(NamedTuple):

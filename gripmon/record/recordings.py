@@ -17,6 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.images import JPEG
+from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.records import (
     AlertRecord,
     CornerRecord,
@@ -252,7 +254,7 @@ def decode_image(blob: bytes) -> Image | None:
     """The pixels of a recorded image, unchanged; None if it is damaged."""
     import cv2
 
-    if not blob:
+    if not blob or (blob.startswith(JPEG) and jpeg_fault(blob) is not None):
         return None
     try:
         image: Image | None = cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -1,22 +1,21 @@
 """Newest frame wins: a thread reads into a slot for one frame, which drops older ones.  A camera through
-``cv2.VideoCapture`` that reconnects automatically.
+``cv2.VideoCapture``, or JPEGs over HTTP, that reconnects automatically.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import re
-import statistics
 import threading
 import time
-from collections import deque
 from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
-from gripmon.model.records import Frame
+from gripmon.io.sources.http_jpegs import HttpJpegs
+from gripmon.io.sources.queued import Backlog
+from gripmon.model.records import Frame, Image
 
 _log = logging.getLogger(__name__)
 _SILENT = Waiting("the camera is silent")
@@ -164,7 +163,7 @@ class LiveCamera(NewestFrame):
 
     ``stamp_ns`` is the Unix time of the frame's arrival here, before decoding; frames that queued up on the way while
     the camera was silent are dropped (:class:`Backlog`).  ``seq`` counts arrivals, so dropped frames leave gaps.
-    Images are BGR as OpenCV delivers them.
+    Images are BGR.  A URL over HTTP is asked for JPEGs first; what it can do about size and rate stands in the URL.
     """
 
     def __init__(self, settings: LiveSettings) -> None:
@@ -192,48 +191,61 @@ class Backoff:
         self._next_s = self._first_s
 
 
-GAP_S = 0.1
-_USUAL, _FEWEST, _NEWEST = 30, 5, 3
+class _Stream(Protocol):
+    """An open camera: wait for a frame; decode it, or say why that isn't possible; close it."""
+
+    def grab(self) -> bool: ...
+    def image(self) -> tuple[Image | None, str | None]: ...
+    def release(self) -> None: ...
 
 
-class Backlog:
-    """Tells frames that waited in a queue (of the network, the driver, a suspended machine) from those that have just
-    been taken: OpenCV gives them no time of capture, and all are read as soon as the silence ends.
+class _VideoCapture:
+    """OpenCV's."""
 
-    After a silence of three usual periods and :data:`GAP_S`, a frame counts as queued until as many have come as fit
-    into the time since, or until the newest three came at the usual rate: then the others were lost, or never taken.
-    Where reading a frame takes three quarters of the period or more, the two can't be told apart.
-    """
+    def __init__(self, capture: Any) -> None:
+        self._capture = capture
+        self.grab, self.release = capture.grab, capture.release
 
-    def __init__(self) -> None:
-        self._periods_s: deque[float] = deque(maxlen=_USUAL)
-        self._newest_s: deque[float] = deque(maxlen=_NEWEST)
-        self._last_s: float | None = None
-        self._began_s: float | None = None
-        self._count = 0
+    @classmethod
+    def open(cls, settings: LiveSettings, api: int, name: str) -> _VideoCapture | None:
+        import cv2
 
-    def queued(self, now_s: float) -> bool:
-        """Whether the frame read at ``now_s`` was taken long before."""
-        last_s, self._last_s = self._last_s, now_s
-        if last_s is None:
-            return False
-        period_s = now_s - last_s
-        usual_s = statistics.fmean(self._periods_s) if len(self._periods_s) >= _FEWEST else math.inf
-        if self._began_s is None:
-            if period_s <= max(3.0 * usual_s, GAP_S):
-                self._periods_s.append(period_s)
-                return False
-            self._began_s, self._count = last_s, 0
-            self._newest_s.clear()
-        else:
-            self._newest_s.append(period_s)
-        self._count += 1
-        at_rate = len(self._newest_s) == _NEWEST and sum(self._newest_s) > 0.75 * _NEWEST * usual_s
-        if at_rate or now_s - self._began_s < (self._count + 1) * usual_s:
-            self._began_s = None
-            self._periods_s.extend(self._newest_s if at_rate else ())
-            return False
-        return True
+        options: list[int] = []
+        if api == cv2.CAP_FFMPEG:
+            for prop, limit_s in (
+                (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, settings.open_timeout_s),
+                (cv2.CAP_PROP_READ_TIMEOUT_MSEC, settings.read_timeout_s),
+            ):
+                options += [prop, round(1000.0 * limit_s)]
+        capture = cv2.VideoCapture(settings.device, api, options)
+        if not capture.isOpened():
+            capture.release()
+            return None
+        _ask_for_options(capture, settings, name)
+        return cls(capture)
+
+    def image(self) -> tuple[Image | None, str | None]:
+        decoded, image = self._capture.retrieve()
+        return (image, None) if decoded else (None, "the frame can't be decoded")
+
+
+def _ask_for_options(capture: Any, settings: LiveSettings, name: str) -> None:
+    import cv2
+
+    if settings.fourcc is not None:
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc))
+    asked = {
+        "width_px": (cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
+        "height_px": (cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
+        "fps": (cv2.CAP_PROP_FPS, settings.fps),
+    }
+    for prop, value in asked.values():
+        if value is not None:
+            capture.set(prop, float(value))
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1.0)  # a queue in the driver would only add delay
+    for key, (prop, value) in asked.items():
+        if value is not None and abs(capture.get(prop) - value) > 0.01 * value:
+            _log.warning("%s: %s is %g, not the %g asked for", name, key, capture.get(prop), value)
 
 
 class _CaptureReader:
@@ -244,7 +256,7 @@ class _CaptureReader:
         self._name = shown_name(settings.device)
         self._api = backend_number(settings)
         self._backoff = Backoff(settings.retry_first_s, settings.retry_longest_s)
-        self._capture: Any = None
+        self._capture: _Stream | None = None
         self._stop = threading.Event()
         self._next_try_s = 0.0
         self._waiting = Waiting(f"{self._name}: connecting")
@@ -270,8 +282,10 @@ class _CaptureReader:
             if pause_s > 0.0:
                 self._stop.wait(min(pause_s, _PAUSE_S))
                 return self._waiting
-            if not self._connect():
+            self._capture = self._connect()
+            if self._capture is None:
                 return self._lost("can't be opened")
+            self._backlog = Backlog()
         if not self._capture.grab():
             return self._lost("delivers no frames" if self._delivers else "opens, but delivers no frame")
         stamp_ns, arrived_ns = time.time_ns(), time.monotonic_ns()
@@ -279,52 +293,24 @@ class _CaptureReader:
             self._seq += 1
             self.queued += 1
             return Waiting(f"{self._name}: old frames that queued up are passed over")
-        decoded, image = self._capture.retrieve()
+        image, fault = self._capture.image()
         if not self._delivers:
             self._delivers = True
             _log.info("%s: connected", self._name)
         self._backoff.reset()
         seq, self._seq = self._seq, self._seq + 1
-        if not decoded:
-            return Frame(seq, stamp_ns, None, None, self._name, "the frame can't be decoded", arrived_ns=arrived_ns)
-        return Frame(seq, stamp_ns, image, None, self._name, arrived_ns=arrived_ns)
+        return Frame(seq, stamp_ns, image, None, self._name, fault, arrived_ns=arrived_ns)
 
-    def _connect(self) -> bool:
-        import cv2
-
-        options: list[int] = []
-        if self._api == cv2.CAP_FFMPEG:
-            for prop, limit_s in (
-                (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, self._settings.open_timeout_s),
-                (cv2.CAP_PROP_READ_TIMEOUT_MSEC, self._settings.read_timeout_s),
-            ):
-                options += [prop, round(1000.0 * limit_s)]
-        capture = cv2.VideoCapture(self._settings.device, self._api, options)
-        if not capture.isOpened():
-            capture.release()
-            return False
-        self._capture, self._backlog = capture, Backlog()
-        self._ask_for_options()
-        return True
-
-    def _ask_for_options(self) -> None:
-        import cv2
-
-        s, capture = self._settings, self._capture
-        if s.fourcc is not None:
-            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*s.fourcc))
-        asked = {
-            "width_px": (cv2.CAP_PROP_FRAME_WIDTH, s.width_px),
-            "height_px": (cv2.CAP_PROP_FRAME_HEIGHT, s.height_px),
-            "fps": (cv2.CAP_PROP_FPS, s.fps),
-        }
-        for prop, value in asked.values():
-            if value is not None:
-                capture.set(prop, float(value))
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1.0)  # a queue in the driver would only add delay
-        for key, (prop, value) in asked.items():
-            if value is not None and abs(capture.get(prop) - value) > 0.01 * value:
-                _log.warning("%s: %s is %g, not the %g asked for", self._name, key, capture.get(prop), value)
+    def _connect(self) -> _Stream | None:
+        settings = self._settings
+        stream: _Stream | None = None
+        if is_http(settings):
+            try:
+                stream = HttpJpegs.open(str(settings.device), settings.open_timeout_s, settings.read_timeout_s)
+            except OSError as error:
+                _log.debug("%s: %s", self._name, error)
+                return None
+        return stream or _VideoCapture.open(settings, self._api, self._name)
 
     def _lost(self, what: str) -> Waiting:
         self._release()
@@ -339,6 +325,12 @@ class _CaptureReader:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+
+def is_http(settings: LiveSettings) -> bool:
+    """Whether the device is a URL over HTTP that may be a stream of JPEGs."""
+    device = str(settings.device)
+    return settings.backend != "gstreamer" and "!" not in device and bool(re.match(r"https?://", device, re.IGNORECASE))
 
 
 def shown_name(device: int | str) -> str:

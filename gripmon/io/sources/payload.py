@@ -5,17 +5,23 @@ from __future__ import annotations
 import functools
 import io
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gripmon.model.errors import one_line
-from gripmon.model.images import PNG
+from gripmon.model.images import JPEG, PNG
+from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.pixels import ENCODINGS, unpacked
 from gripmon.model.records import FrameNote, Image, MessageRefused, from_json
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
+
+LARGEST_PX = 20_000
+"""Largest width and height of a camera's image whose size isn't known beforehand, px."""
 
 MOST_SCANS = 100
 """A progressive JPEG has some ten; each one costs as much as the whole image, however few bytes it has."""
@@ -76,22 +82,47 @@ def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
     uses Pillow, because OpenCV can't read only the header, and writes warnings about damaged files to stderr.  Raises
     :class:`PayloadError`.
     """
-    try:
+    with _damaged("PNG" if payload.startswith(PNG) else "JPEG"):
         if payload.startswith(PNG):
             _check_png(payload)
             with _open_file(payload) as checked:
                 check_size(checked.size, expected_px)
                 checked.verify()  # the check sums; the file has to be opened again after it
-        elif payload.count(b"\xff\xda") > MOST_SCANS:
-            raise PayloadError(f"a JPEG of more than {MOST_SCANS} scans; a usual one")
+        else:
+            _check_jpeg(payload)
         with _open_file(payload) as file:
             check_size(file.size, expected_px)
             return _array_of(file)
+
+
+def jpeg_in_colour(payload: bytes) -> Image:
+    """A JPEG of any size -> H x W x 3 (BGR), uint8.  Raises :class:`PayloadError`."""
+    if not payload.startswith(JPEG):
+        raise PayloadError(f"no JPEG file: it begins with {payload[:8].hex() or 'nothing'}")
+    with _damaged("JPEG"):
+        _check_jpeg(payload)
+        with _open_file(payload) as file:
+            if max(file.size) > LARGEST_PX:
+                raise PayloadError(f"a JPEG of {file.width}x{file.height} pixels; at most {LARGEST_PX} each way")
+            return np.ascontiguousarray(np.asarray(file.convert("RGB"))[:, :, ::-1])
+
+
+@contextmanager
+def _damaged(kind: str) -> Iterator[None]:
+    """Raises :class:`PayloadError` for whatever a decoder raises."""
+    try:
+        yield
     except PayloadError:
         raise
     except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
-        kind = "PNG" if payload.startswith(PNG) else "JPEG"
         raise PayloadError(f"damaged {kind} file ({one_line(error)}); a whole one") from None
+
+
+def _check_jpeg(payload: bytes) -> None:
+    if payload.count(b"\xff\xda") > MOST_SCANS:
+        raise PayloadError(f"a JPEG of more than {MOST_SCANS} scans; a usual one")
+    if (fault := jpeg_fault(payload)) is not None:
+        raise PayloadError(f"damaged JPEG file ({fault}); a whole one")
 
 
 def _open_file(payload: bytes) -> ImageFile:

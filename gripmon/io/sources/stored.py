@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from gripmon.io.ros2.node import opening_between
 from gripmon.io.sources.base import SourceError
 from gripmon.model.errors import one_line
+from gripmon.model.images import JPEG
+from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.records import Array, Image
 
 if TYPE_CHECKING:
@@ -93,6 +95,8 @@ def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
     """
     import cv2
 
+    if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
+        return None, fault
     try:
         image: Image | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     except cv2.error:

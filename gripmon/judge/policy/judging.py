@@ -17,6 +17,7 @@ from gripmon.judge.causes import NOT_THE_CAMERA
 from gripmon.judge.policy.alerts import AlertBook, Topic
 from gripmon.judge.policy.settings import PolicySettings, time_left_s
 from gripmon.judge.policy.words import creep_text, frequency_text, motion_text, unproven_text
+from gripmon.judge.repeats import TEXT as REPEATED
 from gripmon.model.records import (
     NOTHING_WRONG,
     Alert,
@@ -62,7 +63,8 @@ class Evidence:
     ``believed``: the gripper may be taken to be there.
     ``since_first``: ``motion`` counts from where the first frames had the camera, which the reference allows, not
     from the reference.  ``unproven``: nothing in the frame proves where the gripper is, though a frame before did.
-    ``cut_off``: most of the gripper's edges lie beside white or black that is cut off.
+    ``cut_off``: most of the gripper's edges lie beside white or black that is cut off.  ``old``: beside an edge there
+    are only pixels of an earlier frame.
     """
 
     shift: Array
@@ -81,6 +83,7 @@ class Evidence:
     since_first: bool = False
     unproven: bool = False
     cut_off: bool = False
+    old: bool = False
 
     @property
     def moved(self) -> bool:
@@ -152,6 +155,8 @@ class Policy:
         """Why a measured transform isn't valid, its bound being ``beyond`` a limit or not; None where it is."""
         if not confirmed:
             return "not yet confirmed by a second frame"
+        if evidence.old:
+            return REPEATED
         if evidence.stream_at_fault:
             return "the stream of frames is at fault"
         if evidence.explanation.probable.cause in NO_REFERENCE:
