@@ -34,8 +34,15 @@ def line(**columns: Any) -> dict[str, Any]:
         "level_m": [1e-4] * n,
         "level_rad": [1e-3] * n,
         "floor_m": [5e-5] * n,
+        "reference_m": [None] * n,
+        "absolute_m": [1e-4] * n,
         "nees": [6.0] * n,
         "why": [""] * n,
+        "valid_by": "absolute",
+        "knock": None,
+        "moved_alerts": [],
+        "commit": "abc",
+        "grey_dn": 100.0,
     }
     return {**good, **columns}
 
@@ -62,6 +69,175 @@ def test_misleading_frames_are_counted_by_kind():
     assert (out["lies"], out["unbounded"], out["suspect_unbounded"], out["misleading_scenes"]) == (1, 3, 1, 1)
     found = worst(lines)
     assert (found[0]["scene"], found[0]["frame"], found[0]["misleading"]) == (0, 2, 3)
+
+
+def test_figures_count_scenes_and_the_worst_excess():
+    from benchmarks.integrity_stats import figures
+
+    beyond = {"error_m": [1e-5] * 3 + [1.2e-4, 1.4e-4] + [1e-5] * 5}
+    crash = line(condition="one finger: crash", error_m=[1e-5] * 5 + [9e-3] * 5)
+    out = figures([line(**beyond), line(scene=1, **beyond), line(scene=2), crash])
+    assert (out["unbounded"], out["unbounded_scenes"], out["lies"], out["lies_scenes"]) == (9, 3, 5, 1)
+    assert out["worst_excess"] == pytest.approx(90.0)
+    # A crash is in no promise; its 5 frames and its scene are not among these.
+    kept = out["promised"]
+    assert (kept["scenes"], kept["frames"], kept["lies"], kept["unbounded"], kept["unbounded_scenes"]) == (
+        3,
+        27,
+        0,
+        4,
+        2,
+    )
+    assert kept["worst_excess"] == pytest.approx(1.4)
+    # Two of three scenes, exactly: the p with P(at most 2 of 3) = 0.05 is that with p³ = 0.95.
+    assert kept["unbounded_scenes_at_most"] == pytest.approx(0.95 ** (1.0 / 3.0))
+
+
+@pytest.mark.parametrize(
+    ("condition", "valid_by", "promised"),
+    [
+        ("tips worn", "absolute", False),
+        ("one finger: tips worn", "absolute", False),
+        ("tips worn", "reference", True),
+        ("crash", "reference", False),
+        ("bump", "absolute", True),
+    ],
+)
+def test_the_promise_leaves_out_a_closed_list(condition: str, valid_by: str, promised: bool):
+    from benchmarks import integrity_stats
+
+    assert integrity_stats.promised(line(condition=condition, valid_by=valid_by)) is promised
+
+
+def test_frames_until_the_first_valid_one():
+    from benchmarks.integrity_stats import figures, first_valid
+
+    late, never = line(valid=[False] * 4 + [True] * 6), line(valid=[False] * 10)
+    assert (first_valid(line()), first_valid(late), first_valid(never)) == (1.0, 5.0, np.inf)
+    out = figures([line(), late, never])
+    assert (out["first_valid"], out["never_valid"]) == (5.0, 1)
+
+
+def test_frames_valid_at_other_limits():
+    """By the bound; one that another doubt keeps from being valid isn't at any limit, nor one turned too far."""
+    from benchmarks.integrity_stats import figures
+
+    level_m = [1e-4, 1e-4, 1e-4, 6e-4, 6e-4, 1.5e-3, 1.5e-3, 3e-3, 1e-4, 1e-4]
+    valid = [False, True, False, False, False, False, False, False, True, True]
+    level_rad = [1e-3] * 8 + [1e-3, 0.5]
+    out = figures([line(level_m=level_m, valid=valid, level_rad=level_rad)])
+    # Of nine frames: within 0.5 mm the first and the last but one; 1 mm: two more; 2 mm: two more.
+    assert out["within"] == pytest.approx([2 / 9, 4 / 9, 6 / 9])
+
+
+def test_frames_from_a_knock_until_it_is_said_found_and_valid():
+    from benchmarks.integrity_stats import Knock, knock_of
+
+    # A jump of 2 mm before frame 3; measured within 0.5 mm from frame 5 on, held before; said at 6; valid from 7.
+    errors = [1e-5] * 3 + [2e-3, 1e-4] + [1e-4] * 5
+    nees = [6.0] * 3 + [6.0, None] + [6.0] * 5
+    scene = line(
+        knock=[3, 2e-3], error_m=errors, nees=nees, moved_alerts=[1, 6], valid=[True] * 3 + [False] * 4 + [True] * 3
+    )
+    assert knock_of(scene) == Knock(said=4.0, found=3.0, valid=3.0)
+    assert knock_of(line(knock=[3, 2e-3], error_m=[2e-3] * 10)) == Knock(np.inf, np.inf, np.inf)
+    assert knock_of(line()) is None and knock_of(line(knock=[-2, 2e-3])) is None
+
+
+def test_alert_limits_are_data_and_follow_the_scale():
+    from benchmarks import integrity_limits
+    from benchmarks.integrity_limits import frozen_limits
+
+    at_6, at_8 = (frozen_limits("two_box_fingers", False, scale) for scale in (6.0, 8.0))
+    # The exponents and limits of the file, by hand.
+    assert at_6.position_m == pytest.approx(2.64e-3)
+    assert at_8.position_m == pytest.approx(2.64e-3 * (8.0 / 6.0) ** -1.11)
+    assert at_6.rotation_rad == pytest.approx(0.035)
+    # Never above 5 mm and 5 degrees, nor below 1 mm and 2 degrees.
+    assert frozen_limits("two_box_fingers, one", True, 3.0) == integrity_limits.AlertLimits(5e-3, 0.0873)
+    assert frozen_limits("rounded_fingers", True, 12.0) == integrity_limits.AlertLimits(1e-3, 0.035)
+    with pytest.raises(KeyError, match="no limits of hand"):
+        frozen_limits("hand", True, 6.0)
+
+
+def test_the_monitor_that_is_judged_gets_the_frozen_limits():
+    from benchmarks.integrity_practice import CONDITIONS
+    from benchmarks.integrity_runs import _settings, _simulated
+    from benchmarks.integrity_scenes import make_integrity_scene
+
+    by_name = {condition.name: condition for condition in CONDITIONS}
+    watched = _simulated(make_integrity_scene(by_name["pads"], 3, 0, 20))
+    settings = _settings(watched)
+    assert (settings.policy.alert_limit_m, settings.policy.alert_limit_rad) == (2.52e-3, 0.035)
+    assert settings.corners.edges.response == "srgb"
+    assert (watched.camera.width_px, watched.camera.height_px) == (1280, 720)
+
+
+class _Bound:
+    position_m, rotation_rad, since = 1e-4, 2e-3, "reference"
+
+
+class _Record:
+    """As a record of schema 2."""
+
+    protection = _Bound()
+    since_reference = _Bound()
+    absolute = None
+    valid_by = "reference"
+
+
+def test_both_bounds_are_read_where_a_record_has_them():
+    from benchmarks.integrity_runs import bounds_of
+
+    class Old:
+        protection = _Bound()
+
+    assert bounds_of(Old()) == {"reference": None, "absolute": (1e-4, 2e-3)}  # type: ignore[arg-type]
+    assert bounds_of(_Record()) == {"reference": (1e-4, 2e-3), "absolute": None}  # type: ignore[arg-type]
+
+
+def test_by_the_reference_its_own_error_is_no_error():
+    from benchmarks.integrity_runs import Truth
+
+    from gripmon.model.geometry import exp_rotation, make_transform, perturb
+
+    true_start = make_transform(exp_rotation(np.array([0.5, 0.0, 0.1])), np.array([0.01, 0.0, 0.1]))
+    wrong = perturb(true_start, np.array([1e-3, -2e-3, 5e-4, 0.01, 0.0, -0.02]))
+    # The mount turns by a rotation and shifts the TCP: the reference, moved likewise, is right.
+    motion = np.array([3e-3, 1e-3, -2e-3, 0.02, -0.01, 0.03])
+    now = perturb(true_start, motion)
+    truth = Truth(wrong, true_start)
+    assert np.allclose(truth.of(_Record(), now), perturb(wrong, motion), atol=1e-12)  # type: ignore[arg-type]
+
+    class Absolute(_Record):
+        valid_by = "absolute"
+
+    assert np.array_equal(Truth(wrong, true_start).of(Absolute(), now), now)  # type: ignore[arg-type]
+
+
+def test_a_page_beside_another_revision():
+    from benchmarks.integrity_compare import as_text
+
+    before = [line(commit="old", valid=[False] * 5 + [True] * 5), line(commit="old", scene=1)]
+    after = [line(commit="new"), line(commit="new", scene=1, grey_dn=90.0), line(commit="new", scene=7)]
+    page = as_text(after, before)
+    (row,) = (text for text in page.splitlines() if text.startswith("made up"))
+    # 14 of 18 frames were valid, now all are; the first was frame 6 or 1: the median over two scenes 3.5, now 1.
+    assert "77.8 → 100.0" in row and "3.5 → 1" in row
+    assert "old → new" in page and "valid in both 14, only before 0, only after 4, in neither 0" in page
+    assert "NOT THE SAME images or limits in 1 scenes" in page and "1 scenes only here" in page
+    assert "no scene of the other file" in as_text(after, [line(seed=2)])
+
+
+def test_finished_scenes_of_other_code_are_not_continued(tmp_path: Path):
+    from benchmarks.integrity import append_line, read_lines
+
+    state = tmp_path / "state.jsonl"
+    append_line(state, {**line(), "code": "one", "seconds": 1.0})
+    append_line(state, {**line(), "code": "two", "seconds": 2.0})
+    assert [each["seconds"] for each in read_lines(state, "one").values()] == [1.0]
+    assert [each["seconds"] for each in read_lines(state).values()] == [2.0]
+    assert read_lines(state, "three") == {} and read_lines(None) == {}
 
 
 @pytest.mark.parametrize(
@@ -123,6 +299,7 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
 
 @pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
+    from benchmarks.integrity_draft import Fingers
     from benchmarks.integrity_practice import CONDITIONS
     from benchmarks.integrity_scenes import make_integrity_scene
     from benchmarks.outline_seen import outline_seen
@@ -135,7 +312,10 @@ def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
             assert 15.0 <= simulator.scenario.fps <= 30.0
             if not first:
                 seen = [outline_seen(simulator, index) for index in (0, 14)]
-                assert all(s.tips.min() > 0.99 and s.edges.min() > 0.99 for s in seen), condition.name
+                free = condition.fingers is not Fingers.SHORT  # of which the border cuts off the tips' far edges
+                assert all(s.tips.min() > (0.99 if free else 0.3) and s.edges.min() > 0.99 for s in seen), (
+                    condition.name
+                )
             truth = simulator.truth(first)
             assert 0.0 < np.linalg.norm(scene.start_cam_T_grip[:3, 3] - truth.cam_T_grip[:3, 3]) < 6e-4
             again = make_integrity_scene(condition, 5, number, 96)
@@ -173,11 +353,9 @@ def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(tmp_path: Path):
         ("grasp", 0, 8),
     ]
     kept = state.read_text().splitlines()
-    # The first line is marked: if it comes back, it was not run again.  The second is of a version that didn't count
-    # false alerts, and cut off besides: it is.
+    # The first line is marked: if it comes back, it was not run again.  The second was cut off: it is.
     marked = {**json.loads(kept[0]), "seconds": 12345.0}
-    old = {key: value for key, value in json.loads(kept[1]).items() if key != "false_alerts"}
-    state.write_text("\n".join([json.dumps(marked), json.dumps(old), kept[1][:50]]))
+    state.write_text("\n".join([json.dumps(marked), kept[1][:50]]))
     more = integrity.measure(plan)
     assert sorted(one["seconds"] == 12345.0 for one in more) == [False, True]
     assert [one["error_m"] for one in more] == [one["error_m"] for one in lines]

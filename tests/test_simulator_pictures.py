@@ -23,11 +23,14 @@ from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, Pa
 from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulate.background import _smear_kernel
 from gripmon.simulate.coverage import CoverageRaster
-from gripmon.simulate.disturbance import blur
+from gripmon.simulate.disturbance import blur, srgb_dn
 from gripmon.simulate.scenario import (
     Background,
     Creep,
     Defocus,
+    FingerLook,
+    FingerMark,
+    LampChange,
     Light,
     LightStep,
     Sensor,
@@ -346,3 +349,67 @@ def test_every_scenario_can_be_drawn_at_its_defaults(name: str):
     count = drawn.frame_count
     for index in sorted({*range(0, count, max(1, count // 4)), min(77, count - 1), count - 1}):
         assert drawn.render(index).std() > 1.0
+
+
+def test_a_lamp_that_moves_changes_each_face_by_lambert() -> None:
+    """Brightness of faces before and after, against normals and lamps by hand."""
+    first, then = np.array([0.4, -0.55, -0.75]), np.array([-0.8, -0.2, -0.5])
+    look = FingerLook(
+        texture=0.0,
+        carriers=False,
+        ambient=0.3,
+        level_dn=100.0,
+        lamp_cam=tuple(first),
+        lamp_changes=(LampChange(at_s=0.5, lamp_cam=tuple(then), time_s=0.5),),
+    )
+    sim = simulator(plain_scenario(fingers=look, fps=10.0))
+    # A place on the left finger's near face, whose normal is the gripper's -y.
+    inside_m = np.array([-0.022, -0.008, -0.01])
+    cam_T_grip = sim.truth(0).cam_T_grip
+    u, v = np.round(project(PAPER_LENS, (cam_T_grip[:3, :3] @ inside_m + cam_T_grip[:3, 3])[None])[0]).astype(int)
+    normal = cam_T_grip[:3, :3] @ np.array([0.0, -1.0, 0.0])
+
+    def level_dn(lamp: np.ndarray) -> float:
+        return 100.0 * (0.3 + 0.7 * max(float(normal @ lamp) / np.linalg.norm(lamp), 0.0))
+
+    half = first / np.linalg.norm(first) + then / np.linalg.norm(then)  # the middle of the half cosine wave
+    # Frames at 0, 0.75 (between two frames: 0.7 and 0.8 around it) and 2 s.
+    assert sim.light(0)[v, u] == pytest.approx(level_dn(first), rel=1e-3)
+    assert sim.light(20)[v, u] == pytest.approx(level_dn(then), rel=1e-3)
+    around = [float(sim.light(index)[v, u]) for index in (7, 8)]
+    assert min(around) <= level_dn(half) <= max(around)
+    assert level_dn(first) != pytest.approx(level_dn(then), rel=0.05)
+
+
+def test_a_lamp_without_ambient_light_is_refused() -> None:
+    look = FingerLook(ambient=0.0, lamp_changes=(LampChange(at_s=1.0, lamp_cam=(0.0, 0.0, -1.0)),))
+    with pytest.raises(ValueError, match="ambient above 0"):
+        simulator(plain_scenario(fingers=look)).render(0)
+
+
+def test_srgb_is_the_standards_curve() -> None:
+    """Against the values of IEC 61966-2-1 at some levels of light, and with the image of the same light linear."""
+    light = np.array([[0.0, 0.0031308, 0.01, 0.2140, 0.5, 1.0, 1.7]], np.float32) * 255.0
+    expected = np.array([[0.0, 0.04045, 0.09985, 0.5, 0.73536, 1.0, 1.0]]) * 255.0
+    np.testing.assert_allclose(srgb_dn(light), expected, atol=0.02)
+    linear, srgb = (
+        simulator(plain_scenario(sensor=msgspec.structs.replace(IDEAL_SENSOR, response=response))).render(0)
+        for response in ("linear", "srgb")
+    )
+    share = linear.astype(float) / 255.0
+    curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
+    steepest = 255.0 * 12.92 / 255.0  # half a grey level of light is up to this many of the image, in the dark
+    assert np.abs(srgb - 255.0 * curve).max() <= 0.5 * steepest + 0.51
+
+
+def test_a_mark_on_a_whole_finger_darkens_every_face() -> None:
+    plain, marked = (
+        simulator(plain_scenario(fingers=FingerLook(texture=0.0, carriers=False, marks=marks))).light(0)
+        for marks in ((), (FingerMark(shape="whole", gain=0.25, finger="left"),))
+    )
+    middle = plain.shape[1] // 2
+    np.testing.assert_array_equal(plain[:, middle:], marked[:, middle:])  # the right finger and the table
+    darker = plain[:, :middle] - marked[:, :middle]
+    # Where all of a pixel is finger it keeps a quarter of its light; elsewhere nothing changes.
+    inside = darker > 0.74 * plain[:, :middle]
+    assert inside.sum() > 5000 and (np.abs(darker[inside] / plain[:, :middle][inside] - 0.75) < 1e-3).mean() > 0.95

@@ -293,9 +293,10 @@ def _simulated(scene: IntegrityScene) -> Watched:
         scene.first > 0,
         looks(),
         frozen_limits(
-            scene.gripper.name, scene.jaw_sigma_m == 0.0, _px_per_mm(simulator.camera, scene.start_cam_T_grip)
+            _limits_of(scene), scene.jaw_sigma_m == 0.0, _px_per_mm(simulator.camera, scene.start_cam_T_grip)
         ),
-        _knock(scene),
+        response=simulator.scenario.sensor.response,
+        knock=_knock(scene),
     )
 
 
@@ -337,7 +338,7 @@ def _view(scene: IntegrityScene, index: int) -> View:
     tips: dict[str, list[float]] = {}
     for name, share in zip(scene.simulator.gripper.finger_ids, seen.tips.tolist(), strict=True):
         tips.setdefault(name.removesuffix(" pad"), []).append(share)
-    return _by_tips(sum(np.mean(shares) >= TIP_SEEN for shares in tips.values()))
+    return _by_tips(sum(sum(shares) >= TIP_SEEN * len(shares) for shares in tips.values()))
 
 
 def _by_tips(tips: int) -> View:
