@@ -54,6 +54,9 @@ darkest cell is above the second.
 UNSHARP_RATIO = 0.5
 """Steepest grey-level slope, over the usual one, below which an image may be out of focus."""
 
+BLUR_TOLD_PX = 0.3
+"""Change of the edges' blur that is told, px, and that may be why a gripper isn't found."""
+
 STEADY_CELL_RANGE, SAME_CELL_DIFFERENCE, SAME_CELLS_SHARE = 0.02, 0.05, 0.7
 """A blur keeps the mean grey levels of an image's cells; a thing before the lens doesn't.  Of the cells that varied by
 less than the first while all was well, the share in the third must differ from then by less than the second; both
@@ -185,6 +188,8 @@ class CauseJudge:
         top = max(comparison.log.values())
         total = sum(math.exp(value - top) for value in comparison.log.values())
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
+        for key in [key for key in shares if _of_lost_gripper(key, pooled, comparison)]:
+            shares[Cause.UNKNOWN, None] += shares.pop(key)
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
         best = max(shares, key=lambda key: shares[key])
         of_few_edges = _of_few_edges(best, comparison) or _of_one_edge(best, comparison)
@@ -258,6 +263,13 @@ def _ill_founded(key: Key, pooled: Pooled) -> bool:
         return part not in pooled.absent and not pooled.share[part] >= FINGER_SEEN_SHARE
     several = min(len(pooled.share), 2)
     return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= FINGER_SEEN_SHARE).sum()) < several
+
+
+def _of_lost_gripper(key: Key, pooled: Pooled, comparison: Comparison) -> bool:
+    """Whether a cause is the lens while the gripper isn't found: at another scale it would be, as one that is farther
+    away, and only a blur hides it.
+    """
+    return key[0] is Cause.LENS and not pooled.found and not abs(comparison.blur_change_px or 0.0) > BLUR_TOLD_PX
 
 
 def _of_few_edges(key: Key, comparison: Comparison) -> bool:
@@ -350,7 +362,7 @@ def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) 
             parts = []
             if abs(float(motion[FOCAL])) > 5e-4:
                 parts.append(f"the focal length changed by {100.0 * math.expm1(float(motion[FOCAL])):+.2f} %")
-            if blur_change_px is not None and abs(blur_change_px) > 0.3:
+            if blur_change_px is not None and abs(blur_change_px) > BLUR_TOLD_PX:
                 parts.append(f"the edges' blur changed by {blur_change_px:+.1f} px")
             what = " and ".join(parts) or "the image's scale or sharpness changed"
             return f"{what}; a camera that moved along its axis would show nearly so"

@@ -38,7 +38,7 @@ class Pooled:
     an edge; ``absent``: fingers in view that are not seen; ``share`` (f,): inlier ratio of each finger's search lines
     at the finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where
     it isn't known; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
-    of the cells from frame to frame; ``frames`` that it was made of.
+    of the cells from frame to frame; ``frames`` that it was made of; ``found``: in most of them the gripper was.
     """
 
     evidence: EdgeEvidence
@@ -52,6 +52,7 @@ class Pooled:
     cells: Array
     wander: Array
     frames: int
+    found: bool
 
 
 def piece_of(edge: NDArray[np.intp], fraction: Array) -> NDArray[np.intp]:
@@ -79,7 +80,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         details.append(np.column_stack([frame.per_px, frame.spread_px, frame.blur_px2, frame.across]))
     absences = [absent_fingers(frame, gripper) for frame in frames]
     often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
-    share = _share(frames)
+    share, found = _share(frames), 2 * sum(frame.found for frame in frames) > len(frames)
     noise = float(np.median([frame.noise for frame in frames]))
     brightest = float(np.median([frame.brightest for frame in frames]))
     steepest = float(np.median([frame.steepest for frame in frames]))
@@ -87,7 +88,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     image = noise, brightest, steepest, np.median(cells, axis=0), np.ptp(cells, axis=0)
     if not places:
         nothing = _only(midst, np.zeros(len(midst.edge), dtype=bool))
-        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, *image, len(frames))
+        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, *image, len(frames), found)
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -120,7 +121,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         across=other[:, 3:],
     )
     blur_px2 = isotropic_blur_px2(evidence)
-    return Pooled(evidence, numbers, often, share, blur_px2, *image, len(frames))
+    return Pooled(evidence, numbers, often, share, blur_px2, *image, len(frames), found)
 
 
 def _share(frames: Sequence[EdgeEvidence]) -> Array:

@@ -29,7 +29,7 @@ class EdgeEvidence:
     sampled.  ``reach_px``: how far from the measured pose edges were searched at first.  About the image, as fractions
     of full scale: ``noise`` of a pixel; ``brightest``: the level that only one pixel in a hundred exceeds;
     ``steepest``: the difference that only one pair of neighbours in a thousand exceeds; ``cells`` (12, 16): the mean
-    grey levels of a grid of cells.
+    grey levels of a grid of cells.  ``found``: whether all fingers together were measured, so that the pose is one.
     """
 
     cam_T_grip: Array
@@ -49,6 +49,7 @@ class EdgeEvidence:
     steepest: float
     cells: Array
     reach_px: float
+    found: bool = True
 
 
 @dataclass(frozen=True, slots=True)

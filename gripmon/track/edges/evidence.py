@@ -91,6 +91,7 @@ class FingerMeter(Settler):
             steepest=_steepest(image) / measurement.candidates.full_scale,
             cells=_cells(image) / measurement.candidates.full_scale,
             reach_px=zoom * self._settings.sampling.reach_px,
+            found=measurement.trusted,
         )
 
     def _finger_place(

@@ -1,8 +1,9 @@
 """Finding the gripper again after a jump that is wider than the search lines reach.
 
-In a reduced image (``reduced``) the points on the predicted outlines vote for shifts, turns about the optical axis and
-scales.  The best places are perturbed in all six directions, tilts included, then refined by least squares on an image
-of twice the resolution (``hypotheses``); the result is a few starts for the joint fit on the full image, which decides.
+In a reduced image (``reduced``) the points on the predicted outlines vote for shifts in all three directions and turns
+about the optical axis.  The best places are perturbed in all six directions, tilts included, then refined by least
+squares on an image of twice the resolution (``hypotheses``); the result is a few starts for the joint fit on the full
+image, which decides.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
@@ -21,13 +21,14 @@ from gripmon.track.edges.hypotheses import (
     OutlinePoints,
     Poses,
     ProfileScore,
+    Projected,
     apart,
     orientation_of,
     outline_points,
     project,
     rotations,
 )
-from gripmon.track.edges.reduced import BESIDE_CELLS, ORIENTATIONS, Floats, Window, evidence_maps, rectify, window_about
+from gripmon.track.edges.reduced import BESIDE_CELLS, Floats, Window, evidence_maps, rectify, window_about
 from gripmon.track.edges.settings import SearchSettings
 
 POINTS, FINE_POINTS = 80, 120
@@ -66,7 +67,8 @@ def search_poses(
 ) -> Array:
     """Poses (s, 4, 4) about an expected one from which a joint fit may find the gripper, best first.
 
-    ``shown`` (e,): how often each edge shows, 0 to 1; None: all are looked for alike.  Empty when none of its outlines can be in the image.
+    ``shown`` (e,): how often each edge shows, 0 to 1; None: all are looked for alike.  Empty when none of its outlines
+    can be in the image.
     """
     depth_m = float(cam_T_grip[2, 3])
     if not depth_m > 0.0:
@@ -104,6 +106,7 @@ class _Place:
         self.middle_m = np.asarray(points.points_m.mean(axis=1), dtype=float)
         middle_cam_m = cam_T_grip[:3, :3] @ self.middle_m + cam_T_grip[:3, 3]
         self.depth_m = max(float(middle_cam_m[2]), 1e-3)
+        self._middle_cam_m = np.array([*middle_cam_m[:2], self.depth_m])
         seen_m = cam_T_grip[:3, :3] @ points.points_m + cam_T_grip[:3, 3:4]
         self.xy: Array = (seen_m[:2] / np.maximum(seen_m[2], 1e-3)).T
         self._spread = float(np.abs(self.xy - self.xy.mean(axis=0)).max())
@@ -119,36 +122,24 @@ class _Place:
         return _spread_evenly(count) * np.array([across, across, turn * self.depth_m, tilt, tilt, turn])
 
     def voted(self, maps: Floats, window: Window) -> Poses:
-        """The places with most votes over shifts, turns about the optical axis, and scales."""
-        settings, points = self._settings, self._points
-        seen = project(points, self._expected, window)
-        places = np.column_stack([seen.column[0], seen.row[0]]).astype(float)
-        centre = places.mean(axis=0)
-        orientation = orientation_of(seen)[0] * (math.pi / ORIENTATIONS)
+        """The places with most votes over shifts, and turns about the optical axis."""
+        settings = self._settings
         reach = math.ceil(self.reach_m / self.depth_m / window.pitch)
-        padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
         tick = STEP_CELLS * window.pitch / self._spread
-        found: list[tuple[float, float, float, Array]] = []
+        found: list[tuple[float, Array, Array]] = []
         for turn in _ticks(settings.turn_rad, tick):
-            c, s = math.cos(turn), math.sin(turn)
-            turned = (places - centre) @ np.array([[c, s], [-s, c]])
-            index = np.rint((orientation + turn) * (ORIENTATIONS / math.pi)).astype(int) % ORIENTATIONS
-            for scale in _ticks(self.reach_m / self.depth_m, tick):
-                column, row = np.rint((1.0 + scale) * turned + centre).astype(int).T
-                votes = _votes(padded, index, column, row, reach)
-                found += [(score, turn, scale, shift) for score, shift in _peaks(votes, 2)]
+            turned = rotations(np.array([[0.0, 0.0, turn]])) @ self._expected.rotation
+            for nearer in _ticks(self.reach_m / self.depth_m, tick):
+                middle_m = self._middle_cam_m / (1.0 + nearer)  # in the same place of the image
+                seen = project(self._points, Poses(turned, middle_m - turned @ self.middle_m), window)
+                votes = _votes(maps, seen, float(middle_m[2]), reach)
+                step_m = window.pitch * float(middle_m[2])
+                for score, (right, down) in _peaks(votes, 2):
+                    there_m = middle_m + step_m * np.array([right, down, 0.0])
+                    found.append((score, turned[0], there_m - turned[0] @ self.middle_m))
         found.sort(key=lambda item: -item[0])
-        return self._poses(found[:FOLLOWED_PLACES], window)
-
-    def _poses(self, found: list[tuple[float, float, float, Array]], window: Window) -> Poses:
-        turns, scales = np.array([item[1] for item in found]), np.array([item[2] for item in found])
-        shifts = np.array([item[3] for item in found]) * window.pitch
-        turned = rotations(np.column_stack([np.zeros((len(turns), 2)), turns])) @ self._expected.rotation
-        # What was seen at the middle of the fingers is now elsewhere, and nearer by the scale.
-        xy = self.xy.mean(axis=0) + shifts
-        z = self.depth_m / (1.0 + scales)
-        middle = np.column_stack([xy * z[:, None], z])
-        return Poses(turned, middle - turned @ self.middle_m)
+        best = found[:FOLLOWED_PLACES]
+        return Poses(np.array([item[1] for item in best]), np.array([item[2] for item in best]))
 
 
 def _ticks(reach: float, step: float) -> list[float]:
@@ -156,19 +147,22 @@ def _ticks(reach: float, step: float) -> list[float]:
     return [reach * k / count for k in range(-count, count + 1)] if count else [0.0]
 
 
-def _votes(
-    padded: Floats, index: NDArray[np.intp], column: NDArray[np.intp], row: NDArray[np.intp], reach: int
-) -> Floats:
-    """(2 reach + 1, 2 reach + 1) summed evidence over shifts in cells; rows are shifts along v.
+def _votes(maps: Floats, seen: Projected, depth_m: float, reach: int) -> Floats:
+    """(2 reach + 1, 2 reach + 1) summed evidence over shifts of the gripper by whole cells at a depth; rows are shifts
+    along v.
 
-    ``padded`` are the maps with ``reach`` more cells all around; points that fall outside even so have no vote.
+    What is nearer is shifted by more, what is farther by less: fingers reach from half of the TCP's distance to all of
+    it.  Points that fall outside of the maps (o, rows, columns) have no vote.
     """
-    height, width = padded.shape[1] - 2 * reach, padded.shape[2] - 2 * reach
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    size = 2 * reach + 1
-    votes = np.zeros((size, size), dtype=np.float32)
-    for k, u, v in np.column_stack([index, column, row])[inside].tolist():
-        votes += padded[k, v : v + size, u : u + size]
+    rows, columns = maps.shape[1] + 2, maps.shape[2] + 2
+    flat = np.pad(maps, ((0, 0), (1, 1), (1, 1))).ravel()
+    ways = depth_m * np.asarray(seen.per_z[0], dtype=float)[:, None] * np.arange(-reach, reach + 1)
+    row = np.clip(np.rint(seen.row[0][:, None] + ways) + 1.0, 0.0, rows - 1.0).astype(np.intp)
+    column = np.clip(np.rint(seen.column[0][:, None] + ways) + 1.0, 0.0, columns - 1.0).astype(np.intp)
+    row = (orientation_of(seen)[0][:, None] * rows + row) * columns
+    votes = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
+    for v, u in zip(row, column, strict=True):
+        votes += flat.take(v[:, None] + u)
     return votes
 
 
