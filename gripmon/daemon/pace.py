@@ -19,8 +19,8 @@ TRIAL_S = 2.0
 """How long the renderers and the monitor work as fast as they can (s)."""
 
 MARGIN = 1.5
-"""By how much a machine must be faster than the pace (no unit): recording, publishing and searching come on top, and a
-frame that shows a hand takes up to 1.4 times as long to render as the mean.
+"""By how much a machine must be faster than the pace (no unit): for two seconds, while the hand is there, a frame takes
+1.4 times as long to render as the mean frame of the scenario, and recording and publishing come on top.
 """
 
 
