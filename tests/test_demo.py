@@ -142,7 +142,7 @@ def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, s
     records = [record(seq, (0.0, 0.0, 0.0)) for seq in (*range(10), last)]
     (tmp_path / "estimates.jsonl").write_bytes(b"\n".join(map(msgspec.json.encode, records)))
     simulator = SimpleNamespace(truth=truth, scenario=SimpleNamespace(fps=30.0))
-    summary = demo._summarise(tmp_path, simulator, 11)  # type: ignore[arg-type]
+    summary = demo._summarise(tmp_path, simulator, 11, live=True)  # type: ignore[arg-type]
     assert summary is not None and (summary.camera_fps, summary.frames) == (30.0, 11)
     assert json.loads((tmp_path / "summary.json").read_text())["caution"] == summary.caution
     first = _as_text(summary, tmp_path).splitlines()[1]

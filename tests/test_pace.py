@@ -22,14 +22,14 @@ from gripmon.monitor import warm_up
 
 
 @pytest.mark.parametrize(
-    ("possible_hz", "fps", "enough"),
-    [(200.0, 60.0, True), (90.0, 60.0, True), (89.0, 30.0, True), (44.0, 15.0, True), (10.0, 15.0, False)],
+    ("possible_hz", "fps", "live"),
+    [(200.0, 60.0, True), (90.0, 60.0, True), (89.0, 30.0, True), (44.0, 15.0, True), (22.0, 15.0, False)],
 )
-def test_the_fastest_pace_with_a_margin_is_chosen(possible_hz: float, fps: float, enough: bool):
+def test_the_fastest_pace_with_a_margin_is_chosen(possible_hz: float, fps: float, live: bool):
     chosen = pace.pace_for(possible_hz)
-    assert chosen.fps == fps
-    assert f"{possible_hz:.0f} frames/s: the camera runs at {fps:g} frames/s" in chosen.text()
-    assert ("too few even for that" not in chosen.text()) == enough
+    assert (chosen.fps, chosen.live) == (fps, live)
+    assert (f"{possible_hz:.0f} frames/s: the camera runs at {fps:g} frames/s" in chosen.text()) == live
+    assert ("too few for a live camera" not in chosen.text()) == live
 
 
 @dataclasses.dataclass
@@ -54,13 +54,14 @@ def test_what_can_be_rendered_is_measured():
     assert measured.fps == 15.0
 
 
-def test_the_demo_takes_the_measured_rate_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pace, "measure_pace", lambda *_: pace.Pace(30.0, 50.0))
+@pytest.mark.parametrize("live", [True, False])
+def test_the_demo_takes_the_measured_rate_and_nothing_else(monkeypatch: pytest.MonkeyPatch, live: bool):
+    monkeypatch.setattr(pace, "measure_pace", lambda *_: pace.Pace(30.0, 50.0, live))
     config = demo_config(20.0, seed=7)
     slower, _ = at_own_pace(config)
     source = slower.settings.source
     assert isinstance(source, SimulatedSettings) and isinstance(config.settings.source, SimulatedSettings)
-    assert source == msgspec.structs.replace(config.settings.source, fps=30.0)
+    assert source == msgspec.structs.replace(config.settings.source, fps=30.0, realtime=live)
 
 
 def test_a_thread_gives_way_alone():
