@@ -184,7 +184,7 @@ class Latency(msgspec.Struct, frozen=True):
 
 class DemoSummary(msgspec.Struct, frozen=True):
     """The result of the demo, as in ``summary.json``.  ``caution``: what to read first, empty if nearly all frames were
-    measured; ``camera_fps``: of the simulated camera; ``live``: false if it waited for the monitor.
+    measured but for those that the hand covers; ``camera_fps``: of the simulated camera; ``live``: false if it waited for the monitor.
     """
 
     caution: str
@@ -334,9 +334,12 @@ def _summarise(out: Path, simulator: Simulator, received: int, *, live: bool) ->
     latencies_ms = 1e-6 * np.array([record.latency_ns for record in records])
     span_s = 1e-9 * (records[-1].stamp_ns - records[0].stamp_ns)
     dropped = records[-1].seq + 1 - len(records)
-    measured, refused = sum(r.measured for r in records), sum(is_refused(r) for r in records)
+    shown = [
+        r for r in records if r.measured or "hand" not in simulator.truth(r.seq).events
+    ]  # what is covered can't be
+    measured, refused = sum(r.measured for r in shown), sum(is_refused(r) for r in shown)
     summary = DemoSummary(
-        caution=too_few(measured, dropped=dropped, refused=refused, unseen=len(records) - measured - refused),
+        caution=too_few(measured, dropped=dropped, refused=refused, unseen=len(shown) - measured - refused),
         camera_fps=simulator.scenario.fps,
         live=live,
         frames=len(records),
