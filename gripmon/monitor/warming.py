@@ -18,7 +18,7 @@ from typing import Any
 from gripmon.judge import drift, smoothing, stream
 from gripmon.model import poses
 from gripmon.model.compiled import FUNCTIONS, Kept, Watched, locked
-from gripmon.track import edges, integrity, look
+from gripmon.track import edges, integrity
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +28,6 @@ PARTS: dict[str, tuple[Callable[[], object], ...]] = {
     "drift": (drift.warm_up,),
     "edge points": (edges.warm_up_profiles,),
     "geometry": (edges.warm_up_geometry,),
-    "look": (look.warm_up,),
     "averages": (smoothing.warm_up, stream.warm_up, poses.warm_up),
 }
 """What frames need, in parts that can be compiled at once, the longest first."""

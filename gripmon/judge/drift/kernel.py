@@ -369,7 +369,6 @@ def refresh(
     times: Array,
     rare: Ints,
     reference: Array,
-    lasting: Array,
     known: Bools,
     plain: Array,
     mean_covariance: Array,
@@ -384,8 +383,7 @@ def refresh(
     often as to be always there what is missing of ``reported`` (s, 6, 6) comes on top, direction by direction.
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
-    (k,): length from which on noise is rare; ``lasting`` (k, 6, 6): what differences have on top.  The rest is
-    overwritten.  LinAlgError if rounding leaves no root.
+    (k,): length from which on noise is rare.  The rest is overwritten.  LinAlgError if rounding leaves no root.
     """
     lengths, streams = learnt.shape
     total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
@@ -408,7 +406,7 @@ def refresh(
             _add(1.0, total[2 if known[0, k, s] else 0, k], never, part)
             _add(1.0, part, reference[s], whole)
             _whiten(whole, root, whitening[0, k, s])
-            _add(2.0, missing, lasting[k], missing)
+            missing[:] = 2.0 * missing
             _add(times[2 if known[1, k, s] else 0, k, s], of_difference[k, s], missing, whole)
             _whiten(whole, root, whitening[1, k, s])
             _whiten(of_difference[k, s], root, learnt_whitening[k, s])
