@@ -183,8 +183,10 @@ class Latency(msgspec.Struct, frozen=True):
 
 
 class DemoSummary(msgspec.Struct, frozen=True):
-    """The result of the demo, as in ``summary.json``.  ``caution``: what to read first, empty if nearly all frames were
-    measured but for those that the hand covers; ``camera_fps``: of the simulated camera; ``live``: false if it waited for the monitor.
+    """The result of the demo, as in ``summary.json``.
+
+    ``caution``: what to read first, empty if nearly all frames were measured but for those that the hand covers;
+    ``camera_fps``: of the simulated camera (1/s); ``live``: false if it waited for the monitor.
     """
 
     caution: str
