@@ -202,31 +202,3 @@ def test_several_starts_at_once_compile_once_and_share_it(tmp_path: Path):
     assert len(first) == 1
     for text in set(texts) - set(first):
         assert int(text.rpartition("misses")[2]) <= 1
-
-
-def test_no_compiled_function_is_left_for_a_frame():
-    """A monitor's whole life in a scenario compiles nothing that warm_up() hasn't."""
-    said = subprocess.run([sys.executable, "-c", FRAMES], capture_output=True, text=True, timeout=300, check=True)
-    assert said.stdout.split() == ["frames", "90", "compiled", "[]"]
-
-
-FRAMES = """
-from gripmon.daemon.api import Monitor
-from gripmon.io.sources.simulated import make_simulator
-from gripmon.monitor import warm_up
-from gripmon.model.compiled import FUNCTIONS
-from gripmon.daemon.simulated import demo_config
-
-config = demo_config(20.0, fps=6.0)
-simulator = make_simulator(config.settings.source, config.scene, config.directory)
-warm_up()
-before = {made: list(made.signatures) for made in FUNCTIONS}
-monitor, frames = Monitor(config), 0
-for number in range(90):
-    record = monitor.process(simulator.frame(number))
-    monitor.learn()
-    while monitor.pending:
-        monitor.run_pending()
-    frames += 1
-print("frames", frames, "compiled", [made.__name__ for made in FUNCTIONS if made.signatures != before.get(made)])
-"""
