@@ -335,6 +335,27 @@ def test_it_runs_beside_the_main_thread():
     assert codes == [0]
 
 
+@pytest.mark.parametrize(
+    ("dropped", "refused", "said"),
+    [
+        (0, set(), None),
+        (1161, {1}, "only 26 of 1188 frames were measured (1161 dropped, because this machine was too slow, 1 refused"),
+        (0, set(range(9)), "only 18 of 27 frames were measured (9 refused, because their image could not be used)"),
+    ],
+)
+def test_a_run_that_measured_too_little_says_so_first(
+    dropped: int, refused: set[int], said: str | None, caplog: pytest.LogCaptureFixture
+):
+    def drop(source: object) -> None:
+        source.dropped = dropped  # type: ignore[attr-defined]
+
+    with caplog.at_level("INFO", "gripmon"):
+        Bench([drop, *range(27)], ScriptedMonitor(lambda seq: REFUSED if seq in refused else {})).run()
+    last_two = [record.getMessage() for record in caplog.records][-2:]
+    assert last_two[1] == f"stopped after 27 frames, {len(refused)} refused, {dropped} dropped"
+    assert last_two[0].startswith(said) if said else "only" not in last_two[0]
+
+
 def test_lines_for_people_on_stderr(capsys: pytest.CaptureFixture[str]):
     logger = logging.getLogger("gripmon")
     before = (logger.handlers, logger.level, logger.propagate)

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -131,6 +132,25 @@ def test_the_comparison_counts_by_hand():
     assert bump.alerts == ("recalibrated (unknown)", "step (camera_mount_moved)"), "in order; the first is no alarm"
     assert occlusion.noticed_after_s is None and occlusion.alerts == ()
     assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("last", "slow"), [(11, False), (1187, True)])
+def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, slow: bool):
+    """What the figures are worth comes before them, as after 27 of 1188 frames, in which no event was noticed."""
+    from gripmon.cli.demo import _as_text
+
+    records = [record(seq, (0.0, 0.0, 0.0)) for seq in (*range(7), 9, last)]
+    records += [record(seq, (0.0, 0.0, 0.0), source=Origin.HELD) for seq in (7, 8)]  # covered by the hand
+    records.sort(key=lambda each: each.seq)
+    (tmp_path / "estimates.jsonl").write_bytes(b"\n".join(map(msgspec.json.encode, records)))
+    simulator = SimpleNamespace(truth=truth, scenario=SimpleNamespace(fps=30.0))
+    summary = demo._summarise(tmp_path, simulator, 11, live=True)  # type: ignore[arg-type]
+    assert summary is not None and (summary.camera_fps, summary.frames) == (30.0, 11)
+    assert json.loads((tmp_path / "summary.json").read_text())["caution"] == summary.caution
+    first = _as_text(summary, tmp_path).splitlines()[1]
+    few = "only 9 of 1186 frames were measured (1177 dropped, because this machine was too slow)"
+    assert first.startswith(few) == bool(summary.caution) == slow
+    assert "camera     30 frames/s" in _as_text(summary, tmp_path)
 
 
 def test_the_demo_names_what_there_is_to_ask(tmp_path: Path):

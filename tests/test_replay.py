@@ -248,6 +248,15 @@ def test_the_summary_needs_no_memory_for_each_frame():
     assert len(counts._reasons) == 1 and len(counts._latencies) < 300
 
 
+def test_a_replay_that_measured_too_little_says_so_first():
+    counts, enough = Counts(), Counts()
+    for seq in range(20):
+        counts.add(frame_record(seq, source=Origin.HELD, reason="few") if seq < 3 else frame_record(seq))
+        enough.add(frame_record(seq, source=Origin.HELD, reason="few") if seq < 2 else frame_record(seq))
+    assert counts.caution()[0].startswith("only 17 of 20 frames were measured (3 in which the gripper was not found)")
+    assert enough.caution() == []
+
+
 def test_ctrl_c_leaves_whole_lines_and_130(sequence: Path, tmp_path: Path):
     many = tmp_path / "many"
     many.mkdir()

@@ -189,6 +189,8 @@ def test_what_was_lost_is_told():
     assert recording.running.gaps == 1
     assert "for 2.0 s there was no transform" in recording.summary
     assert "100 frames (20 %) are missing" in recording.summary
+    few = "Only 300 of 500 frames were measured (100 missing, 100 in which nothing could be measured): "
+    assert recording.summary.startswith(few)
 
 
 GAP, DAMAGE = "run-0001.rrd: 40 frames of the run are missing", "run-0001.rrd: has 1 damaged message"

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import errno
+import fcntl
+import logging
 import os
+import re
 import subprocess
 import sys
-import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from gripmon.model import compiled
+from gripmon.model.compiled import Watched, fingerprint, locked
 from gripmon.monitor import warm_up, warming
+
+CLOCK = SimpleNamespace(now_s=0.0)
 
 
 class Part:
@@ -23,40 +31,34 @@ class Part:
 
     def warm_up(self) -> None:
         CLOCK.now_s += self.takes_s
+        assert Watched.watcher is not None
+        if self.takes_s:
+            Watched.watcher.missing("kernel.one")
+            Watched.watcher.ready("kernel.one")
         if self.failures:
             self.failures -= 1
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-CLOCK = SimpleNamespace(now_s=0.0)
-
-
 @pytest.fixture
 def part(monkeypatch: pytest.MonkeyPatch) -> Part:
     made = Part()
-    for name in ("edges", "integrity", "drift", "smoothing", "poses"):
-        monkeypatch.setattr(warming, name, made)
-    monkeypatch.setattr(warming, "time", SimpleNamespace(perf_counter=lambda: CLOCK.now_s))
+    monkeypatch.setattr(warming, "PARTS", {str(number): (made.warm_up,) for number in range(5)})
+    monkeypatch.setattr(warming, "_cores", lambda: 1)
+    monkeypatch.setattr(warming, "time", SimpleNamespace(perf_counter=lambda: CLOCK.now_s, monotonic=time.monotonic))
     return made
 
 
 def test_what_is_only_loaded_is_no_news(part: Part):
-    part.takes_s = 0.1
     assert warm_up() == ""
+    assert Watched.watcher is None
 
 
-def test_a_first_start_says_what_took_so_long(part: Part):
+def test_a_first_start_says_what_took_so_long(part: Part, caplog: pytest.LogCaptureFixture):
     part.takes_s = 8.0
-    assert warm_up() == "what every frame needs was compiled, in 40 s; the next start loads it"
-
-
-def test_who_waits_for_the_compiler_reads_for_what(part: Part, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(warming, "LOADED_WITHIN_S", 0.01)
-    said = threading.Event()
-    monkeypatch.setattr(warming._log, "info", lambda text: said.set() if text.startswith("compiling") else None)
-    monkeypatch.setattr(part, "warm_up", lambda: said.wait(10.0))
-    warm_up()
-    assert said.is_set()
+    with caplog.at_level(logging.INFO, "gripmon"):
+        assert warm_up() == "what every frame needs was compiled, in 40 s; the next start loads it"
+    assert re.search(r"compiling what every frame needs.*: 0 of \d+, now kernel.one", caplog.text)
 
 
 def test_a_full_disk_costs_time_at_every_start_and_no_start(part: Part):
@@ -66,29 +68,137 @@ def test_a_full_disk_costs_time_at_every_start_and_no_start(part: Part):
     assert "No space left on device" in said and "NUMBA_CACHE_DIR" in said
 
 
-DOUBLED = """
-from gripmon.model.compiled import compiled
+def test_the_log_is_not_flooded(part: Part, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    part.takes_s = 1.0
+    with caplog.at_level(logging.INFO, "gripmon"):
+        warm_up()
+    assert len(caplog.records) == 1, "five parts, ten events, within ten seconds"
+    monkeypatch.setattr(warming, "SAID_EVERY_S", 0.0)
+    with caplog.at_level(logging.INFO, "gripmon"):
+        warm_up()
+    assert len(caplog.records) == 11
+
+
+ONE = """
+import math
+from gripmon.model.compiled import compiled, Watched
+from other import FACTOR, third
+
+class Printed:
+    def missing(self, name): print("missing", name); return False
+    def ready(self, name): print("ready", name)
 
 @compiled
-def double(x):
-    return x + x
+def times(x):
+    return FACTOR * x + third(x)
 
-assert double(21.0) == 42.0
-print(len(double.signatures), double._cache.__class__.__name__)
+Watched.watcher = Printed()
+print(times(3.0), type(times._cache).__name__)
+"""
+OTHER = """
+from gripmon.model.compiled import compiled
+
+FACTOR = {factor}
+
+@compiled
+def third(x):
+    return {third}
 """
 
 
+@pytest.fixture
+def run_one(tmp_path: Path) -> Callable[..., str]:
+    """Runs a program with a compiled function, a constant and a callee from another file; its standard output."""
+
+    def run(factor: float = 2.0, third: str = "x / 3.0", cache: Path = tmp_path / "cache", **more: str) -> str:
+        (tmp_path / "one.py").write_text(ONE)
+        (tmp_path / "other.py").write_text(OTHER.format(factor=factor, third=third))
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)} | more
+        said = subprocess.run(
+            [sys.executable, "-B", tmp_path / "one.py"], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert (said.returncode, said.stderr) == (0, "")
+        return said.stdout
+
+    return run
+
+
+def test_a_constant_of_another_file_is_noticed(run_one: Callable[..., str]):
+    """Numba itself compares a function's own file alone: the second program gave 7.0 once more."""
+    assert "7.0 Kept" in run_one() and "missing" not in run_one()
+    changed = run_one(factor=10.0)
+    assert "31.0 Kept" in changed and "missing __main__.times" in changed
+
+
+def test_a_callee_of_another_file_is_noticed(run_one: Callable[..., str]):
+    run_one()
+    assert "12.0 Kept" in run_one(third="2.0 * x")
+
+
+def test_the_fingerprint_is_of_what_is_named():
+    def one(x: float) -> float:
+        return x * warming.SAID_EVERY_S
+
+    def same(y: float) -> float:
+        return y + warming.SAID_EVERY_S
+
+    def another(x: float) -> float:
+        return x * compiled._INDEX_PATIENCE_S
+
+    assert fingerprint(one) == fingerprint(same) != fingerprint(another)
+
+
 @pytest.mark.parametrize("kept", [True, False])
-def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(tmp_path: Path, kept: bool):
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(
+    tmp_path: Path, run_one: Callable[..., str], kept: bool
+):
     """A service without a home on a read-only system: no folder can be written to, whatever NUMBA_CACHE_DIR says."""
-    (tmp_path / "doubled.py").write_text(DOUBLED)
     (tmp_path / "__pycache__").touch()  # no folder, and none can be made in its place
     (nowhere := tmp_path / "file").touch()
     cache = tmp_path / "cache" if kept else nowhere / "cache"
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "HOME": str(nowhere), "XDG_CACHE_HOME": str(nowhere)}
-    said = subprocess.run(
-        [sys.executable, tmp_path / "doubled.py"], env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert (said.returncode, said.stderr) == (0, "")
-    assert said.stdout.split() == ["1", "FunctionCache" if kept else "NullCache"]
+    said = run_one(cache=cache, HOME=str(nowhere), XDG_CACHE_HOME=str(nowhere))
+    assert f"7.0 {'Kept' if kept else 'Unkept'}" in said
+    assert "missing __main__.times" in said and "ready __main__.times" in said
     assert any(tmp_path.glob("cache/*/*.nbi")) == kept
+
+
+def test_a_lock_waits_and_gives_up(tmp_path: Path):
+    path, waits = tmp_path / "lock", []
+    with locked(path, fcntl.LOCK_EX, 0.0) as first, locked(path, fcntl.LOCK_EX, 0.1, lambda: waits.append(1)) as second:
+        assert first and not second and waits
+    with locked(path, fcntl.LOCK_SH, 0.0) as one, locked(path, fcntl.LOCK_SH, 0.0) as two:
+        assert one and two
+    with locked(tmp_path / "no" / "lock", fcntl.LOCK_EX, 0.0) as nowhere:
+        assert not nowhere
+
+
+HELPED = """
+import logging, sys
+from gripmon.judge import smoothing, stream
+from gripmon.model import poses
+from gripmon.monitor import warming
+
+warming.PARTS = {"averages": (smoothing.warm_up, stream.warm_up, poses.warm_up), "look": (warming.look.warm_up,)}
+warming._cores = lambda: 2
+logging.basicConfig(level=logging.INFO, stream=sys.stdout)
+warming.SAID_EVERY_S = 0.0
+print(warming.warm_up())
+print("misses", sum(sum(f._cache_misses.values()) for f in warming.FUNCTIONS))
+"""
+
+
+@pytest.mark.slow("40; the other tests of this file, and that every run of the suite begins with this")
+def test_several_starts_at_once_compile_once_and_share_it(tmp_path: Path):
+    """Three programs at once on an empty cache: what each part needs is compiled by one of six processes."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    started = [
+        subprocess.Popen([sys.executable, "-c", HELPED], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    texts = [process.communicate(timeout=600)[0] for process in started]
+    assert all(process.returncode == 0 for process in started)
+    assert any("now look.kernel.align" in text and "now judge.smoothing" in text for text in texts)
+    first = [text for text in texts if "another process compiles the same" not in text]
+    assert len(first) == 1
+    for text in set(texts) - set(first):
+        assert int(text.rpartition("misses")[2]) <= 1

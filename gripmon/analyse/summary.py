@@ -67,8 +67,13 @@ def paragraph(report: RecordingReport) -> str:
 def _too_few(report: RecordingReport) -> str:
     """What the reader must know before anything else."""
     running = report.running
-    measured = running.frames - running.frames_refused
-    text = too_few(measured, dropped=running.frames_dropped, unmeasured=running.frames_refused)
+    dropped = min(running.monitor_dropped or 0, running.frames_dropped)
+    text = too_few(
+        running.frames - running.frames_refused,
+        dropped=dropped,
+        missing=running.frames_dropped - dropped,
+        unmeasured=running.frames_refused,
+    )
     return f"{text[0].upper()}{text[1:]}." if text else ""
 
 

@@ -106,7 +106,7 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
             *(event.text() for event in comparison.events),
             "",
             f"frames     {summary.frames} ({verdicts}), {summary.frames_dropped} dropped",
-            f"camera     {summary.camera_fps:g} frames/s",
+            f"camera     {summary.camera_fps:g} frames/s{'' if summary.live else ', each when the monitor was ready'}",
             f"Zenoh      {summary.transforms_received} transforms received",
             f"latency    {_latency_line(summary.latency_ms)}, from frame to published transform",
             f"           {_latency_line(summary.latency_while_tracking_ms)} while tracking (not searching)",

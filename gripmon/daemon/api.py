@@ -36,7 +36,8 @@ class Monitor(monitor.Monitor):
 
     def __init__(self, config: Config, state: MonitorState | None = None, keep: Keep = lambda _: "") -> None:
         """``state`` and ``keep``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for an inconsistent state.
-        The very first frame on a machine takes a minute, in which the per-frame code is compiled.
+        The very first frame on a machine takes a minute, in which the per-frame code is compiled, unless
+        :func:`gripmon.monitor.warm_up` has done so before, in all cores.
         """
         super().__init__(
             config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, state, keep

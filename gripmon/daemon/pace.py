@@ -19,28 +19,34 @@ TRIAL_S = 2.0
 """How long the renderers and the monitor work as fast as they can (s)."""
 
 MARGIN = 1.5
-"""By how much a machine must be faster than the pace (no unit): recording, publishing and searching come on top, and a
-frame that shows a hand takes up to 1.4 times as long to render as the mean.
+"""By how much a machine must be faster than the pace (no unit): for two seconds, while the hand is there, a frame takes
+1.4 times as long to render as the mean frame of the scenario, and recording and publishing come on top.
 """
 
 
 class Pace(NamedTuple):
-    """A frame rate and the rate that the trial reached, 1/s."""
+    """A frame rate and the rate that the trial reached, 1/s; ``live``: whether the machine can follow a camera at all,
+    otherwise each frame waits until the one before was processed.
+    """
 
     fps: float
     possible_hz: float
+    live: bool
 
     def text(self) -> str:
         """One line for the user."""
         can = f"this machine renders and processes {self.possible_hz:.0f} frames/s"
-        slow = "" if self.possible_hz >= self.fps else ", too few even for that"
-        return f"{can}: the camera runs at {self.fps:g} frames/s{slow} (--fps sets another)"
+        if not self.live:
+            return f"{can}, too few for a live camera: frames of one with {self.fps:g} frames/s come when it is ready"
+        return f"{can}: the camera runs at {self.fps:g} frames/s (--fps sets another)"
 
 
 def pace_for(possible_hz: float) -> Pace:
-    """The fastest of :data:`PACES_HZ` that leaves a margin, else the slowest."""
-    fits = (fps for fps in PACES_HZ if possible_hz >= MARGIN * fps)
-    return Pace(next(fits, PACES_HZ[-1]), possible_hz)
+    """The fastest of :data:`PACES_HZ` that leaves a margin, else the slowest, not live."""
+    for fps in PACES_HZ:
+        if possible_hz >= MARGIN * fps:
+            return Pace(fps, possible_hz, live=True)
+    return Pace(PACES_HZ[-1], possible_hz, live=False)
 
 
 def measure_pace(config: Config, simulator: Simulator, processes: int) -> Pace:

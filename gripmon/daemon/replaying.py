@@ -148,7 +148,7 @@ class Counts:
 
     def caution(self) -> list[str]:
         """A line that comes first, if too little was measured."""
-        text = too_few(self.usable, dropped=0, refused=self._refused, unseen=self.frames - self.usable - self._refused)
+        text = too_few(self.usable, refused=self._refused, unseen=self.frames - self.usable - self._refused)
         return [text] if text and self.usable else []
 
     def summary(self) -> str:

@@ -183,12 +183,15 @@ class Latency(msgspec.Struct, frozen=True):
 
 
 class DemoSummary(msgspec.Struct, frozen=True):
-    """The result of the demo, as in ``summary.json``.  ``caution``: what to read first, empty if nearly all frames were
-    measured; ``camera_fps``: of the simulated camera.
+    """The result of the demo, as in ``summary.json``.
+
+    ``caution``: what to read first, empty if nearly all frames were measured but for those that the hand covers;
+    ``camera_fps``: of the simulated camera (1/s); ``live``: false if it waited for the monitor.
     """
 
     caution: str
     camera_fps: float
+    live: bool
     frames: int
     frames_dropped: int
     frames_per_s: float | None
@@ -200,7 +203,8 @@ class DemoSummary(msgspec.Struct, frozen=True):
 
 
 def at_own_pace(config: Config) -> tuple[Config, Pace]:
-    """The demo's configuration with the frame rate that this machine can keep, which is measured.
+    """The demo's configuration with the frame rate that this machine can keep, which is measured; where it can keep
+    none, every frame waits for the one before.
 
     Raises :class:`InputError` if nothing can be rendered.
     """
@@ -213,7 +217,8 @@ def at_own_pace(config: Config) -> tuple[Config, Pace]:
         pace = measure_pace(config, simulator, source.processes)
     except SourceError as error:
         raise InputError(f"demo: {error}") from None
-    settings = msgspec.structs.replace(config.settings, source=msgspec.structs.replace(source, fps=pace.fps))
+    source = msgspec.structs.replace(source, fps=pace.fps, realtime=pace.live)
+    settings = msgspec.structs.replace(config.settings, source=source)
     return dataclasses.replace(config, settings=settings), pace
 
 
@@ -271,6 +276,9 @@ class Demo:
         from gripmon.daemon.service import log_to_stderr
         from gripmon.daemon.starting import run_monitor
 
+        source = self._config.settings.source
+        assert isinstance(source, SimulatedSettings), "checked before"
+
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:
             x, y, z = self._simulator.truth(seq).cam_T_grip[:3, 3].tolist()
             return x, y, z
@@ -286,7 +294,7 @@ class Demo:
                 self._config, out=out, stop=stop, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=joined,
                 view=view,
             )  # fmt: skip
-        return code, _summarise(out, self._simulator, receiver.count)
+        return code, _summarise(out, self._simulator, receiver.count, live=source.realtime)
 
 
 class _Receiver(AbstractContextManager["_Receiver"]):
@@ -318,7 +326,7 @@ class _Receiver(AbstractContextManager["_Receiver"]):
         self._step()
 
 
-def _summarise(out: Path, simulator: Simulator, received: int) -> DemoSummary | None:
+def _summarise(out: Path, simulator: Simulator, received: int, *, live: bool) -> DemoSummary | None:
     """Compare ``estimates.jsonl`` with the truth, and write ``summary.json``."""
     estimates = out / "estimates.jsonl"
     decode = msgspec.json.Decoder(FrameRecord).decode
@@ -328,10 +336,14 @@ def _summarise(out: Path, simulator: Simulator, received: int) -> DemoSummary | 
     latencies_ms = 1e-6 * np.array([record.latency_ns for record in records])
     span_s = 1e-9 * (records[-1].stamp_ns - records[0].stamp_ns)
     dropped = records[-1].seq + 1 - len(records)
-    measured, refused = sum(r.measured for r in records), sum(is_refused(r) for r in records)
+    shown = [
+        r for r in records if r.measured or "hand" not in simulator.truth(r.seq).events
+    ]  # what is covered can't be
+    measured, refused = sum(r.measured for r in shown), sum(is_refused(r) for r in shown)
     summary = DemoSummary(
-        caution=too_few(measured, dropped=dropped, refused=refused, unseen=len(records) - measured - refused),
+        caution=too_few(measured, dropped=dropped, refused=refused, unseen=len(shown) - measured - refused),
         camera_fps=simulator.scenario.fps,
+        live=live,
         frames=len(records),
         frames_dropped=dropped,
         frames_per_s=(len(records) - 1) / span_s if span_s > 0.0 else None,

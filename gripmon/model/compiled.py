@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
+from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
@@ -46,10 +46,7 @@ class Watched:
     """A cache of numba whose hits and misses are told to a watcher."""
 
     watcher: ClassVar[Watcher | None] = None
-    _py_func: FunctionType
-
-    if TYPE_CHECKING:
-        cache_path: str | None
+    _py_func: Any  # the function in Python
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         watcher, name = Watched.watcher, _name_of(self._py_func)
@@ -74,14 +71,14 @@ class Watched:
         """Nothing is kept."""
 
 
-class Unkept(Watched, NullCache):  # type: ignore[misc]
+class Unkept(Watched, NullCache):
     """Where there is no folder for the cache."""
 
-    def __init__(self, py_func: FunctionType) -> None:
+    def __init__(self, py_func: Callable[..., Any]) -> None:
         self._py_func = py_func
 
 
-class Kept(Watched, FunctionCache):  # type: ignore[misc]
+class Kept(Watched, FunctionCache):
     """Numba's cache with constants in its key, in which index and code of a function change together.
 
     Numba writes the index first: two processes would give one file's name to two sets of argument types, and one that
@@ -89,15 +86,15 @@ class Kept(Watched, FunctionCache):  # type: ignore[misc]
     """
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return *super()._index_key(sig, codegen), fingerprint(self._py_func)
+        return *super()._index_key(sig, codegen), fingerprint(self._py_func)  # type: ignore[no-untyped-call]
 
     def _load(self, sig: Any, target_context: Any) -> Any:
         with self._index(fcntl.LOCK_SH):
-            return FunctionCache.load_overload(self, sig, target_context)
+            return FunctionCache.load_overload(self, sig, target_context)  # type: ignore[no-untyped-call]
 
     def _save(self, sig: Any, data: Any) -> None:
         with self._index(fcntl.LOCK_EX):
-            FunctionCache.save_overload(self, sig, data)
+            FunctionCache.save_overload(self, sig, data)  # type: ignore[no-untyped-call]
 
     def _index(self, how: int) -> contextlib.AbstractContextManager[bool]:
         return locked(Path(self._cache_path) / "gripmon-index.lock", how, _INDEX_PATIENCE_S)
@@ -109,16 +106,18 @@ def compiled(function: _F) -> _F:
     Arithmetic is done as written, neither fused nor reordered, so that a replay on another machine decides the same;
     division by zero behaves as in NumPy.  The GIL is held: reacquiring it takes longer than a kernel runs.
     """
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # for a debugger
+        return function
     made: Any = numba.njit(error_model="numpy")(function)
     try:
-        made._cache = Kept(function)
+        made._cache = Kept(function)  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError):  # no folder for the cache: every start compiles
         made._cache = Unkept(function)
     FUNCTIONS.append(made)
     return cast("_F", made)
 
 
-def _name_of(function: FunctionType) -> str:
+def _name_of(function: Any) -> str:
     """``integrity.kernel.follow``"""
     return f"{'.'.join(function.__module__.split('.')[-2:])}.{function.__qualname__}"
 

@@ -6,18 +6,22 @@ LEAST_SHARE = 0.9
 """Share of the frames (no unit) below which a run's summary begins with that: a convention, for runs of any kind."""
 
 
-def too_few(measured: int, *, dropped: int, refused: int = 0, unseen: int = 0, unmeasured: int = 0) -> str:
+def too_few(
+    measured: int, *, dropped: int = 0, missing: int = 0, refused: int = 0, unseen: int = 0, unmeasured: int = 0
+) -> str:
     """A sentence if fewer than :data:`LEAST_SHARE` of all frames were measured, with the reasons, the commonest first;
     else an empty string.
 
-    ``dropped``: passed over for lack of time; ``refused``: with an image that could not be used; ``unseen``: in which
-    the gripper was not found; ``unmeasured``: either of these.  There may be no frame at all.
+    ``dropped``: passed over for lack of time; ``missing``: gone for any reason; ``refused``: with an image that could
+    not be used; ``unseen``: in which the gripper was not found; ``unmeasured``: either of these two.  There may be no
+    frame at all.
     """
-    total = measured + dropped + refused + unseen + unmeasured
+    total = measured + dropped + missing + refused + unseen + unmeasured
     if measured >= LEAST_SHARE * total:
         return ""
     lost = [
         (dropped, "{} dropped, because this machine was too slow"),
+        (missing, "{} missing"),
         (refused, "{} refused, because their image could not be used"),
         (unseen, "{} in which the gripper was not found"),
         (unmeasured, "{} in which nothing could be measured"),

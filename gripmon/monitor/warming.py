@@ -162,7 +162,7 @@ class _Work:
     def _begin(self) -> None:
         self.compiles = True
         self._show = _shown(self._closing)
-        kept = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
+        kept: list[str] = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
         if len(kept) < len(FUNCTIONS):
             self.unkept = "no folder for it may be written"
             return

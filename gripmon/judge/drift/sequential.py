@@ -321,6 +321,6 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
 def warm_up() -> None:
     """Compile what a frame needs, or load what was compiled."""
     test = SequentialTest(DriftSettings())
-    for number in range(4):
+    for number in range(LEARN_EVERY + 1):
         test.add(np.full((1, 6), 1e-6 * number), 1e-12 * np.eye(6)[None])
     test.square_beyond(np.zeros(6), np.eye(6))
