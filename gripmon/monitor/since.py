@@ -1,15 +1,15 @@
-"""The motion d since the reference: what is the same in the reference's frames and now cancels (``docs/integrity.md``).
+"""The motion d since the reference: what is the same in the reference's frames and now cancels.
 
-A measured pose is ``x = exp(d) exp(b) reference``, with left perturbations as in equation (11): d is the camera's motion
-since the reference, b how far off the reference the measurements had the gripper then, an average over the first proved
-frames or a recalibration's own.  With their pose ``x_b = exp(b) reference``, ``exp(d) = x x_b^-1``.  An error E that is
-constant in gripper axes (another TCP, bevels, worn or rounded tips, edges taught at a wrong reference) is in both poses:
-``x E (x_b E)^-1 = x x_b^-1``, whatever the motion.
+A measured pose is ``x = exp(d) exp(b) reference``, with left perturbations as in equation (11): d is the camera's
+motion since the reference, b how far off the reference the measurements had the gripper then, an average over the first
+proved frames or a recalibration's own.  With their pose ``x_b = exp(b) reference``, ``exp(d) = x x_b^-1``.  An error E
+that is constant in gripper axes (another TCP, bevels, worn or rounded tips, edges taught at a wrong reference) is in
+both poses: ``x E (x_b E)^-1 = x x_b^-1``, whatever the motion (``docs/integrity.md``).
 
-What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is, too;
-as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into a motion;
-edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of the motion;
-a longer finger moves a fit by its visible edges, which may be others than then.
+What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is
+larger, too; as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into
+a motion; edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of
+the motion; a longer finger moves a fit by its visible edges, which may be others than then.
 """
 
 from __future__ import annotations

@@ -64,7 +64,8 @@ class AccuracyForecast:
     ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
     ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
     distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``bounds``: both
-    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect of an unknown opening; None for a gripper without jaw, or
+    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect
+    of an unknown opening; None for a gripper without jaw, or
     where not asked for.
     """
 

@@ -6,12 +6,13 @@ and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reade
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from typing import TypeVar
 
 import msgspec
 
-from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
+from gripmon.model.records.commands import CommandError, CommandReply, CommandReply1, CommandRequest
 from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.laser import LaserPulse, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
@@ -35,8 +36,8 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 }
 """All messages that go over the wire."""
 
-OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1}
-"""The previous major version of a message, which is read as well."""
+OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1, CommandReply: CommandReply1}
+"""The messages of an earlier version that are read as well: transforms of schema 1, by themselves and in a reply."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
@@ -68,9 +69,9 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     try:
         return _decoder(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        older = OLDER.get(message)
-        if older is not None and _schema_of(payload) == schema_name(older):
-            return from_json(payload, older)  # type: ignore[return-value]  # a kind of the same message
+        if (older := OLDER.get(message)) is not None and _schema_of(payload) == schema_name(older):
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+                return _decoder(older).decode(payload)  # type: ignore[return-value]  # a kind of the same message
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
