@@ -258,12 +258,17 @@ class AtReferences:
         some of it isn't used: settings or taught edges have changed since; None if all of it is.
         """
         refused = None
+        if self._valid_by is ValidBy.REFERENCE and self._id not in {each.reference_id for each in records}:
+            refused = (
+                "the state has nothing of the reference's frames: it is from an earlier version, or too few frames had "
+                "proved where the gripper is; the motion since the reference counts from the first frames"
+            )
         for each in records:
             fits = _fits(each, lasting, fingers) if each.measured_as == self._digest else None
             if fits is None:
                 refused = (
                     "where the reference's frames had the gripper isn't used: the edges were taught again, or measured "
-                    "with other settings, since; the bound since the reference counts from the first frames"
+                    "with other settings, since; the motion since the reference counts from the first frames"
                 )
             else:
                 at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns

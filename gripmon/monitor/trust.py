@@ -137,8 +137,9 @@ class Integrity:
                     self._finer.restore(state.look.finer)
             except LookRefused as refused:
                 self.look_refused = str(refused)
-        if state is not None and state.at_reference is not msgspec.UNSET:
-            self.since_refused = self._weigher.restore(state.at_reference)
+        if state is not None:
+            known = () if state.at_reference is msgspec.UNSET else state.at_reference
+            self.since_refused = self._weigher.restore(known)
 
     def learn(self) -> None:
         """Learn the look from the newest frame that proved the pose, once."""

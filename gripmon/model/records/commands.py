@@ -145,6 +145,14 @@ class CommandReply1(CommandReply, frozen=True, tag_field="schema", tag="gripmon.
 
     snapshot: Snapshot1 | None = None
 
+    def upgraded(self) -> CommandReply:
+        """As of this version."""
+        fields, snapshot = {name: getattr(self, name) for name in self.__struct_fields__}, self.snapshot
+        if snapshot is not None:
+            of_snapshot = {name: getattr(snapshot, name) for name in snapshot.__struct_fields__}
+            fields["snapshot"] = Snapshot(**of_snapshot | {"record": snapshot.record.upgraded()})
+        return CommandReply(**fields)
+
 
 class CommandFault(OpenEnum):
     """Why a command did not reach the monitor, or why its outcome is unknown."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import msgspec
 
@@ -36,7 +36,10 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 }
 """All messages that go over the wire."""
 
-OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1, CommandReply: CommandReply1}
+OLDER: dict[type[msgspec.Struct], type[FrameRecord1] | type[CommandReply1]] = {
+    FrameRecord: FrameRecord1,
+    CommandReply: CommandReply1,
+}
 """The messages of an earlier version that are read as well: transforms of schema 1, by themselves and in a reply."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
@@ -71,7 +74,7 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         if (older := OLDER.get(message)) is not None and _schema_of(payload) == schema_name(older):
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-                return _decoder(older).decode(payload)  # type: ignore[return-value]  # a kind of the same message
+                return cast(_T, _decoder(older).decode(payload).upgraded())
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
