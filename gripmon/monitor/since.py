@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, invert, skew
-from gripmon.model.poses import to_record
+from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
     Absolute,
     Array,
@@ -34,6 +34,7 @@ from gripmon.model.records import (
     SinceReference,
     ValidBy,
 )
+from gripmon.track.edges import Measurement
 from gripmon.track.integrity import Separation
 
 if TYPE_CHECKING:
@@ -42,6 +43,12 @@ if TYPE_CHECKING:
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
 less than such an average claims.
+"""
+
+UNSETTLED_FRAMES = 5
+"""Proved frames after a start in which another place within their bound is no knock: within two seconds at 15 frames/s
+(one in four is proved), in which a mount that is knocked once a month is knocked with a probability of 8e-7; that an
+edge of theirs belongs to something else has one of 1e-2.
 """
 
 KEPT_REFERENCES = 8
@@ -72,10 +79,21 @@ class Named(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A fit's jaw opening, m, and how the fitted pose changes with it (6,), per metre."""
+    """A fit's jaw opening, m, and how the fitted pose changes with the reported one (6,), per metre."""
 
     jaw_opening_m: float
     pose_rate: Array
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Opened:
+        """As in a Kalman update: the better the image shows the opening by itself, the less the pose changes.  Zero for
+        a gripper without jaw.
+        """
+        covariance = measurement.covariance
+        if len(covariance) < 7:
+            return cls(0.0, np.zeros(6))
+        known = max(measurement.jaw_known_sigma_m**2, covariance[6, 6])  # exact: as certain as the fit
+        return cls(measurement.jaw_opening_m, covariance[:6, 6] / known if known > 0.0 else np.zeros(6))
 
 
 class AtReference(NamedTuple):
@@ -151,12 +169,15 @@ class AtReference(NamedTuple):
 class AtReferences:
     """What was measured at each reference, of one monitor, and at the one in force."""
 
-    def __init__(self, reference: ReferenceRecord, valid_by: ValidBy, measured_as: tuple[object, ...]):
-        """``valid_by``: what is published; ``measured_as``: what a measured pose depends on but gripper and camera."""
+    def __init__(self, reference: ReferenceRecord, valid_by: ValidBy, risk: float, measured_as: tuple[object, ...]):
+        """``valid_by``: what is published; ``risk``: the integrity risk; ``measured_as``: what a measured pose depends
+        on besides gripper and camera.
+        """
         self._valid_by = valid_by
         self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
         self._known: dict[str, AtReference] = {}
         self._growing: Anchor | None = None  # the average that b follows until there are enough frames
+        self._risk = risk
         self.changes = 0
         """Grows with each change that a restart should know."""
         self.refer(reference)
@@ -208,19 +229,27 @@ class AtReferences:
 
     def add(self, anchor: Anchor, jaw_opening_m: float, stamp_ns: int) -> None:
         """A frame has proved a pose, which ``anchor`` includes."""
-        known = self.current
-        if known is None:
-            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
-        elif self._growing is None:
+        growing = self._growing
+        if growing is None and self.current is not None:
             return
-        elif self._growing is not anchor:
+        if growing is not None and growing is not anchor and not self._was_wrong(growing, anchor):
             self._end()  # the mount was knocked
             return
+        if growing is not anchor:
+            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
         self._openings_m.append(jaw_opening_m)
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
         self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns)
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
+
+    def _was_wrong(self, first: Anchor, anchor: Anchor) -> bool:
+        """Whether the first frames were wrong, rather than the mount knocked just after them, when another place is
+        proved: the other place is one that they allow by their own bound.
+        """
+        bound, away = first.bound(self._risk), perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
+        within = np.linalg.norm(away[:3]) <= bound.position_m and np.linalg.norm(away[3:]) <= bound.rotation_rad
+        return first.frames <= UNSETTLED_FRAMES and bool(within)
 
     def _end(self) -> None:
         self._growing = None

@@ -1,6 +1,6 @@
 """The messages by name, and reading a message from an untrusted sender.
 
-A message names its schema and its major version, ``"schema": "gripmon.transform/1"``.  Within a major version fields
+A message names its schema and its major version, ``"schema": "gripmon.transform/2"``.  Within a major version fields
 and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader ignores what it doesn't know.
 """
 
@@ -84,7 +84,7 @@ def largest_bytes(message: type[msgspec.Struct]) -> int:
 
 
 def schema_name(message: type[msgspec.Struct]) -> str:
-    """Its name on the wire with its major version, e.g. ``gripmon.transform/1``."""
+    """Its name on the wire with its major version, e.g. ``gripmon.transform/2``."""
     return str(message.__struct_config__.tag)
 
 
