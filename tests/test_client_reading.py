@@ -196,7 +196,7 @@ BOUNDS = {"position_m": 4e-4, "rotation_rad": 5e-3, "risk": 1e-5}
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("schema", "gripmon.transform/2"),
+        ("schema", "gripmon.transform/3"),
         ("schema", "gripmon.state/1"),
         ("verdict", "certainly"),
         ("seq", -1),
@@ -254,10 +254,10 @@ def test_an_older_monitor_has_no_protection_level_and_is_read():
 def test_a_newer_monitor_is_named_as_the_reason_and_additions_are_passed_over():
     told = json.loads(payload())
     newer = Inbox()
-    newer.take(WRIST, json.dumps(told | {"schema": "gripmon.transform/2"}).encode(), 0.0)
+    newer.take(WRIST, json.dumps(told | {"schema": "gripmon.transform/3"}).encode(), 0.0)
     got = reading(newer)
     assert got.why is Unusable.UNREADABLE
-    assert "'gripmon.transform/2'" in got.reason and "'gripmon.transform/1'; update the older one" in got.reason
+    assert "'gripmon.transform/3'" in got.reason and "'gripmon.transform/2'; update the older one" in got.reason
     added = Inbox()
     added.take(WRIST, json.dumps(told | {"added": [1], "state": "dreaming", "source": "guess"}).encode(), 100.0)
     assert reading(added).usable and reading(added).state == "dreaming"

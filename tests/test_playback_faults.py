@@ -181,7 +181,7 @@ def test_rerun_of_a_newer_version(run: Run, tmp_path: Path, capfd: pytest.Captur
 def test_gripmon_of_a_newer_version(run: Run, tmp_path: Path):
     """A newer meta schema, newer records with more fields, a state, origin and verdict that aren't known here."""
     meta = altered(to_json(opened(*run.files).meta), schema="gripmon.recording/2", colour="blue", has_truth=...)
-    newer = {"schema": "gripmon.transform/2", "wind_m_s": 3.0, "state": "dreaming", "source": "oracle"}
+    newer = {"schema": "gripmon.transform/3", "wind_m_s": 3.0, "state": "dreaming", "source": "oracle"}
     texts = [altered(text, **newer, verdict="perhaps") for text in lines(*records_of_a_run(0, 50))]
     path = write_rrd(tmp_path / "newer.rrd", texts, meta=meta)
     collection = open_recordings([path])
@@ -194,7 +194,7 @@ def test_gripmon_of_a_newer_version(run: Run, tmp_path: Path):
     again = list(found.records())
     assert [r.seq for r in again] == list(range(50))
     assert {r.verdict for r in again} == {Verdict.UNKNOWN} and {str(r.state) for r in again} == {"dreaming"}
-    for word in ("gripmon.recording/2", "gripmon.transform/2", "'dreaming'", "'oracle'", "'perhaps'"):
+    for word in ("gripmon.recording/2", "gripmon.transform/3", "'dreaming'", "'oracle'", "'perhaps'"):
         assert any(word in fault for fault in found.faults), word
     assert [a.seq for a in found.alerts] == [40]
 

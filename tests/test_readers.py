@@ -123,7 +123,7 @@ def test_a_valid_transform_is_given_with_every_digit(program: Path):
         ({"verdict": "suspect", "reason": "too few edges"}, "suspect: too few edges"),
         ({"verdict": "unknown", "reason": "black"}, "unknown: black"),
         ({"verdict": "splendid", "reason": None}, "unknown: "),
-        ({"schema": "gripmon.transform/2"}, "the last transform can't be read: not gripmon.transform/1"),
+        ({"schema": "gripmon.transform/3"}, "the last transform can't be read: not gripmon.transform/2"),
         ({"monitor_id": "another-1-2"}, "its monitor is gone"),
         ({"latency_ns": 2**61}, "it is too old"),
     ],

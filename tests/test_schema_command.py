@@ -145,7 +145,7 @@ def test_a_monitor_always_says_the_schema():
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        (("schema",), "gripmon.transform/2"),
+        (("schema",), "gripmon.transform/3"),
         (("verdict",), "splendid"),
         (("seq",), "7"),
         (("seq",), 7.5),

@@ -114,8 +114,8 @@ def test_a_verdict_that_is_not_known_is_never_taken_for_one_that_is(value: objec
 @pytest.mark.parametrize(
     ("payload", "said"),
     [
-        (b"", "no message gripmon.transform/1: Input data was truncated"),
-        (b"\xff\xfe", "no message gripmon.transform/1: JSON is malformed"),
+        (b"", "no message gripmon.transform/2: Input data was truncated"),
+        (b"\xff\xfe", "no message gripmon.transform/2: JSON is malformed"),
         (b"[1, 2]", "Expected `object`, got `array`"),
         (b'{"schema": "gripmon.state/1", "seq": 3}', "its schema is 'gripmon.state/1'"),
         (b'{"schema": 1}', "Expected `str` - at `$.schema`"),

@@ -67,7 +67,7 @@ def test_a_plain_reader_gets_what_was_meant():
     """By the standard library alone, without a word of the package's."""
     read = {name: json.loads(kept(name)) for name in SAMPLES}
     transform = read["transform"]
-    assert transform["schema"] == "gripmon.transform/1" and transform["verdict"] == "valid"
+    assert transform["schema"] == "gripmon.transform/2" and transform["verdict"] == "valid"
     assert transform["stamp_ns"] == 1767225600123456789, "all digits"
     assert transform["cam_T_grip"] == {
         "translation_m": [0.0116, -0.0021, 0.1327],

@@ -165,9 +165,9 @@ def distribution(values: Array) -> Distribution:
 
 def _error(pair: _Pair) -> Array | None:
     """Error (3,) of the TCP in camera axes, m; None for a frame without a measurement of its own."""
-    if pair.record.cam_T_grip is None or pair.record.source is Origin.HELD:
+    if pair.record.measured_T is None or pair.record.source is Origin.HELD:
         return None
-    return np.array(pair.record.cam_T_grip.translation_m) - pair.truth.cam_T_grip[:3, 3]
+    return np.array(pair.record.measured_T.translation_m) - pair.truth.cam_T_grip[:3, 3]
 
 
 def _smoothed_error(pair: _Pair) -> Array | None:

@@ -111,6 +111,9 @@ class Limits(msgspec.Struct, frozen=True):
         float | None, _is("monitor.policy.alert_limit_m: a position's error bound is compared with it")
     ] = None
     alert_limit_rad: float | None = None
+    valid_by: Annotated[
+        str, _is("monitor.policy.valid_by: which error that is, absolute or reference, of the motion since it")
+    ] = "absolute"
 
 
 class Integrity(msgspec.Struct, frozen=True, kw_only=True):
@@ -174,7 +177,7 @@ class Curve(msgspec.Struct, frozen=True):
         str,
         _is(
             "tcp_from_beginning_m, tcp_from_reference_m, x_m, y_m, z_m, rotation_rad; where the recording "
-            "has them protection_m, protection_rad"
+            "has them protection_m, protection_rad, since_reference_m, since_reference_rad, absolute_m, absolute_rad"
         ),
     ]
     stamp_ns: Annotated[tuple[int, ...], _is("middle of each piece")]

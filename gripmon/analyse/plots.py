@@ -16,7 +16,7 @@ from plotly.subplots import make_subplots
 
 from gripmon.analyse.content import Curve, RecordingReport, Stretch, clock_time, iso, span
 
-BLUE, ORANGE, PURPLE = "#3f7fdd", "#dd8420", "#8f63cf"
+BLUE, ORANGE, PURPLE, PALE_PURPLE = "#3f7fdd", "#dd8420", "#8f63cf", "#c7b1e7"
 AXES = {"x": "#dc5450", "y": "#2f9c5c", "z": "#4c7fe6"}
 ROBOTS = ("#3f7fdd", "#dd8420", "#2f9c5c", "#a861c9", "#cf4f7a", "#2a9aa5", "#8d7a3c", "#7a7f8c")
 VERDICTS = {"valid": "#41ad6b", "suspect": "#e0a22f", "unknown": "#8d94a1"}
@@ -119,6 +119,10 @@ def protection_figure(report: RecordingReport) -> go.Figure:
     ):
         label = "protection level" if row == 1 else "of the rotation"
         _line(figure, curves[name], row, PURPLE, label, scale, legend=row == 1)
+        # Which of both is the protection level, valid_by says: the other one.
+        of = "absolute" if limits.valid_by == "reference" else "since_reference"
+        if (other := curves.get(name.replace("protection", of))) is not None:
+            _line(figure, other, row, PALE_PURPLE, of.replace("_", " the "), scale, legend=row == 1)
         if limit is not None:  # a line, since a shape's text stands elsewhere on a logarithmic axis
             ends = _times([report.start_ns, report.end_ns])
             figure.add_scatter(

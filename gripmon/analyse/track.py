@@ -216,7 +216,8 @@ def curves_of(table: FrameTable, track: Track, moments_ns: Sequence[int]) -> tup
         *((f"{axis}_m", shift[:, i], track.sigma[:, i]) for i, axis in enumerate("xyz")),
         ("rotation_rad", np.linalg.norm(shift[:, 3:], axis=1), turn),
     ]
-    for name in ("protection_m", "protection_rad"):
+    bounds_of = ("protection", "since_reference", "absolute")
+    for name in (f"{of}_{unit}" for of in bounds_of for unit in ("m", "rad")):
         bounds = getattr(table, name)
         if np.isfinite(bounds).any():
             series.append((name, bounds, np.zeros(len(bounds))))

@@ -189,11 +189,12 @@ def _waits(status: MonitorStatus) -> str:
 
 
 def _bound(state: StateRecord | None) -> str:
-    """The protection level over the alert limit, if known."""
+    """The protection level over the alert limit, if known; ``ref``: of the motion since the reference."""
     if state is None or state.protection_m is None:
         return "-"
     limit = "" if state.alert_limit_m is None else f"/{1e3 * state.alert_limit_m:g}"
-    return f"{1e3 * state.protection_m:.2f}{limit}"
+    by = " ref" if state.valid_by == "reference" else ""
+    return f"{1e3 * state.protection_m:.2f}{limit}{by}"
 
 
 def _number(scale: float, value: float | None, how: str) -> str:

@@ -150,7 +150,7 @@ def schema(arguments: Arguments) -> None:
     """Print the JSON Schema (draft 2020-12) of one message, or of all messages: fields with units and frames,
     and when they are null.
 
-    Every message names its schema with the major version: "schema": "gripmon.transform/1".  Within a major
+    Every message names its schema with the major version: "schema": "gripmon.transform/2".  Within a major
     version fields and names may be added, and nothing else changes.
     """
     from gripmon.model.records import MESSAGES, json_schema, schema_name, summary

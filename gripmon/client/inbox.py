@@ -103,7 +103,7 @@ def transform_message(payload: bytes) -> FrameRecord:
     """
     record = from_json(payload, FrameRecord)
     smoothed, bounds = record.smoothed, record.protection
-    for pose in (record.cam_T_grip, smoothed):
+    for pose in (record.cam_T_grip, smoothed, record.absolute):
         if pose is not None and not abs(math.hypot(*pose.rotation_xyzw) - 1.0) < _UNIT_TOLERANCE:
             raise MessageRefused("a transform that is not a pose")
     for covariance in (record.covariance, None if smoothed is None else smoothed.covariance):
@@ -111,6 +111,9 @@ def transform_message(payload: bytes) -> FrameRecord:
             raise MessageRefused("a covariance with a variance below 0")
     if bounds is not None and not (min(bounds.position_m, bounds.rotation_rad) >= 0.0 and 0.0 < bounds.risk <= 1.0):
         raise MessageRefused("a protection level below 0, or a risk that is not within 0 and 1")
+    for bound in (record.since_reference, record.absolute):
+        if bound is not None and not min(bound.position_m, bound.rotation_rad) >= 0.0:
+            raise MessageRefused("a protection level below 0")
     if record.verdict is not Verdict.UNKNOWN and (record.cam_T_grip is None or record.covariance is None):
         raise MessageRefused(f"verdict {record.verdict} without a transform and its covariance")
     for name in ("seq", "stamp_ns", "revision", "latency_ns"):

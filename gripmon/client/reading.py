@@ -11,7 +11,18 @@ import msgspec
 
 from gripmon.client.inbox import Entry, Heard, several, waited_s
 from gripmon.client.network import MonitorName
-from gripmon.model.records import FrameRecord, Origin, Protection, Smoothed, State, Transform, Verdict
+from gripmon.model.records import (
+    Absolute,
+    FrameRecord,
+    Origin,
+    Protection,
+    SinceReference,
+    Smoothed,
+    State,
+    Transform,
+    ValidBy,
+    Verdict,
+)
 
 if TYPE_CHECKING:
     from gripmon.model.records import Array
@@ -79,8 +90,10 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
 
     ``transform`` (``cam_T_grip``), ``covariance`` (36 numbers, 6 x 6 row by row: m, rad, camera axes), ``protection``
     (bounds on the error of ``transform`` at a stated risk; None from an older monitor, too) and ``smoothed`` are
-    None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` if the monitor is gone,
-    its last transform is too old, or there is none.
+    None whenever ``verdict`` is ``unknown``.  ``valid_by`` says which transform and error these four are of: the
+    reference after the motion since it, or the transform as measured; ``since_reference`` and ``absolute`` have both
+    bounds, and the latter the transform as measured.  The verdict is the monitor's, but ``unknown`` if the monitor is
+    gone, its last transform is too old, or there is none.
 
     ``usable``: the policy allows it; otherwise ``why`` gives the reason in a word and ``reason`` in a line.  ``age_s``
     bounds the time since the monitor received the frame: its processing time, the largest possible delay of the message
@@ -106,6 +119,9 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     reference_id: str = ""
     revision: int = -1
     monitor_id: str = ""
+    valid_by: ValidBy = ValidBy.ABSOLUTE
+    since_reference: SinceReference | None = None
+    absolute: Absolute | None = None
 
     def same_revision_as(self, other: Reading) -> bool:
         """Whether both refer to the same reference of the same start of the monitor; only then may they be subtracted.
@@ -171,6 +187,9 @@ def judge(
         reference_id=record.reference_id,
         revision=record.revision,
         monitor_id=record.monitor_id,
+        valid_by=record.valid_by,
+        since_reference=None if lost else record.since_reference,
+        absolute=None if lost else record.absolute,
     )
 
 

@@ -260,13 +260,17 @@ def _promise(report: Forecast) -> Finding | None:
     limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
     share = max(found.position_m / limit_m, found.rotation_rad / limit_rad)
     good = f"{_millimetres(found.position_m)} and {_degrees(found.rotation_rad)}"
+    subject = "the motion since the reference is " if report.valid_by == "reference" else ""
     limit = f"the alert limit of {_millimetres(limit_m)} and {_degrees(limit_rad)}"
     if share > 1.0:
-        text = f"no transform can be valid: good to {good}, beyond {limit}; valid needs {report.needed}"
+        text = f"no transform can be valid: {subject}good to {good}, beyond {limit}; valid needs {report.needed}"
         return Finding("WARN", "promise", text)
     close = _USUAL_SPREAD * share > 1.0
     level: Level = "WARN" if close else "OK"
-    text = f"good to {good}, close to {limit}" if close else f"a transform is good to {good}, within {limit}"
+    if close:
+        text = f"{subject}good to {good}, close to {limit}"
+    else:
+        text = f"{subject or 'a transform is '}good to {good}, within {limit}"
     bevelled = report.protection_if_bevelled
     if bevelled is not None and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
         level = "WARN"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gripmon.daemon.config import Config
+from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast_values import (
     Accuracy,
     BorderValues,
@@ -81,6 +82,7 @@ def forecast(config: Config) -> Forecast:
     None.
     """
     settings, gripper, found = config.settings, config.gripper, promise_of(config)
+    both = None if found is None else forecast_frame(rig_of(config), config.cam_T_grip, config.jaw_opening_m).bounds
     policy = settings.monitor.policy
     return Forecast(
         config=str(config.path),
@@ -103,7 +105,10 @@ def forecast(config: Config) -> Forecast:
         corners=_corners(config),
         edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
         accuracy=_accuracy(config),
+        valid_by=policy.valid_by,
         protection=None if found is None else _bounds(found.protection),
+        since_reference=None if both is None else _bounds(both.since_reference),
+        absolute=None if both is None else _bounds(both.absolute),
         protection_if_bevelled=None if found is None else _if_bevelled(config),
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
@@ -153,10 +158,13 @@ def promise_of(config: Config) -> Promise | None:
 
 
 def limits_warning(config: Config) -> str | None:
-    """A warning if no transform of the configured view can be valid; None otherwise."""
+    """A warning if no transform of the configured view can be valid, or if what the bound rests on isn't known; None
+    otherwise.
+    """
     found = promise_of(config)
     if found is None or found.reachable:
-        return None
+        doubt = reference_doubt(config.settings)
+        return None if doubt is None else f"{config.path}: {doubt}"
     return f"{config.path}: no transform of this view can be valid: valid needs {found.needed} (monitor.policy)"
 
 

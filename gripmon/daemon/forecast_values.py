@@ -251,9 +251,10 @@ class InView(msgspec.Struct, frozen=True):
 class Forecast(msgspec.Struct, frozen=True):
     """The forecast of a configuration's view: metres, radians, px; positions in the camera frame.
 
-    ``protection``: the protection level of one frame; ``protection_if_bevelled``: the same if the gripper has bevels
-    that are neither stated nor taught, null if that is excluded; ``needed``: the alert limits that this view could
-    meet, or teaching, if no transform of it can be valid.
+    ``protection``: the protection level of one frame, which ``valid_by`` names: that of the motion ``since_reference``,
+    before the reference's frames are averaged, or the ``absolute`` one; ``protection_if_bevelled``: the same if the
+    gripper has bevels that are neither stated nor taught, null if that is excluded; ``needed``: the alert limits that
+    this view could meet, or teaching, if no transform of it can be valid.
     """
 
     config: str
@@ -267,7 +268,10 @@ class Forecast(msgspec.Struct, frozen=True):
     corners: tuple[CornerView, ...]
     edges: tuple[EdgeView, ...]
     accuracy: Accuracy
+    valid_by: str
     protection: Bounds | None
+    since_reference: Bounds | None
+    absolute: Bounds | None
     protection_if_bevelled: Bounds | None
     alert_limit_m: float
     alert_limit_rad: float

@@ -20,11 +20,11 @@ _QUALITY = 85  # of JPEG, percent
 
 
 def outlines_of(camera: Camera, gripper: Gripper, record: FrameRecord) -> Outlines:
-    """The gripper's visible edges at the record's transform, px; none without a transform."""
-    if record.cam_T_grip is None:
+    """The gripper's visible edges where the record measured it, px; none without a transform."""
+    if record.measured_T is None:
         return ()
     opening_m = record.jaw_opening_m if gripper.has_jaw else None
-    lines = outlines_px(camera, gripper, from_record(record.cam_T_grip), opening_m, _POINTS).values()
+    lines = outlines_px(camera, gripper, from_record(record.measured_T), opening_m, _POINTS).values()
     return tuple(tuple((round(float(u), 2), round(float(v), 2)) for u, v in line) for line in lines)
 
 

@@ -54,6 +54,8 @@ class RecordedRun:
         """Compare the record of the frame that the source returned last with the recorded one."""
         then = self.source.record
         assert then is not None, "every replayed frame has a record"
+        if then.since_reference is None:  # as versions without it recorded
+            record = msgspec.structs.replace(record, since_reference=None)
         unbounded = then.protection is None and record.protection is not None
         self._unbounded += unbounded
         self._differences.add(then, as_recorded_before_bounds(record) if unbounded else record)
@@ -146,7 +148,8 @@ class RecordedRun:
 
 def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
     """The record as written by versions without bounds, which gave a reason only where nothing was measured."""
-    return msgspec.structs.replace(record, protection=None, reason=None if record.measured else record.reason)
+    reason = None if record.measured else record.reason
+    return msgspec.structs.replace(record, protection=None, since_reference=None, absolute=None, reason=reason)
 
 
 def _limits(config: Config | None) -> Limits | None:

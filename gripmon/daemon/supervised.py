@@ -337,6 +337,7 @@ class Loop(ABC):
             sigma_m=watch.last.sigma_m if alone else None,
             protection_m=watch.last.protection_m if alone else None,
             alert_limit_m=reports.alert_limit_m,
+            valid_by=watch.last.valid_by if alone else None,
             open_alerts=watch.standing(self._open_alerts),
             transforms_unsent=self._ask(reports.unsent, 0),
             malformed=self._ask(reports.malformed, 0),

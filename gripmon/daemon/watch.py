@@ -21,6 +21,7 @@ from gripmon.model.records import (
     Severity,
     StandingAlert,
     State,
+    ValidBy,
     Verdict,
 )
 
@@ -86,7 +87,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 class FrameOutcome(NamedTuple):
     """What is kept of a frame.  ``usable``: it was measured; ``refused``: its image could not be used; ``reason``: what
-    is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
+    is wrong, if anything.  ``tcp_shift_m``, ``sigma_m``, ``protection_m`` and ``valid_by`` as in the state message.
     """
 
     state: State
@@ -97,6 +98,7 @@ class FrameOutcome(NamedTuple):
     tcp_shift_m: tuple[float, float, float] | None = None
     sigma_m: float | None = None
     protection_m: float | None = None
+    valid_by: ValidBy | None = None
 
 
 _NOTHING = FrameOutcome(State.ACQUIRING, Verdict.UNKNOWN, usable=False)
@@ -261,6 +263,7 @@ def _of_record(record: FrameRecord) -> FrameOutcome:
         tcp_shift_m=record.drift.tcp_shift_m if counts and record.drift is not None else None,
         sigma_m=None if not counts or record.covariance is None else math.sqrt(max(record.covariance[:15:7])),
         protection_m=None if not counts or record.protection is None else record.protection.position_m,
+        valid_by=record.valid_by,
     )
 
 

@@ -127,6 +127,11 @@ class Monitor:
         return self._trust.look_refused
 
     @property
+    def since_refused(self) -> str | None:
+        """Why what a state has of the reference's frames isn't used; None where it is, or there was no state."""
+        return self._trust.since_refused
+
+    @property
     def proposal(self) -> ReferenceRecord | None:
         """A new reference that waits for an operator."""
         return self._renewal.book.proposal

@@ -239,9 +239,7 @@ class Refits:
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
         """(h, f, 6) their errors if a finger is longer by its standard deviation."""
-        jaw = measurement.covariance
-        rate = jaw[:6, 6] / jaw[6, 6] if m == 7 and jaw[6, 6] > 0.0 else np.zeros(6)
-        self.opened = Opened(measurement.jaw_opening_m, rate)
+        self.opened = Opened.of(measurement)
 
     @property
     def edges(self) -> NDArray[np.intp]:
@@ -448,6 +446,12 @@ class Anchor:
         """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
         shift = self._filters.shift - perturbation_between(self._base_T, self.cam_T_grip)
         return Separation(shift, self._claimed, self._filters.of_model)
+
+    def bound(self, risk: float) -> Protection:
+        """The protection level of the average itself."""
+        fits = _with_origin(self.fits(), self.cam_T_grip, self._origin, np.zeros(6))
+        prior = np.append(self._lasting.prior[:-1], self.misread)
+        return protection_of(Doubts.of(self._lasting.name, prior, fits, SIGMA_INFLATION), risk)
 
     def doubts(
         self,

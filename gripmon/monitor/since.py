@@ -1,15 +1,15 @@
-"""The motion d since the reference: what is the same in the reference's frames and now cancels (``docs/integrity.md``).
+"""The motion d since the reference: what is the same in the reference's frames and now cancels.
 
-A measured pose is ``x = exp(d) exp(b) reference``, with left perturbations as in equation (11): d is the camera's motion
-since the reference, b how far off the reference the measurements had the gripper then, an average over the first proved
-frames or a recalibration's own.  With their pose ``x_b = exp(b) reference``, ``exp(d) = x x_b^-1``.  An error E that is
-constant in gripper axes (another TCP, bevels, worn or rounded tips, edges taught at a wrong reference) is in both poses:
-``x E (x_b E)^-1 = x x_b^-1``, whatever the motion.
+A measured pose is ``x = exp(d) exp(b) reference``, with left perturbations as in equation (11): d is the camera's
+motion since the reference, b how far off the reference the measurements had the gripper then, an average over the first
+proved frames or a recalibration's own.  With their pose ``x_b = exp(b) reference``, ``exp(d) = x x_b^-1``.  An error E
+that is constant in gripper axes (another TCP, bevels, worn or rounded tips, edges taught at a wrong reference) is in
+both poses: ``x E (x_b E)^-1 = x x_b^-1``, whatever the motion (``docs/integrity.md``).
 
-What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is, too;
-as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into a motion;
-edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of the motion;
-a longer finger moves a fit by its visible edges, which may be others than then.
+What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is
+larger, too; as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into
+a motion; edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of
+the motion; a longer finger moves a fit by its visible edges, which may be others than then.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from gripmon.model.records import (
     SinceReference,
     ValidBy,
 )
+from gripmon.track.edges import Measurement
 from gripmon.track.integrity import Separation, follow
 
 if TYPE_CHECKING:
@@ -42,6 +43,12 @@ if TYPE_CHECKING:
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
 less than such an average claims.
+"""
+
+UNSETTLED_FRAMES = 5
+"""Proved frames after a start in which another place within their bound is no knock: within two seconds at 15 frames/s
+(one in four is proved), in which a mount that is knocked once a month is knocked with a probability of 8e-7; that an
+edge of theirs belongs to something else has one of 1e-2.
 """
 
 KEPT_REFERENCES = 8
@@ -72,10 +79,21 @@ class Named(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A fit's jaw opening, m, and how the fitted pose changes with it (6,), per metre."""
+    """A fit's jaw opening, m, and how the fitted pose changes with the reported one (6,), per metre."""
 
     jaw_opening_m: float
     pose_rate: Array
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Opened:
+        """As in a Kalman update: the better the image shows the opening by itself, the less the pose changes.  Zero for
+        a gripper without jaw.
+        """
+        covariance = measurement.covariance
+        if len(covariance) < 7:
+            return cls(0.0, np.zeros(6))
+        known = max(measurement.jaw_known_sigma_m**2, covariance[6, 6])  # exact: as certain as the fit
+        return cls(measurement.jaw_opening_m, covariance[:6, 6] / known if known > 0.0 else np.zeros(6))
 
 
 class AtReference(NamedTuple):
@@ -162,12 +180,15 @@ class AtReference(NamedTuple):
 class AtReferences:
     """What was measured at each reference, of one monitor, and at the one in force."""
 
-    def __init__(self, reference: ReferenceRecord, valid_by: ValidBy, measured_as: tuple[object, ...]):
-        """``valid_by``: what is published; ``measured_as``: what a measured pose depends on but gripper and camera."""
+    def __init__(self, reference: ReferenceRecord, valid_by: ValidBy, risk: float, measured_as: tuple[object, ...]):
+        """``valid_by``: what is published; ``risk``: the integrity risk; ``measured_as``: what a measured pose depends
+        on besides gripper and camera.
+        """
         self._valid_by = valid_by
         self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
         self._known: dict[str, AtReference] = {}
         self._growing: Anchor | None = None  # the average that b follows until there are enough frames
+        self._risk = risk
         self.changes = 0
         """Grows with each change that a restart should know."""
         self.refer(reference)
@@ -219,14 +240,14 @@ class AtReferences:
 
     def add(self, anchor: Anchor, jaw_opening_m: float, stamp_ns: int) -> None:
         """A frame has proved a pose, which ``anchor`` includes."""
-        known = self.current
-        if known is None:
-            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
-        elif self._growing is None:
+        growing = self._growing
+        if growing is None and self.current is not None:
             return
-        elif self._growing is not anchor:
+        if growing is not None and growing is not anchor and not self._was_wrong(growing, anchor):
             self._end()  # the mount was knocked
             return
+        if growing is not anchor:
+            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
         self._openings_m.append(jaw_opening_m)
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
         self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns)
@@ -237,6 +258,14 @@ class AtReferences:
         """Begin again at the reference in force."""
         self._known.pop(self._id, None)
         self._growing = None
+
+    def _was_wrong(self, first: Anchor, anchor: Anchor) -> bool:
+        """Whether the first frames were wrong, rather than the mount knocked just after them, when another place is
+        proved: the other place is one that they allow by their own bound.
+        """
+        bound, away = first.bound(self._risk), perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
+        within = np.linalg.norm(away[:3]) <= bound.position_m and np.linalg.norm(away[3:]) <= bound.rotation_rad
+        return first.frames <= UNSETTLED_FRAMES and bool(within)
 
     def _end(self) -> None:
         self._growing = None
@@ -274,12 +303,17 @@ class AtReferences:
         some of it isn't used: settings or taught edges have changed since; None if all of it is.
         """
         refused = None
+        if self._valid_by is ValidBy.REFERENCE and self._id not in {each.reference_id for each in records}:
+            refused = (
+                "the state has nothing of the reference's frames: it is from an earlier version, or too few frames had "
+                "proved where the gripper is; the motion since the reference counts from the first frames"
+            )
         for each in records:
             fits = _fits(each, lasting, fingers) if each.measured_as == self._digest else None
             if fits is None:
                 refused = (
                     "where the reference's frames had the gripper isn't used: the edges were taught again, or measured "
-                    "with other settings, since; the bound since the reference counts from the first frames"
+                    "with other settings, since; the motion since the reference counts from the first frames"
                 )
             else:
                 at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns

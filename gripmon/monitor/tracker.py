@@ -218,6 +218,7 @@ class Tracker:
         fused = self._jaw.fuse(measurement.jaw_reported_m, measurement.jaw_opening_m, measurement.covariance)
         covariance = measurement.covariance.copy()
         covariance[:6, :6] = fused.covariance
+        covariance[:6, 6] = covariance[6, :6] = covariance[:6, 6] * (fused.sigma_m**2 / covariance[6, 6])
         covariance[6, 6] = fused.sigma_m**2
         return replace(
             measurement,

@@ -55,7 +55,7 @@ class Integrity:
     ):
         self._tracker, self._policy = tracker, settings.policy
         measured_as = tracker.taught_digest, settings.corners, settings.measurement, settings.jaw_sigma_m
-        self.since = AtReferences(reference, settings.policy.valid_by, measured_as)
+        self.since = AtReferences(reference, settings.policy.valid_by, settings.policy.integrity_risk, measured_as)
         """What was measured at the reference in force."""
         self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
         # Fingers without a direction of their own are slid out of the gripper.
@@ -125,8 +125,9 @@ class Integrity:
                     self._strips.restore(state.look.strips)
             except LookRefused as refused:
                 self.look_refused = str(refused)
-        if state is not None and state.at_reference is not msgspec.UNSET:
-            self.since_refused = self._weigher.restore(state.at_reference)
+        if state is not None:
+            known = () if state.at_reference is msgspec.UNSET else state.at_reference
+            self.since_refused = self._weigher.restore(known)
 
     def learn(self) -> None:
         """Learn the look from the newest frame that proved the pose, once."""

@@ -270,7 +270,7 @@ class Weigher:
         return Trust(both, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of, misread)
 
     def _with_question(self, both: Bounds) -> Bounds:
-        """The bounds while it is open why the first frames differed from the reference: that is no motion since them."""
+        """The bounds while it is open why the first frames differed from the reference: no motion since them."""
         if self.unexplained is None:
             return both
         return both._replace(absolute=larger(both.absolute, self._not_as_expected(self.unexplained)))

@@ -4,18 +4,20 @@ as far as they are understood.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
 
 from gripmon.model.records import (
+    OLDER,
     AlertRecord,
     FrameRecord,
     Meta,
@@ -102,10 +104,16 @@ def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
     written = fields.get("schema", schema)
     if not isinstance(written, str) or written.partition("/")[0] != schema.partition("/")[0]:
         raise ValueError(f"isn't a {schema} but {written!r:.80}")
-    fields["schema"] = schema
+    older = OLDER.get(kind)
+    earlier = older is not None and written == schema_name(older)
+    fields["schema"] = written if earlier else schema
     if kind is FrameRecord and fields.get("verdict") not in set(Verdict):
         fields["verdict"] = Verdict.UNKNOWN
     try:
+        if older is not None and earlier:
+            with contextlib.suppress(msgspec.MsgspecError):
+                return cast(_T, msgspec.convert(fields, type=older).upgraded()), ""
+            return cast(_T, msgspec.convert(_UNKNOWN.get(kind, {}) | fields, type=older).upgraded()), reason
         record = msgspec.convert(_UNKNOWN.get(kind, {}) | fields, type=kind)
     except _DECODING_ERRORS as error:
         raise ValueError(f"isn't a {schema} that can be understood: {error}") from None
@@ -297,7 +305,7 @@ class Contents:
         self._examples.setdefault(what, error)
 
     def _misunderstood(self) -> list[str]:
-        newer = sorted(self._schemas - {"", schema_name(FrameRecord)})
+        newer = sorted(self._schemas - {"", schema_name(FrameRecord), schema_name(OLDER[FrameRecord])})
         faults = [f"has records of {name!r:.60}: read as {schema_name(FrameRecord)}" for name in newer]
         for what, count in self._not_understood.items():
             faults.append(f"has {count} of {what} that can't be understood ({self._examples[what]:.120}); left out")

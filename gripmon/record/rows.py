@@ -21,7 +21,8 @@ per entity, which costs a tenth of logging frame by frame.
 ``drift/noticed_mm``, ``_deg``      the interval within which a constant shift goes undetected: x, y, z; x, y, z
 ``drift/truth_mm``, ``error_mm``    where a simulator provides the truth
 ``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised, noted or changes kind
-``protection/level_mm``, ``_deg``   bounds on the errors of the TCP's position and of the rotation
+``protection/level_mm``, ``_deg``   bounds on the errors of the TCP's position and of the rotation: what valid means
+``protection/…``                    ``since_reference_…`` of the motion since the reference, ``absolute_…`` as measured
 ``protection/limit_mm``, ``_deg``   the alert limits that the bounds are compared with
 ``test/share``                      the drift test's largest statistic over its threshold;  ``test/alarm`` is 1
 ``transform``                       translation (m) and quaternion x, y, z, w, raw and smoothed
@@ -203,6 +204,11 @@ class CurveWriter:
         self._send.curve("protection/level_mm", rows, [None if b is None else 1e3 * b.position_m for b in bounds])
         degrees = [None if b is None else math.degrees(b.rotation_rad) for b in bounds]
         self._send.curve("protection/level_deg", rows, degrees)
+        for name in ("since_reference", "absolute"):
+            known = [getattr(r.record, name) for r in rows]
+            self._send.curve(f"protection/{name}_mm", rows, [None if b is None else 1e3 * b.position_m for b in known])
+            degrees = [None if b is None else math.degrees(b.rotation_rad) for b in known]
+            self._send.curve(f"protection/{name}_deg", rows, degrees)
 
     def _news(self, record: FrameRecord) -> set[Severity]:
         """Severities of alerts that are raised, noted, or change kind or severity (a creep that ends in a step)."""
@@ -305,6 +311,8 @@ def _log_styles(send: Sender, corner_ids: tuple[str, ...]) -> None:
         lines(f"drift/limits_{unit}", ["warning", "limit"], [Palette.DOUBTFUL, Palette.BAD], 1.5)
         lines(f"drift/noticed_{unit}", [f"{name} unnoticed" for name in both], pale * 2, 1.0)
         lines(f"protection/level_{unit}", "protection level", Palette.WHOLE, 1.5)
+        lines(f"protection/since_reference_{unit}", "since the reference", faded(Palette.WHOLE, 130), 1.0)
+        lines(f"protection/absolute_{unit}", "absolute", faded(Palette.WHOLE, 130), 1.0)
         lines(f"protection/limit_{unit}", "alert limit", Palette.BAD, 1.5)
     marks = {Severity.INFO: Palette.BUSY, Severity.WARNING: Palette.DOUBTFUL, Severity.ERROR: Palette.BAD}
     for severity, colour in marks.items():

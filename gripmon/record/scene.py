@@ -45,6 +45,7 @@ _STATISTIC_SHOWN = (0.0, 2.0)  # a collision gives hundreds of times the thresho
 _Pixels = NDArray[np.float32]
 _NOT_TRACED = TraceNote(b"", b"", b"", b"", [], b"")
 _NO_POINTS = np.empty((0, 3))
+_BOUNDS = [f"protection/{name}_mm" for name in ("level", "since_reference", "absolute", "limit")]
 
 
 class _Corner(NamedTuple):
@@ -363,7 +364,11 @@ def _details(scene: Scene) -> rrb.Tabs:
     close_up = ["drift/noticed_mm", "drift/tcp_shift_sigma_mm", "drift/tcp_shift_mm"]
     return rrb.Tabs(
         plot("drift", close_up, "Close up (mm)", legend=False, shown=_CLOSE_UP_MM),
-        plot("protection", ["protection/level_mm", "protection/limit_mm"], "Protection (mm)"),
+        plot(
+            "protection",
+            _BOUNDS,
+            "Protection (mm)",
+        ),
         *error,
         plot("residual", "residual/rms_px", "Residual (px)"),
         plot("residual", "residual/corners_px", "Corners (px)"),

@@ -15,7 +15,20 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.model.records import Drift, FrameRecord, Origin, Protection, Smoothed, State, Transform, Verdict
+from gripmon.model.records import (
+    Absolute,
+    Drift,
+    FrameRecord,
+    Origin,
+    Protection,
+    Since,
+    SinceReference,
+    Smoothed,
+    State,
+    Transform,
+    ValidBy,
+    Verdict,
+)
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
@@ -53,6 +66,9 @@ class Line(msgspec.Struct, frozen=True, gc=False):
     latency_ns: _Integer = -1
     reason: str | None = None
     protection: Protection | None = None
+    valid_by: str = ValidBy.ABSOLUTE.value
+    since_reference: SinceReference | None = None
+    absolute: Absolute | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +76,15 @@ class FrameTable:
     """One row per frame; NaN where a number is null, -1 where an integer is unknown.
 
     Codes index the tuples of names: ``VERDICTS[verdict]``, ``STATES[state]``, ``ORIGINS[source]``,
-    ``reference_ids[reference]``.  A state or origin that this version doesn't know is ``other``; an unknown
-    verdict counts as ``unknown``, on which nothing may rely.
+    ``VALID_BY[valid_by]``, ``SINCE[since]``, ``reference_ids[reference]``.  A state or origin that this version doesn't
+    know is ``other``; an unknown verdict counts as ``unknown``, on which nothing may rely.
     """
 
     VERDICTS: ClassVar[tuple[str, ...]] = tuple(v.value for v in Verdict)
     STATES: ClassVar[tuple[str, ...]] = (*(s.value for s in State), OTHER)
     ORIGINS: ClassVar[tuple[str, ...]] = (*(o.value for o in Origin), OTHER)
+    VALID_BY: ClassVar[tuple[str, ...]] = tuple(v.value for v in ValidBy)
+    SINCE: ClassVar[tuple[str, ...]] = (*(s.value for s in Since), OTHER)
 
     seq: IntArray
     """(n,) number of the frame."""
@@ -76,7 +94,7 @@ class FrameTable:
     state: NDArray[np.int8]
     source: NDArray[np.int8]
     cam_T_grip: FloatArray
-    """(n, 7): x, y, z of the TCP in camera axes, m; unit quaternion x, y, z, w."""
+    """(n, 7) what ``valid_by`` names: x, y, z of the TCP in camera axes, m; unit quaternion x, y, z, w."""
     covariance: FloatArray
     """(n, 6, 6): position (m), then rotation vector (rad), camera axes."""
     smoothed: FloatArray
@@ -88,6 +106,20 @@ class FrameTable:
     """(n,) bound on the angle of the rotation error."""
     integrity_risk: FloatArray
     """(n,) probability per frame that the error exceeds a bound."""
+    valid_by: NDArray[np.int8]
+    """(n,) which transform and which error ``cam_T_grip``, ``covariance`` and the protection level are of."""
+    since_reference_m: FloatArray
+    """(n,) bound on the position error of the motion since the reference; NaN in recordings from before it, too."""
+    since_reference_rad: FloatArray
+    since: NDArray[np.int8]
+    """(n,) what that motion counts from; -1: not known."""
+    since_ns: IntArray
+    """(n,) and its stamp, Unix ns."""
+    absolute_m: FloatArray
+    """(n,) bound on the position error of the transform as measured."""
+    absolute_rad: FloatArray
+    absolute: FloatArray
+    """(n, 7) the transform as measured."""
     d_m: FloatArray
     """(n,) length of the camera's displacement from the reference."""
     delta_rad: FloatArray
@@ -134,6 +166,8 @@ def pose_matrices(poses: Any) -> FloatArray:
 _VERDICT_CODES = {name: code for code, name in enumerate(FrameTable.VERDICTS)}
 _STATE_CODES = {name: code for code, name in enumerate(FrameTable.STATES)}
 _ORIGIN_CODES = {name: code for code, name in enumerate(FrameTable.ORIGINS)}
+_VALID_BY_CODES = {name: code for code, name in enumerate(FrameTable.VALID_BY)}
+_SINCE_CODES = {name: code for code, name in enumerate(FrameTable.SINCE)}
 _NAN_3, _NAN_7, _NAN_36 = (np.nan,) * 3, (np.nan,) * 7, (np.nan,) * 36
 
 
@@ -145,8 +179,21 @@ class _Column(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
-def _pose(pose: Transform | Smoothed | None) -> tuple[float, ...]:
+def _pose(pose: Transform | Smoothed | Absolute | None) -> tuple[float, ...]:
     return _NAN_7 if pose is None else pose.translation_m + pose.rotation_xyzw
+
+
+def _since(row: FrameRecord | Line) -> int:
+    return -1 if row.since_reference is None else _SINCE_CODES.get(row.since_reference.since, _SINCE_CODES[OTHER])
+
+
+def _bound_of(row: FrameRecord | Line) -> Absolute | Protection | None:
+    """Of the transform as measured; a record of schema 1 has no other."""
+    return row.absolute or (row.protection if row.valid_by == ValidBy.ABSOLUTE else None)
+
+
+def _as_measured(row: FrameRecord | Line) -> Transform | Absolute | None:
+    return row.absolute or (row.cam_T_grip if row.valid_by == ValidBy.ABSOLUTE else None)
 
 
 _COLUMNS: dict[str, _Column] = {
@@ -162,6 +209,15 @@ _COLUMNS: dict[str, _Column] = {
     "protection_m": _Column(lambda r: np.nan if r.protection is None else r.protection.position_m),
     "protection_rad": _Column(lambda r: np.nan if r.protection is None else r.protection.rotation_rad),
     "integrity_risk": _Column(lambda r: np.nan if r.protection is None else r.protection.risk),
+    # A name that this version doesn't know counts as the bound that promises less.
+    "valid_by": _Column(lambda r: _VALID_BY_CODES.get(r.valid_by, _VALID_BY_CODES[ValidBy.REFERENCE]), np.int8),
+    "since_reference_m": _Column(lambda r: np.nan if r.since_reference is None else r.since_reference.position_m),
+    "since_reference_rad": _Column(lambda r: np.nan if r.since_reference is None else r.since_reference.rotation_rad),
+    "since": _Column(_since, np.int8),
+    "since_ns": _Column(lambda r: -1 if r.since_reference is None else r.since_reference.since_ns, np.int64),
+    "absolute_m": _Column(lambda r: np.nan if (b := _bound_of(r)) is None else b.position_m),
+    "absolute_rad": _Column(lambda r: np.nan if (b := _bound_of(r)) is None else b.rotation_rad),
+    "absolute": _Column(lambda r: _pose(_as_measured(r)), shape=(7,)),
     "d_m": _Column(lambda r: np.nan if r.drift is None else r.drift.translation_m),
     "delta_rad": _Column(lambda r: np.nan if r.drift is None else r.drift.rotation_rad),
     "tcp_shift_m": _Column(lambda r: _NAN_3 if r.drift is None else r.drift.tcp_shift_m, shape=(3,)),

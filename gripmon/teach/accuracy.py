@@ -17,7 +17,7 @@ from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image, Protection, ReferenceRecord
+from gripmon.model.records import Array, Image, Protection, ReferenceRecord, ValidBy
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.monitor import Bounds, MonitorSettings, Tracker, foresee_bounds
 from gripmon.teach.visibility import Rig, samples_behind, see
@@ -64,7 +64,8 @@ class AccuracyForecast:
     ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
     ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
     distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``bounds``: both
-    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect of an unknown opening; None for a gripper without jaw, or
+    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect
+    of an unknown opening; None for a gripper without jaw, or
     where not asked for.
     """
 
@@ -230,11 +231,12 @@ class Promise:
     protection: Protection
     alert_limit_m: float
     alert_limit_rad: float
+    valid_by: ValidBy = ValidBy.ABSOLUTE
     remedies: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
-        return cls(protection, policy.alert_limit_m, policy.alert_limit_rad)
+        return cls(protection, policy.alert_limit_m, policy.alert_limit_rad, policy.valid_by)
 
     @property
     def reachable(self) -> bool:
@@ -261,13 +263,18 @@ class Promise:
             parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
         return ", or ".join([*self.remedies, " and ".join(parts)])
 
+    @property
+    def subject(self) -> str:
+        """What the bound is of, in words."""
+        return "the motion since the reference" if self.valid_by is ValidBy.REFERENCE else "a transform"
+
     def text(self) -> str:
         """One line for a person."""
         bound = self.protection
         good = f"good to {in_mm(bound.position_m)} mm and {in_degrees(bound.rotation_rad)} degrees"
         limits = f"{1e3 * self.alert_limit_m:g} mm, {in_degrees(self.alert_limit_rad)} degrees"
         reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
-        return f"a transform of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+        return f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
 
 
 def _rounded_up(value: float) -> float:

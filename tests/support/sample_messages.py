@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.model.records import (
+    Absolute,
     Alert,
     AlertEvent,
     AlertKind,
@@ -39,6 +40,8 @@ from gripmon.model.records import (
     ReferenceInputs,
     ReferenceRecord,
     Severity,
+    Since,
+    SinceReference,
     Smoothed,
     Snapshot,
     SnapshotImage,
@@ -48,6 +51,7 @@ from gripmon.model.records import (
     State,
     StateRecord,
     Transform,
+    ValidBy,
     Verdict,
     to_json,
 )
@@ -114,6 +118,16 @@ MEASURED = FrameRecord(
     monitor_id=MONITOR_ID,
     name="/dev/video0",
     protection=Protection(3.5e-4, 4.4e-3, 1e-5, "an edge belongs to something else"),
+    valid_by=ValidBy.ABSOLUTE,
+    since_reference=SinceReference(2.5e-4, 3.1e-3, Since.REFERENCE, STAMP_NS - 60_000_000_000),
+    absolute=Absolute(3.5e-4, 4.4e-3, POSE.translation_m, POSE.rotation_xyzw),
+)
+BY_REFERENCE = msgspec.structs.replace(
+    MEASURED,
+    cam_T_grip=Transform((0.0121, -0.0021, 0.1323), (0.5, -0.5, 0.5, 0.5)),
+    protection=Protection(2.5e-4, 3.1e-3, 1e-5, "an edge belongs to something else"),
+    valid_by=ValidBy.REFERENCE,
+    since_reference=SinceReference(2.5e-4, 3.1e-3, Since.FIRST_PROVED, STAMP_NS - 90_000_000_000),
 )
 HELD = msgspec.structs.replace(
     MEASURED,
@@ -129,6 +143,8 @@ HELD = msgspec.structs.replace(
     alerts=(),
     reason="too few edges are seen",
     protection=Protection(1.1e-3, 0.018, 1e-5, "nothing is wrong"),
+    since_reference=SinceReference(1.0e-3, 0.017, Since.REFERENCE, STAMP_NS - 60_000_000_000),
+    absolute=Absolute(1.1e-3, 0.018, POSE.translation_m, POSE.rotation_xyzw),
 )
 NOTHING = msgspec.structs.replace(
     HELD,
@@ -141,6 +157,8 @@ NOTHING = msgspec.structs.replace(
     smoothed=None,
     drift=None,
     protection=None,
+    since_reference=None,
+    absolute=None,
 )
 CONFIGURED = ReferenceRecord("config-5f2ac301", 0, 0, "configuration", POSE, covariance(0.002, 0.01))
 RECALIBRATED = ReferenceRecord(
@@ -224,6 +242,7 @@ SPOT_UNUSED = msgspec.structs.replace(
 
 SAMPLES: dict[str, msgspec.Struct] = {
     "transform": MEASURED,
+    "transform_reference": BY_REFERENCE,
     "transform_held": HELD,
     "transform_null": NOTHING,
     "state": StateRecord(
@@ -256,6 +275,7 @@ SAMPLES: dict[str, msgspec.Struct] = {
         ),
         transforms_unsent=0,
         malformed=1,
+        valid_by=ValidBy.ABSOLUTE,
     ),
     "alert": AlertRecord(
         robot="arm1",

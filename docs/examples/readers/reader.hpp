@@ -83,7 +83,7 @@ inline std::string text(const Json& json, const char* name) {
 }
 
 inline Transform read(const std::string& payload) {
-  const Json json = message(payload, "gripmon.transform/1");
+  const Json json = message(payload, "gripmon.transform/2");
   Transform out;
   out.verdict = json.at("verdict").get<std::string>();
   out.reason = text(json, "reason");

@@ -35,7 +35,7 @@ from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, ReferenceRecord, Transform, to_json
+from gripmon.model.records import Array, ReferenceRecord, Transform, ValidBy, to_json
 from gripmon.monitor import MonitorSettings
 
 _log = logging.getLogger(__name__)
@@ -88,10 +88,40 @@ def reference_transform(settings: ReferenceSettings) -> Array:
     return make_transform(rotation_from_xyzw((x, y, z, w)), translation_m)
 
 
+ASSUMED_SIGMA_M, ASSUMED_SIGMA_RAD = 0.001, 0.01
+"""Standard deviations of a reference that states none, per axis: hand/eye calibrations of laboratories are good to 1 to
+3 mm.
+"""
+
+
+def reference_doubt(settings: Settings) -> str | None:
+    """Why a transform that is valid by its absolute error may be farther off than its alert limit, in one line with
+    what would be right; None where that isn't so.
+    """
+    reference, policy = settings.reference, settings.monitor.policy
+    if policy.valid_by is not ValidBy.ABSOLUTE:
+        return None
+    sigma_m = float(np.sqrt(np.reshape(covariance_of(reference), (6, 6)).diagonal()[:3].max()))
+    right = "or monitor.policy.valid_by: reference, if only motion since the reference matters"
+    if reference.covariance is None and reference.position_sigma_m is None:
+        return (
+            f"reference.position_sigma_m isn't stated, {1e3 * sigma_m:g} mm are assumed, but transforms are valid by "
+            f"their absolute error; state what the reference is good to, {right}"
+        )
+    if policy.alert_limit_m < sigma_m:
+        return (
+            f"monitor.policy.alert_limit_m is {policy.alert_limit_m:g}, below the reference's own standard deviation "
+            f"of {sigma_m:.2g} m; at least that, a reference that is known better, {right}"
+        )
+    return None
+
+
 def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
     """The reference's covariance, row by row.  Raises :class:`SettingsError` if it is invalid."""
     if settings.covariance is None:
-        variances = [settings.position_sigma_m**2] * 3 + [settings.rotation_sigma_rad**2] * 3
+        sigma_m, sigma_rad = settings.position_sigma_m, settings.rotation_sigma_rad
+        sigma_m, sigma_rad = ASSUMED_SIGMA_M if sigma_m is None else sigma_m, sigma_rad or ASSUMED_SIGMA_RAD
+        variances = [sigma_m**2] * 3 + [sigma_rad**2] * 3
         return tuple(np.diag(variances).ravel().tolist())
     matrix = np.array(settings.covariance).reshape(6, 6)
     scale, wrong = np.sqrt(np.abs(np.diag(matrix))), ""

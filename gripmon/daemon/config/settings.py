@@ -45,19 +45,30 @@ class ReferenceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     cam_T_grip: TransformSettings
     id: Annotated[str, Meta(min_length=1, description="name of this calibration in messages")] | None = None
-    position_sigma_m: Annotated[
-        float,
-        Meta(
-            gt=0.0,
-            le=0.1,
-            description="standard deviation of the reference's position, per axis; once edges are taught, in every "
-            "protection level (m)",
-        ),
-    ] = 0.001
-    rotation_sigma_rad: Annotated[
-        float,
-        Meta(gt=0.0, le=0.5, description="standard deviation of the reference's rotation, per axis, likewise (rad)"),
-    ] = 0.01
+    position_sigma_m: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=0.1,
+                description="standard deviation of the reference's position, per axis; once edges are taught, in every "
+                "absolute protection level; null: not known, 0.001 is assumed (m)",
+            ),
+        ]
+        | None
+    ) = None
+    rotation_sigma_rad: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=0.5,
+                description="standard deviation of the reference's rotation, per axis, likewise; null: 0.01 is assumed "
+                "(rad)",
+            ),
+        ]
+        | None
+    ) = None
     covariance: (
         Annotated[
             tuple[float, ...],

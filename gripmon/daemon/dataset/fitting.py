@@ -107,8 +107,8 @@ def _seen(config: Config, record: FrameRecord, trace: MeasurementTrace) -> dict[
     Creases between two faces of a finger may be too faint to be detected; outlines are visible on most backgrounds.
     """
     gripper: Gripper = config.gripper
-    assert record.cam_T_grip is not None
-    cam_T_grip = from_record(record.cam_T_grip)
+    assert record.measured_T is not None
+    cam_T_grip = from_record(record.measured_T)
     points_m = gripper.points_grip_m(record.jaw_opening_m if gripper.has_jaw else None)
     view = gripper.edge_view(points_m, invert(cam_T_grip)[:3, 3])
     edges = np.flatnonzero(view.visible & ~view.crease)

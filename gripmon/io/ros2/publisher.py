@@ -20,7 +20,6 @@ from gripmon.model.records import (
     AlertRecord,
     Array,
     FrameRecord,
-    Protection,
     Severity,
     StandingAlert,
     State,
@@ -148,7 +147,7 @@ def values_of(
         values.append(("rotation (deg)", f"{math.degrees(frame.drift.rotation_rad):.4f}"))
     if state.sigma_m is not None:
         values.append(("position sigma (mm)", f"{1e3 * state.sigma_m:.4f}"))
-    values += _bounds_of(state, None if frame is None else frame.protection)
+    values += _bounds_of(state, frame)
     values += [
         ("alerts", ", ".join(f"{alert.kind} ({alert.severity})" for alert in alerts)),
         ("camera connected", str(state.camera_connected).lower()),
@@ -162,16 +161,21 @@ def values_of(
     return values
 
 
-def _bounds_of(state: StateRecord, protection: Protection | None) -> list[tuple[str, str]]:
+def _bounds_of(state: StateRecord, frame: FrameRecord | None) -> list[tuple[str, str]]:
     """The newest transform's protection levels, their risk, and the alert limit."""
     values = []
-    if protection is not None:
+    protection = None if frame is None else frame.protection
+    if frame is not None and protection is not None:
         values = [
+            ("valid by", str(frame.valid_by)),
             ("protection level (mm)", f"{1e3 * protection.position_m:.4f}"),
             ("rotation protection level (deg)", f"{math.degrees(protection.rotation_rad):.4f}"),
             ("integrity risk per frame", f"{protection.risk:g}"),
             ("hypothesis", protection.hypothesis),
         ]
+        for name, bound in (("since the reference", frame.since_reference), ("absolute", frame.absolute)):
+            if bound is not None:
+                values.append((f"protection level {name} (mm)", f"{1e3 * bound.position_m:.4f}"))
     if state.alert_limit_m is not None:
         values.append(("alert limit (mm)", f"{1e3 * state.alert_limit_m:g}"))
     return values

@@ -31,7 +31,6 @@ from gripmon.model.records.frames import (
     CornerRecord,
     Frame,
     FrameRecord,
-    FrameRecord1,
     MeasurementTrace,
     Origin,
     Refusal,
@@ -48,7 +47,7 @@ from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
 from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
 from gripmon.model.records.references import AtReferenceRecord, MonitorState, ReferenceInputs, ReferenceRecord
-from gripmon.model.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
+from gripmon.model.records.schemas import MESSAGES, OLDER, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.model.records.values import (
     NOTHING_WRONG,
     Absolute,
@@ -67,6 +66,7 @@ from gripmon.model.records.values import (
 __all__ = [
     "MESSAGES",
     "NOTHING_WRONG",
+    "OLDER",
     "Absolute",
     "Alert",
     "AlertEvent",
@@ -95,7 +95,6 @@ __all__ = [
     "Frame",
     "FrameNote",
     "FrameRecord",
-    "FrameRecord1",
     "Image",
     "JawReading",
     "LaserPulse",

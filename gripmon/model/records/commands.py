@@ -95,7 +95,7 @@ Outlines = tuple[tuple[tuple[float, float], ...], ...]
 class Snapshot(msgspec.Struct, frozen=True):
     """The newest frame: the monitor's record of it, and its image."""
 
-    record: Annotated[FrameRecord | FrameRecord1, Meta(description="the transform message of that frame")]
+    record: Annotated[FrameRecord, Meta(description="the transform message of that frame")]
     age_s: Annotated[float, Meta(description="from when it was judged to when it was asked for, s")]
     jaw_reported_m: Annotated[
         float | None, Meta(description="the opening that the robot had reported, m; null if none")
@@ -132,6 +132,26 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
         ),
     ] = True
     monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""
+
+
+class Snapshot1(Snapshot, frozen=True):
+    """A snapshot of an earlier version."""
+
+    record: FrameRecord1
+
+
+class CommandReply1(CommandReply, frozen=True, tag_field="schema", tag="gripmon.reply/1"):
+    """A reply with a snapshot of an earlier version."""
+
+    snapshot: Snapshot1 | None = None
+
+    def upgraded(self) -> CommandReply:
+        """As of this version."""
+        fields, snapshot = {name: getattr(self, name) for name in self.__struct_fields__}, self.snapshot
+        if snapshot is not None:
+            of_snapshot = {name: getattr(snapshot, name) for name in snapshot.__struct_fields__}
+            fields["snapshot"] = Snapshot(**of_snapshot | {"record": snapshot.record.upgraded()})
+        return CommandReply(**fields)
 
 
 class CommandFault(OpenEnum):

@@ -184,13 +184,15 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
 
 
 class FrameRecord1(FrameRecord, frozen=True, tag_field="schema", tag="gripmon.transform/1"):
-    """A record of an earlier version, whose transform and bounds are absolute."""
+    """A record of schema 1, whose transform and bounds are absolute."""
 
-    def __post_init__(self) -> None:
-        at, bound = self.cam_T_grip, self.protection
+    def upgraded(self) -> FrameRecord:
+        """As of this version; it has no bound since the reference."""
+        at, bound, absolute = self.cam_T_grip, self.protection, None
         if at is not None and bound is not None:
-            of = Absolute(bound.position_m, bound.rotation_rad, at.translation_m, at.rotation_xyzw)
-            msgspec.structs.force_setattr(self, "absolute", of)
+            absolute = Absolute(bound.position_m, bound.rotation_rad, at.translation_m, at.rotation_xyzw)
+        fields = {name: getattr(self, name) for name in self.__struct_fields__}
+        return FrameRecord(**fields | {"absolute": absolute})
 
 
 @dataclass(frozen=True, slots=True)

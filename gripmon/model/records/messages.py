@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from gripmon.model.records.alerts import Alert, AlertKind, Severity
 from gripmon.model.records.frames import State, Verdict
+from gripmon.model.records.values import ValidBy
 
 
 class StandingAlert(msgspec.Struct, frozen=True):
@@ -80,6 +81,10 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     proposal_id: Annotated[
         str, Meta(description="the new reference that waits for an operator to accept or reject it; empty if none does")
     ] = ""
+    valid_by: Annotated[
+        ValidBy | None,
+        Meta(description="which error protection_m bounds, as in transform; null for second cameras, earlier monitors"),
+    ] = None
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):

@@ -1,17 +1,18 @@
 """The messages by name, and reading a message from an untrusted sender.
 
-A message names its schema and its major version, ``"schema": "gripmon.transform/1"``.  Within a major version fields
+A message names its schema and its major version, ``"schema": "gripmon.transform/2"``.  Within a major version fields
 and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader ignores what it doesn't know.
 """
 
 from __future__ import annotations
 
-from typing import TypeVar
+import contextlib
+from typing import TypeVar, cast
 
 import msgspec
 
 from gripmon.model.decoding import decoder_of
-from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
+from gripmon.model.records.commands import CommandError, CommandReply, CommandReply1, CommandRequest
 from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.laser import LaserPulse, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
@@ -35,8 +36,11 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 }
 """All messages that go over the wire."""
 
-OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1}
-"""The previous major version of a message, which is read as well."""
+OLDER: dict[type[msgspec.Struct], type[FrameRecord1] | type[CommandReply1]] = {
+    FrameRecord: FrameRecord1,
+    CommandReply: CommandReply1,
+}
+"""The messages of an earlier version that are read as well: transforms of schema 1, by themselves and in a reply."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
@@ -73,9 +77,9 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     try:
         return decoder_of(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        older = OLDER.get(message)
-        if older is not None and _schema_of(payload) == schema_name(older):
-            return from_json(payload, older)  # type: ignore[return-value]  # a kind of the same message
+        if (older := OLDER.get(message)) is not None and _schema_of(payload) == schema_name(older):
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+                return cast(_T, decoder_of(older).decode(payload).upgraded())
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
@@ -85,7 +89,7 @@ def largest_bytes(message: type[msgspec.Struct]) -> int:
 
 
 def schema_name(message: type[msgspec.Struct]) -> str:
-    """Its name on the wire with its major version, e.g. ``gripmon.transform/1``."""
+    """Its name on the wire with its major version, e.g. ``gripmon.transform/2``."""
     return str(message.__struct_config__.tag)
 
 

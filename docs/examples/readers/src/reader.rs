@@ -168,7 +168,7 @@ fn entry(payload: &[u8], attachment: &[u8], arrived_ns: Ns) -> Result<Entry, Str
 }
 
 fn transform(payload: &[u8]) -> Result<Transform, String> {
-    let json = message(payload, "gripmon.transform/1")?;
+    let json = message(payload, "gripmon.transform/2")?;
     let mut out = Transform {
         verdict: text(&json, "verdict").ok_or("no verdict")?,
         reason: text(&json, "reason").unwrap_or_default(),
