@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from support.changing_backgrounds import images_of, moving_robot
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
+from gripmon.daemon.api import open_source
 from gripmon.daemon.config import builtin_config
 from gripmon.model.geometry import to_record
 
@@ -122,10 +124,10 @@ def test_a_half_that_nothing_is_taught_for_counts_as_not_measured():
     from benchmarks.real_runs import Part
 
     run = run_of(*[still(np.zeros(6))] * 5, taught="even")
-    refused = Part(("a.png",) * 4, 1, "odd", refused="teach: no edges")
+    refused = Part(("a.png",) * 4, 1, "odd", refused="teach: no edges; and left out before: b.png: 1 px; c.png: 2 px")
     found = figures_of(msgspec.structs.replace(run, parts=(*run.parts, refused)))
     assert (found.stills, found.measured, found.valid) == (7, 4, 4)
-    assert found.teaching == ("nothing is taught from the odd stills: no edges",)
+    assert found.teaching == ("nothing is taught from the odd stills: no edges (others were left out before)",)
     np.testing.assert_allclose(found.proposed, (2e-3, 0.02))
 
 
@@ -200,6 +202,20 @@ def test_simulated_stills_are_judged_once_untaught_and_once_taught(replayed):
         assert (found.scatter[:3] < 1e-4).all() and found.chi2_scatter < 3.0
         assert (found.least < WIDE).all() and (found.bound <= found.least).all()
         assert np.isfinite(found.proposed).all()
+
+
+def test_jaw_openings_follow_their_stills_which_are_a_second_apart(stills: Path, tmp_path: Path):
+    from benchmarks.real_runs import Limit, _Project
+
+    folder, place = tmp_path / "set", tmp_path / "place"
+    place.mkdir()
+    shutil.copytree(stills, folder)
+    rows = [f"{n}.png,{7 * n},0.03{n}" for n in range(10)]
+    (folder / "timestamps.csv").write_text("\n".join(["file,stamp_ns,jaw_opening_m", *rows]) + "\n")
+    project = _Project(folder, place, Limit(*WIDE))
+    source = open_source(project._stills(project._images[1::2]))
+    read = [(frame.name, frame.stamp_ns, frame.jaw_opening_m) for frame in source]
+    assert read == [(f"{n}.png", 1_000_000_000 * k, float(f"0.03{n}")) for k, n in enumerate((1, 3, 5, 7, 9))]
 
 
 def test_limits_decide_what_is_valid(stills: Path):
