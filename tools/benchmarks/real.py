@@ -132,13 +132,13 @@ def _elsewhere(sets: dict[str, tuple[Path, Limit]], against: str) -> list[Run]:
     import msgspec
 
     from benchmarks.real_runs import Run
-    from benchmarks.revision import environment, package_of
+    from benchmarks.revision import checkout_of, environment
 
     print(f"real: with {against}", file=sys.stderr)
     named = [f"{name}={m!r},{rad!r}={folder.resolve()}" for name, (folder, (m, rad)) in sets.items()]
     made = subprocess.run(
         [sys.executable, "-P", "-m", "benchmarks.real_runs", *named],
-        env=environment(package_of(against)), stdout=subprocess.PIPE, check=False,
+        env=environment(checkout_of(against)), stdout=subprocess.PIPE, check=False,
     )  # fmt: skip
     if made.returncode != 0:
         raise ValueError(f"gripmon of {against} failed (exit code {made.returncode}), see above")

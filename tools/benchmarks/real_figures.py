@@ -88,7 +88,10 @@ def _teaching(part: Part) -> str:
     if part.taught is None:
         return ""
     if part.refused is not None:
-        return f"nothing is taught from the {part.taught} stills: {part.refused.removeprefix('teach: ')}"
+        why, left_out, _ = part.refused.removeprefix("teach: ").partition("; and left out before: ")
+        return (
+            f"nothing is taught from the {part.taught} stills: {why}{' (others were left out before)' * bool(left_out)}"
+        )
     return f"taught from the {part.taught} stills, {part.left_out} of which are left out" if part.left_out else ""
 
 

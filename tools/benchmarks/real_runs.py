@@ -18,7 +18,7 @@ import yaml
 
 import gripmon
 from gripmon.model.images import image_paths
-from gripmon.model.records import FrameRecord, Verdict
+from gripmon.model.records import FrameRecord, Protection, Verdict
 
 APART_S = 1.0
 """Between two stills, as if one had followed the other."""
@@ -95,12 +95,12 @@ def bound_names() -> tuple[str, ...]:
     return ("reference", "absolute") if "valid_by" in PolicySettings.__struct_fields__ else ("absolute",)
 
 
-def bound_of(record: FrameRecord) -> tuple[float | None, float | None]:
-    """Bounds on position (m) and rotation (rad) that the record's verdict goes by, as ``valid_by`` says in records that
-    have two.
+def bound_of(record: FrameRecord) -> Protection | None:
+    """The bound that the record's verdict goes by; None without a transform measured in it.  By the motion since the
+    reference that is also so before a frame proves where the gripper is: the transform is only the reference then.
     """
-    bound = record.protection if record.measured else None
-    return (None, None) if bound is None else (bound.position_m, bound.rotation_rad)
+    by_reference = getattr(record, "valid_by", "absolute") == "reference"  # records of one bound don't say
+    return None if not record.measured or (by_reference and record.since_reference is None) else record.protection
 
 
 def proposed_by_check(config: gripmon.Config) -> tuple[float | None, float | None]:
@@ -211,16 +211,18 @@ def _openings(table: Path) -> dict[str, str]:
 
 
 def _still(record: FrameRecord) -> Still:
-    pose = record.cam_T_grip if record.measured else None
+    bound = bound_of(record)
+    pose = None if bound is None else record.cam_T_grip
     return Still(
         record.name,
-        record.measured,
+        bound is not None,
         record.verdict is Verdict.VALID,
         None if pose is None else pose.translation_m,
         None if pose is None else pose.rotation_xyzw,
         None if pose is None else record.covariance,
-        *bound_of(record),
-        "" if pose is None or record.protection is None else record.protection.hypothesis,
+        None if bound is None else bound.position_m,
+        None if bound is None else bound.rotation_rad,
+        "" if bound is None else bound.hypothesis,
         record.reason,
         tuple(alert.kind.value for alert in record.alerts if alert.event.value == "raised"),
     )

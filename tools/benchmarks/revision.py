@@ -1,4 +1,4 @@
-"""gripmon of another commit beside this checkout's, to be measured with the same benchmark."""
+"""Another commit beside this checkout, to be measured in the same benchmark."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ def commit_of(revision: str) -> str:
     asked = ["git", "rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}"]
     found = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=False)
     if found.returncode != 0:
-        raise ValueError(f"{revision} is no commit of this checkout; a hash, a branch or a tag")
+        raise ValueError(f"{revision}: git knows no such commit here; a hash, a branch or a tag")
     return found.stdout.strip()
 
 
-def package_of(revision: str) -> Path:
-    """A folder in which ``gripmon`` is as it was; kept, since its compiled code is kept beside it."""
+def checkout_of(revision: str) -> Path:
+    """A folder with the commit's files, named by its hash; kept, since compiled code is kept beside it.  Raises
+    ValueError for a revision that is none.
+    """
     commit = commit_of(revision)
     folder = _KEPT / commit
     if not folder.exists():
-        packed = subprocess.run(["git", "archive", commit, "gripmon"], cwd=ROOT, capture_output=True, check=True).stdout
+        packed = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
         unpacked = _KEPT / f"{commit}.{os.getpid()}"
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
             archive.extractall(unpacked, filter="data")
@@ -35,6 +37,6 @@ def package_of(revision: str) -> Path:
     return folder
 
 
-def environment(package: Path) -> dict[str, str]:
-    """For a process of ``python -P`` whose gripmon is in this folder, and whose benchmarks are these."""
-    return {**os.environ, "PYTHONPATH": f"{package}{os.pathsep}{ROOT / 'tools'}"}
+def environment(checkout: Path) -> dict[str, str]:
+    """For a process of ``python -P`` whose gripmon is that of a checkout, and whose benchmarks are these."""
+    return {**os.environ, "PYTHONPATH": f"{checkout}{os.pathsep}{ROOT / 'tools'}"}
