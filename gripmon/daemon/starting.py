@@ -117,8 +117,8 @@ def run_monitor(
         state = None if kept is None else kept.state
         keeper = StateKeeper(kept)
         monitor = Monitor(config, state, keeper.references)
-        if monitor.look_refused is not None:
-            _log.warning("%s", monitor.look_refused)
+        if monitor.strips_refused is not None:
+            _log.warning("%s", monitor.strips_refused)
         network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         on_network()

@@ -122,9 +122,9 @@ class Monitor:
         return self._trust.unexplained is not None
 
     @property
-    def look_refused(self) -> str | None:
-        """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
-        return self._trust.look_refused
+    def strips_refused(self) -> str | None:
+        """Why the strips that were kept over a restart aren't used; None where they are, or none were kept."""
+        return self._trust.strips_refused
 
     @property
     def proposal(self) -> ReferenceRecord | None:
@@ -138,7 +138,7 @@ class Monitor:
 
     @property
     def state_revision(self) -> int:
-        """Grows with each change of :meth:`state`, except of the last transform and the look."""
+        """Grows with each change of :meth:`state`, except of the last transform and the strips."""
         known = int(self._analysis.of_configured.error is not None) + int(self._trust.question is not None)
         return self._renewal.book.changes + self._policy.alerts.changes + known
 
@@ -155,7 +155,7 @@ class Monitor:
             reference_error=None if error is None else tuple(error.tolist()),
             unexplained=msgspec.UNSET if question is None else tuple(question.away.tolist()),
             explained_from=msgspec.UNSET if answered is None else answered,
-            look=self._trust.look_state(self.reference),
+            strips=self._trust.strips_state(),
         )
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -283,7 +283,8 @@ class Monitor:
         if self.reference is not before:
             self._begin()
         wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
-        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # 150 kB that only a restart needs
+        # The strips are 10 kB that only a restart needs.
+        state = msgspec.structs.replace(self.state(), strips=msgspec.UNSET) if wanted else None
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:
