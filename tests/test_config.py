@@ -347,6 +347,7 @@ def test_a_state_belongs_to_camera_gripper_and_reference_whatever_else_changes(f
 
 
 LOOK = "monitor.look: the look as a measurement is gone, and transforms come from the edges alone; remove the section"
+RATE = "monitor.stream.rate_s: another frame rate than usual is no fault any more; remove the key"
 SIGMA = "monitor.policy.suspect_sigma_m: is gone"
 
 
@@ -355,6 +356,7 @@ SIGMA = "monitor.policy.suspect_sigma_m: is gone"
     [
         ("look: {enabled: true}", LOOK, True),
         ("look: {enabled: false}", LOOK, False),
+        ("stream: {rate_s: 3.0}", RATE, False),
         ("policy: {suspect_sigma_m: null}", SIGMA, False),
     ],
 )

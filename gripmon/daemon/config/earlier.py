@@ -32,6 +32,12 @@ _GONE = (
         lambda look: isinstance(look, dict) and look.get("enabled") is True,
     ),
     _Gone(
+        ("monitor", "stream"),
+        "rate_s",
+        "another frame rate than usual is no fault any more; remove the key",
+        lambda _: False,
+    ),
+    _Gone(
         ("monitor", "policy"),
         "suspect_sigma_m",
         "is gone",
