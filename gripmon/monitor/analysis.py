@@ -181,7 +181,7 @@ class FrameAnalysis:
         error: Array | None,
     ):
         """``configured``: the reference of the configuration; ``error`` (6,): its error, if known."""
-        self._gripper, self._tracker = gripper, tracker
+        self._gripper, self._tracker, self._valid_by = gripper, tracker, settings.policy.valid_by
         self._reach_px = settings.corners.sampling.reach_px
         self.stream = StreamWatch(settings.stream)
         self.watch = MotionWatch(settings.drift)
@@ -266,7 +266,7 @@ class FrameAnalysis:
             self.explain(frame, measurement, wrong, standing.believed, now_s),
             astray,
             doubtful,
-            standing.protection,
+            standing.bounds.by(self._valid_by),
             standing.where_it_was,
             swing,
             standing.believed,

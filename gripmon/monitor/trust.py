@@ -18,8 +18,9 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord, StripsRecord
-from gripmon.monitor.refits import reaching
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, reaching
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
@@ -54,14 +55,20 @@ class Integrity:
         reference: ReferenceRecord,
     ):
         self._tracker, self._policy = tracker, settings.policy
-        self._weigher = Weigher(tracker, gripper, settings, reference)
+        measured_as = tracker.taught_digest, settings.corners, settings.measurement, settings.jaw_sigma_m
+        self.since = AtReferences(reference, settings.policy.valid_by, measured_as)
+        """What was measured at the reference in force."""
+        self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
         # Fingers without a direction of their own are slid out of the gripper.
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
         self.strips_refused: str | None = None
         """Why strips that were kept over a restart aren't used; None where they are, or none were kept."""
+        self.since_refused: str | None = None
+        """Why what a state has about the reference's frames isn't used; None where it is, or there is nothing."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
+        self._jaw_opening_m = 0.0  # in the newest frame that proved a pose
         self._frames = 0
         self._elsewhere = 0
         self._slid_until_s = -math.inf
@@ -89,6 +96,15 @@ class Integrity:
         """(6,) variance of the vibration between proven poses, m² and rad²."""
         return self._weigher.swing
 
+    def refer(self, reference: ReferenceRecord) -> None:
+        """Begin the motion since the reference in force."""
+        self.since.refer(reference)
+
+    def measured_again(self, reference: ReferenceRecord) -> None:
+        """A new reference, in force or proposed, was measured from the newest frames."""
+        if self._weigher.anchor is not None:
+            self.since.measured(reference, self._weigher.anchor, self._jaw_opening_m)
+
     def rebase(self, reference: ReferenceRecord) -> None:
         """Expect the gripper at a new reference."""
         self._weigher.rebase(reference)
@@ -108,6 +124,8 @@ class Integrity:
                 self._strips.restore(state.strips)
             except StripsRefused as refused:
                 self.strips_refused = str(refused)
+        if state is not None and state.at_reference is not msgspec.UNSET:
+            self.since_refused = self._weigher.restore(state.at_reference)
 
     def learn(self) -> None:
         """Learn the look from the newest frame that proved the pose, once."""
@@ -127,11 +145,11 @@ class Integrity:
         anchor = self._weigher.anchor
         return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
 
-    def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The bounds of a pose published ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
+    def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
+        """The bounds of a pose measured ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
         ``hidden``: the image is good, but the gripper isn't seen.
         """
-        return self._weigher.held(standing.protection, growth, unseen_s, hidden)
+        return self._weigher.held(standing.bounds, growth, unseen_s, hidden)
 
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
         """What to publish of a measurement, and how far it is trusted; None where the gripper isn't seen."""
@@ -141,7 +159,15 @@ class Integrity:
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
+        if standing is not None and self.since.current is None:
+            why = "the gripper is elsewhere, since no frame has proved yet where it is"
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, self._policy.integrity_risk, why)
+            standing = replace(standing, bounds=standing.bounds._replace(since_reference=unbounded))
         return standing
+
+    def _past_limit(self, both: Bounds) -> bool:
+        """Whether the bound that makes a transform valid is past an alert limit."""
+        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is not None
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
         weigh = self._weigher.weigh
@@ -150,7 +176,7 @@ class Integrity:
         trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
-        if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
+        if due or self._past_limit(trust.bounds) or trust.displaced or self._weigher.anchor is None:
             ends = self._tracker.ends(frame, measurement)
             trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
             self._ends_seen = trust.proven
@@ -215,7 +241,7 @@ class Integrity:
         if there is None:
             return None
         standing = self._conclude(frame, there, now_s)
-        return None if past_alert_limit(standing.protection, self._policy) else standing
+        return None if self._past_limit(standing.bounds) else standing
 
     def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
         """The measurement at the expected place, if the gripper may still be there: marks on the fingers and borders
@@ -245,7 +271,7 @@ class Integrity:
         """What to publish of a place, and whether it becomes the anchor."""
         measurement, cam_T_grip, covariance, along, trust = candidate
         left_open = trust.most_probable is not None and not trust.proven
-        if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
+        if left_open and (trust.displaced or self._past_limit(trust.bounds)):
             return self._by_anchor(frame, candidate, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
@@ -255,13 +281,16 @@ class Integrity:
         unproven = self._weigher.anchor is not None and not settles
         if settles:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
+            assert self._weigher.anchor is not None
+            self._jaw_opening_m = measurement.jaw_opening_m
+            self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
             if knocked:
                 self._slid_until_s = -math.inf
             if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        at = measurement, cam_T_grip, covariance, trust.protection
+        at = measurement, cam_T_grip, covariance, trust.bounds
         standing = Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
         if moved or trust.ambiguous or not trust.displaced:
             return standing
@@ -294,7 +323,7 @@ class Integrity:
         slid = along.undecided or now_s < self._slid_until_s
         seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
-        at = measurement, cam_T_grip, covariance, trust.protection
+        at = measurement, cam_T_grip, covariance, trust.bounds
         return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
     def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
@@ -320,4 +349,5 @@ class Integrity:
 def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
     """The same, not believed, with a bound that includes another possible pose (4, 4)."""
     away = perturbation_between(standing.cam_T_grip, other_T)
-    return replace(standing, protection=reaching(standing.protection, away, why), believed=False)
+    both = Bounds(*(reaching(each, away, why) for each in standing.bounds))
+    return replace(standing, bounds=both, believed=False)

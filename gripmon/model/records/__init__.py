@@ -31,6 +31,7 @@ from gripmon.model.records.frames import (
     CornerRecord,
     Frame,
     FrameRecord,
+    FrameRecord1,
     MeasurementTrace,
     Origin,
     Refusal,
@@ -45,28 +46,40 @@ from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote,
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
 from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
-from gripmon.model.records.references import MonitorState, ReferenceInputs, ReferenceRecord, StripsRecord
+from gripmon.model.records.references import (
+    AtReferenceRecord,
+    MonitorState,
+    ReferenceInputs,
+    ReferenceRecord,
+    StripsRecord,
+)
 from gripmon.model.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.model.records.values import (
     NOTHING_WRONG,
+    Absolute,
     Array,
     Drift,
     Image,
     Protection,
+    Since,
+    SinceReference,
     Smoothed,
     Transform,
+    ValidBy,
     to_json,
 )
 
 __all__ = [
     "MESSAGES",
     "NOTHING_WRONG",
+    "Absolute",
     "Alert",
     "AlertEvent",
     "AlertKind",
     "AlertRecord",
     "ArmPose",
     "Array",
+    "AtReferenceRecord",
     "CameraShift",
     "Cause",
     "CauseWeight",
@@ -87,6 +100,7 @@ __all__ = [
     "Frame",
     "FrameNote",
     "FrameRecord",
+    "FrameRecord1",
     "Image",
     "JawReading",
     "LaserPulse",
@@ -109,6 +123,8 @@ __all__ = [
     "ReferenceRecord",
     "Refusal",
     "Severity",
+    "Since",
+    "SinceReference",
     "Smoothed",
     "Snapshot",
     "SnapshotImage",
@@ -119,6 +135,7 @@ __all__ = [
     "StateRecord",
     "StripsRecord",
     "Transform",
+    "ValidBy",
     "Verdict",
     "Vibration",
     "accepting",
