@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy import stats
 
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
+from gripmon.judge.policy import PolicySettings
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"
@@ -344,40 +346,38 @@ def test_a_state_belongs_to_camera_gripper_and_reference_whatever_else_changes(f
 # --- what earlier versions had ---
 
 
-@pytest.mark.parametrize(("enabled", "effect"), [("true", "; transforms come from the edges alone"), ("false", "")])
-def test_the_look_as_a_measurement_is_gone_with_a_line(
-    folder: Path, caplog: pytest.LogCaptureFixture, enabled: str, effect: str
+LOOK = "monitor.look: the look as a measurement is gone, and transforms come from the edges alone; remove the section"
+RATE = "monitor.stream.rate_s: another frame rate than usual is no fault any more; remove the key"
+SIGMA = "monitor.policy.suspect_sigma_m: is gone"
+
+
+@pytest.mark.parametrize(
+    ("section", "said", "used"),
+    [
+        ("look: {enabled: true}", LOOK, True),
+        ("look: {enabled: false}", LOOK, False),
+        ("stream: {rate_s: 3.0}", RATE, False),
+        ("policy: {suspect_sigma_m: null}", SIGMA, False),
+    ],
+)
+def test_what_is_gone_is_read_over_with_a_line(
+    folder: Path, caplog: pytest.LogCaptureFixture, section: str, said: str, used: bool
 ):
-    path = edited(folder, r"^source:", f"monitor: {{floor_m: 3e-6, look: {{enabled: {enabled}}}}}\nsource:")
+    """In a recording, which nobody can edit, only where it decided something."""
+    path = edited(folder, r"^source:", f"monitor: {{floor_m: 3e-6, {section}}}\nsource:")
     assert load_config(path).settings.monitor.floor_m == 3e-6
-    what = f"monitor.look: the look as a measurement is gone{effect}; remove the section"
-    assert caplog.messages == [f"{path}: {what}"]
+    assert caplog.messages == [f"{path}: {said}"]
     caplog.clear()
-    load_config(path, say_deprecated=False)  # of a recording: only where it decided something
-    assert len(caplog.messages) == (enabled == "true")
+    load_config(path, say_gone=False)
+    assert len(caplog.messages) == used
 
 
-def test_a_largest_sigma_is_read_as_the_alert_limit_that_it_stands_for(folder: Path, caplog: pytest.LogCaptureFixture):
+def test_a_largest_sigma_is_refused_and_the_line_says_what_it_stood_for(folder: Path):
     path = edited(folder, r"^source:", "monitor: {policy: {suspect_sigma_m: 0.003}}\nsource:")
-    policy = load_config(path).settings.monitor.policy
+    with pytest.raises(ConfigError, match=r"suspect_sigma_m: is gone; alert_limit_m, the error .* 4.42 times its"):
+        load_config(path)
     # Of a normal distribution 1e-5 lies beyond 4.417 standard deviations, both tails together.
-    assert policy.alert_limit_m == pytest.approx(4.417 * 0.003, abs=1e-5) and policy.suspect_sigma_m is None
-    (said,) = caplog.messages
-    what = "monitor.policy.suspect_sigma_m: 0.003 is deprecated; write alert_limit_m: 0.013252, which it stands for"
-    assert said == f"{path}: {what}"
-    path = edited(folder, r"suspect_sigma_m: 0.003", "suspect_sigma_m: 0.003, integrity_risk: 0.01")
-    assert load_config(path).settings.monitor.policy.alert_limit_m == pytest.approx(2.576 * 0.003, abs=1e-5)
-
-
-def test_a_largest_sigma_beside_an_alert_limit_is_refused(folder: Path):
-    path = edited(folder, r"^source:", "monitor: {policy: {suspect_sigma_m: 1e-4, alert_limit_m: 5e-4}}\nsource:")
-    with pytest.raises(
-        ConfigError, match=r"suspect_sigma_m: stands beside alert_limit_m, which replaces it; alert_limit_m alone"
-    ):
-        load_config(path)
-    path = edited(folder, r"suspect_sigma_m: 1e-4, alert_limit_m: 5e-4", "suspect_sigma_m: 0.5")
-    with pytest.raises(ConfigError, match=r"0.5 stands for alert_limit_m: 2.2"):
-        load_config(path)
+    assert stats.norm.isf(0.5 * PolicySettings().integrity_risk) == pytest.approx(4.42, abs=4e-3)
 
 
 def test_the_limits_are_the_defaults_without_a_word(folder: Path, caplog: pytest.LogCaptureFixture):

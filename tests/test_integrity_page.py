@@ -28,9 +28,6 @@ def test_the_settings_and_their_defaults_are_those_of_the_code():
     policy = PolicySettings()
     assert f"(`monitor.policy.alert_limit_m` ({1e3 * policy.alert_limit_m:g} mm)" in f"({TEXT.split('you set it: ')[1]}"
     assert "(2°)" in TEXT and policy.alert_limit_rad == 0.035 and policy.integrity_risk == 1e-5
-    assert "4.42 times" in TEXT and PolicySettings(suspect_sigma_m=1.0).position_limit_m == pytest.approx(
-        4.42, abs=4e-3
-    )
 
 
 def test_the_line_of_check_is_what_check_prints(capsys: pytest.CaptureFixture[str]):

@@ -43,8 +43,8 @@ def test_protection_levels_stand_with_their_limits_and_shares():
     )
 
 
-def test_recordings_without_bounds_and_of_a_largest_sigma_are_reported():
-    text = "monitor:\n  policy:\n    suspect_sigma_m: 0.001\n"
+def test_recordings_without_bounds_are_reported():
+    text = "monitor:\n  policy:\n    suspect_sigma_m: null\n    alert_limit_m: 0.004417\n"
     run = stepped(configuration=RecordedConfiguration("main.yaml", {"main.yaml": RecordedFile(text)}))
     older = [msgspec.structs.replace(record, protection=None) for record in run.records]
     report, told = build([dataclasses.replace(run, records=older)])

@@ -231,22 +231,6 @@ def test_a_gap_is_fifty_periods_and_five_seconds_long(fps: float, pause_s: float
     assert found == [{"gap"} if told else set()]
 
 
-@pytest.mark.parametrize(("fps", "learnt_after"), [(5.0, 49), (60.0, 121)])
-def test_the_usual_rate_is_learnt_from_six_blocks_that_span_two_seconds(fps: float, learnt_after: int):
-    """49 frames are six blocks of eight intervals; 121 span two seconds."""
-    watch = StreamWatch()
-    kinds(watch, frames(0, learnt_after - 1, fps))
-    assert watch._rate.usual_ns is None
-    kinds(watch, frames(learnt_after - 1, 1, fps))
-    assert watch._rate.usual_ns == pytest.approx(1e9 / fps, rel=1e-6)
-
-
-def test_the_usual_rate_is_learnt_in_the_time_that_shows_another_one():
-    watch = StreamWatch(StreamSettings(rate_s=5.0))
-    assert not any(kinds(watch, frames(0, round(4.9 * FPS)))) and watch._rate.usual_ns is None
-    assert not any(kinds(watch, frames(round(4.9 * FPS), round(0.5 * FPS)))) and watch._rate.usual_ns is not None
-
-
 def test_the_rate_is_that_of_the_last_64_intervals():
     watch = StreamWatch()
     well = frames(0, 100)
@@ -258,55 +242,12 @@ def test_the_rate_is_that_of_the_last_64_intervals():
     assert watch.frames_per_s == pytest.approx(15.0, rel=1e-6)
 
 
-@pytest.mark.parametrize(("uneven", "has_rate"), [(0.2, True), (0.4, False)])
-def test_intervals_that_differ_by_a_third_have_no_usual_rate(uneven: float, has_rate: bool):
-    """Intervals of the middle one less and more a share, by turns: that is their median deviation."""
-    stamp_ns, watch = START_NS, StreamWatch()
-    for k in range(200):
-        stamp_ns += round(1e9 / FPS * (1.0 + (uneven, 0.0, -uneven, uneven, -uneven, 0.0, uneven, -uneven)[k % 8]))
-        watch.add(Frame(k, stamp_ns, picture(k)))
-    assert (watch._rate.usual_ns is not None) == has_rate
-
-
 def test_a_clock_that_stands_still_is_told_but_not_one_frame_handed_over_twice():
     watch = StreamWatch()
     well = frames(0, 150)
     assert not any(kinds(watch, [*well, well[-1], *after(well, 60)]))
     later = after(after(well, 60), 40, stamp_ns=well[-1].stamp_ns + 2 * 10**9)
     assert kinds(watch, later)[-1] == {"clock"}
-
-
-@pytest.mark.parametrize("factor", [0.4, 0.55, 1.9, 4.0])
-def test_another_rate_is_told_within_seconds_and_cleared(factor: float):
-    watch = StreamWatch()
-    well = frames(0, 150)
-    kinds(watch, well)
-    other = after(well, round(5.0 * factor * FPS), fps=factor * FPS)
-    found = kinds(watch, other)
-    first_s = found.index({"rate"}) / (factor * FPS)
-    assert 0.9 < first_s < 3.5
-    faults = watch.add(after(other, 1, fps=factor * FPS)[0])
-    assert faults[0].cause is Cause.CLOCK
-    assert f"{factor * FPS:.1f} frames a second" in faults[0].text and f"{FPS:.1f} were usual" in faults[0].text
-    nearer = after(other, round(8.0 * 1.45 * FPS), fps=1.45 * FPS)  # not back yet
-    assert {"rate"} in kinds(watch, nearer)[-20:]
-    assert not kinds(watch, after(nearer, 200))[-1]
-
-
-def test_a_short_hiccup_is_no_other_rate():
-    watch = StreamWatch()
-    well = frames(0, 150)
-    slow = after(well, 5, fps=5.0)
-    assert not any(kinds(watch, [*well, *slow, *after(slow, 150)]))
-
-
-def test_frames_that_come_as_they_like_have_no_usual_rate():
-    """Photographs taken by hand."""
-    rng = np.random.default_rng(2)
-    stamp_ns, watch = START_NS, StreamWatch()
-    for k in range(400):
-        stamp_ns += int(1e9 * np.exp(rng.normal(0.0, 1.5)))
-        assert not [f for f in watch.add(Frame(k, stamp_ns, picture(k))) if f.kind == "rate"]
 
 
 def test_frames_minutes_apart_are_no_gaps():

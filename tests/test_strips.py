@@ -16,7 +16,7 @@ from gripmon.model.records import Image, StripsRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
 from gripmon.track.edges.roles import along_fingers
-from gripmon.track.look import FingerStrips, LookRefused, StripsSeen
+from gripmon.track.look import FingerStrips, StripsRefused, StripsSeen
 from gripmon.track.look.strips import FIRST_FRAMES, RELEARN_S
 
 RISK = 1e-3
@@ -200,7 +200,7 @@ def test_kept_strips_that_cant_be_this_grippers_are_refused_and_learnt_again(fau
         "not finite": {"mean": np.full(len(state.mean) // 4, np.nan, dtype="<f4").tobytes()},
     }[fault]
     again = new_strips()
-    with pytest.raises(LookRefused, match="learnt again"):
+    with pytest.raises(StripsRefused, match="learnt again"):
         again.restore(msgspec.structs.replace(state, **change))
     assert again.awaited and not again.ready
     truth = simulation.truth(LAST)

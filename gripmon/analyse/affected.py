@@ -187,7 +187,7 @@ def limits_of(source: Recording, affected_m: float | None, affected_rad: float |
         warn_rad=policy.warn_rad,
         limit_m=policy.limit_m,
         limit_rad=policy.limit_rad,
-        alert_limit_m=policy.position_limit_m,
+        alert_limit_m=policy.alert_limit_m,
         valid_by=policy.valid_by.value,
         alert_limit_rad=policy.alert_limit_rad,
         origin=origin,

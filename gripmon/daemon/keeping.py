@@ -48,14 +48,13 @@ class StateKeeper:
         """Write a chain of references before the newest takes effect; returns why it failed, empty if it succeeded.
 
         A failed write is not retried: the caller does without the new reference.  The rest of the state is the newest
-        known, without a proposal, which a new reference withdraws, and without the look, which belonged to the previous
-        reference.
+        known, without a proposal, which a new reference withdraws.
         """
         if self._sink is None:
             return ""
         with self._changed:
             known = self._newest or MonitorState(references)
-        state = msgspec.structs.replace(known, references=references, proposal=None, look=None)
+        state = msgspec.structs.replace(known, references=references, proposal=None)
         with self._writing:
             if not self._sink.write(state):
                 return self._sink.failure

@@ -117,7 +117,7 @@ def run_monitor(
         state = None if kept is None else kept.state
         keeper = StateKeeper(kept)
         monitor = Monitor(config, state, keeper.references)
-        for refused in (monitor.look_refused, monitor.since_refused):
+        for refused in (monitor.strips_refused, monitor.since_refused):
             if refused is not None:
                 _log.warning("%s", refused)
         network = open_network(config, take_over=take_over)

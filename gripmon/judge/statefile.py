@@ -23,7 +23,7 @@ from gripmon.model.atomic import remove_leftovers, write_atomically
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import GripperModel, contents_of
-from gripmon.model.records import MonitorState, ReferenceRecord
+from gripmon.model.records import MonitorState, ReferenceRecord, StripsRecord
 
 _log = logging.getLogger(__name__)
 
@@ -83,8 +83,16 @@ class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     state: MonitorState
 
 
+class _Look(msgspec.Struct, frozen=True):
+    """The gripper's learned look, which was kept up to commit ab09892a: only the strips still are."""
+
+    strips: StripsRecord | msgspec.UnsetType = msgspec.UNSET
+
+
 class _State(MonitorState, frozen=True, forbid_unknown_fields=True):
     """A state as read from a file: an unknown field is an error, because the next write would lose it."""
+
+    look: _Look | None = None
 
 
 class _Read(Kept, frozen=True, forbid_unknown_fields=True):
@@ -147,7 +155,11 @@ def unpack(data: bytes) -> Kept:
         read = msgspec.json.decode(content, type=_Read)
     except _UNREADABLE as error:
         raise ValueError(f"its content is not a state: {error}") from None
-    kept = Kept(read.format, read.owner, MonitorState(**msgspec.structs.asdict(read.state)))
+    values = msgspec.structs.asdict(read.state)
+    look = values.pop("look")
+    if look is not None and read.state.strips is msgspec.UNSET:
+        values["strips"] = look.strips
+    kept = Kept(read.format, read.owner, MonitorState(**values))
     if fault := state_fault(kept.state):
         raise ValueError(f"its content contradicts itself: {fault}")
     return kept

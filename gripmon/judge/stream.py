@@ -1,4 +1,4 @@
-"""Faults of the frame stream, detected from the frames alone: frozen, replaced, a wrong clock or a wrong frame rate.
+"""Faults of the frame stream, detected from the frames alone: frozen, replaced, or a wrong clock; and its rate.
 
 Time is the frames' own stamps.  Of each frame about 1,700 pixels are examined, whatever its size.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import bisect
 import math
-import statistics
 from collections import deque
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -48,20 +47,8 @@ frames without anything wrong after which the evidence of a cause is forgotten.
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * NS_PER_S
 """A stamp has jumped if it is more than both of these after the one before: usual periods, and time."""
 
-BLOCK_INTERVALS = 8
-"""Intervals in a block."""
-
-LEARN_BLOCKS = 6
-"""Blocks needed to learn the usual rate; and as much time as shows another one."""
-
-ARRIVALS, MOST_BLOCKS = 64, 512
-"""Newest intervals, and newest blocks, that are kept."""
-
-REGULAR_INTERVAL_DEVIATION = 0.3
-"""Median deviation of the intervals over their median, above which the stream has no usual rate."""
-
-RATE_FAULT_RATIO, RATE_RELEASE_RATIO = 1.6, 1.3
-"""Ratio to the usual rate, either way, above which the rate is a fault; and below which it is right again."""
+FEWEST_INTERVALS, MOST_INTERVALS = 8, 64
+"""Newest intervals from which the rate is known, and most of them that count."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -81,15 +68,6 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             "send nothing for still parts until the next key frame (s)",
         ),
     ] = 10.0
-    rate_s: Annotated[
-        float,
-        Meta(
-            gt=0.0,
-            le=3600.0,
-            description="time for which the frame rate must differ from the usual one to count as a fault, and "
-            "which it takes to learn the usual one (s)",
-        ),
-    ] = 2.0
 
 
 class StreamFault(NamedTuple):
@@ -99,7 +77,7 @@ class StreamFault(NamedTuple):
     over when it is reported; its cause is unknown: the camera was away, or its clock was set.
     """
 
-    kind: Literal["frozen", "repeated", "replaced", "clock", "gap", "rate"]
+    kind: Literal["frozen", "repeated", "replaced", "clock", "gap"]
     cause: Cause
     text: str
 
@@ -111,17 +89,14 @@ class StreamWatch:
         settings = settings or StreamSettings()
         self._frozen = _Frozen(settings)
         self._clock = _Clock()
-        self._rate = _Rate(settings)
+        self._rate = _Rate()
         self._kind = _Kind()
 
     def add(self, frame: Frame) -> tuple[StreamFault, ...]:
         """What is wrong now; empty when all is well.  Never raises for a bad frame."""
-        faults = (
-            self._clock.add(frame, self._rate),
-            self._rate.add(frame),
-            self._kind.add(frame.image),
-            self._frozen.add(frame, self._rate.usual_ns),
-        )
+        clock = self._clock.add(frame, self._rate)
+        self._rate.add(frame)
+        faults = clock, self._kind.add(frame.image), self._frozen.add(frame, self._rate.interval_ns)
         return tuple(filter(None, faults))
 
     @property
@@ -168,7 +143,7 @@ class _Frozen:
     def coded(self) -> bool:
         return self._coded >= SURE_FRAMES
 
-    def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
+    def add(self, frame: Frame, interval_ns: float | None) -> StreamFault | None:
         image = frame.image
         if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
             return None
@@ -186,7 +161,7 @@ class _Frozen:
             return None
         self._run += 1
         # The stamps may repeat together with the images.
-        lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
+        lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (interval_ns or 0.0))
         enough = max(self._settings.frozen_frames, FREEZE_TO_USUAL_RATIO * self._longest)
         settings = self._settings
         frozen_s = max(settings.frozen_s, settings.frozen_coded_s) if self.coded else settings.frozen_s
@@ -275,100 +250,45 @@ class _Clock:
 
 
 class _Rate:
-    """The interval between frames; frame numbers account for dropped frames.
+    """The interval at which frames arrive: the median of the newest ones."""
 
-    Intervals are grouped in blocks of :data:`BLOCK_INTERVALS`, of which the median counts.
-    """
-
-    def __init__(self, settings: StreamSettings):
-        self._settings = settings
+    def __init__(self) -> None:
         self._last: tuple[int, int] | None = None
-        self._arrivals_ns: deque[int] = deque(maxlen=ARRIVALS)
+        self._intervals_ns: deque[int] = deque(maxlen=MOST_INTERVALS)
         self._in_order_ns: list[int] = []
-        self._block_ns: list[float] = []
-        self._blocks: deque[_Block] = deque(maxlen=MOST_BLOCKS)
-        self.usual_ns: float | None = None
-        self._fault: StreamFault | None = None
 
     @property
-    def frames_per_s(self) -> float | None:
-        if len(self._arrivals_ns) < BLOCK_INTERVALS:
+    def interval_ns(self) -> float | None:
+        """None until it is known."""
+        if len(self._intervals_ns) < FEWEST_INTERVALS:
             return None
         half, odd = divmod(len(self._in_order_ns), 2)
         upper_ns = self._in_order_ns[half]
-        return NS_PER_S / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
+        return upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns)
+
+    @property
+    def frames_per_s(self) -> float | None:
+        interval_ns = self.interval_ns
+        return None if interval_ns is None else NS_PER_S / interval_ns
 
     def longest_ns(self, frames: int) -> float:
         """Longest time that N ``frames`` take while nothing is wrong; infinite until the rate is known."""
-        frames_per_s = self.frames_per_s
-        return math.inf if frames_per_s is None else frames * JUMP_PERIODS * NS_PER_S / frames_per_s
+        interval_ns = self.interval_ns
+        return math.inf if interval_ns is None else frames * JUMP_PERIODS * interval_ns
 
-    def add(self, frame: Frame) -> StreamFault | None:
+    def add(self, frame: Frame) -> None:
         last, self._last = self._last, (frame.seq, frame.stamp_ns)
         if last is None or frame.stamp_ns <= last[1]:
-            return self._fault
+            return
         step_ns = frame.stamp_ns - last[1]
+        # Frame numbers account for dropped frames.
         interval_ns = step_ns / max(frame.seq - last[0], 1)
         if interval_ns > JUMP_NS and interval_ns > self.longest_ns(1):
-            return self._fault  # a gap
-        if len(self._arrivals_ns) == ARRIVALS:
-            self._in_order_ns.remove(self._arrivals_ns[0])
-        self._arrivals_ns.append(step_ns)
+            return  # a gap
+        if len(self._intervals_ns) == MOST_INTERVALS:
+            self._in_order_ns.remove(self._intervals_ns[0])
+        self._intervals_ns.append(step_ns)
         bisect.insort(self._in_order_ns, step_ns)
-        self._block_ns.append(interval_ns)
-        if len(self._block_ns) == BLOCK_INTERVALS:
-            middle_ns = statistics.median(self._block_ns)
-            uneven = statistics.median(abs(t - middle_ns) for t in self._block_ns) / middle_ns
-            self._blocks.append(_Block(middle_ns, sum(self._block_ns), uneven))
-            self._block_ns = []
-            if self.usual_ns is None:
-                self._learn()
-            else:
-                self._judge(self.usual_ns)
-        return self._fault
-
-    def _judge(self, usual_ns: float) -> None:
-        recent: list[_Block] = []
-        lasted_ns = 0.0
-        for block in reversed(self._blocks):
-            recent.append(block)
-            lasted_ns += block.lasted_ns
-            if lasted_ns >= NS_PER_S * self._settings.rate_s:
-                break
-        else:
-            return
-        slower = _middle_ns(recent) / usual_ns
-        if max(slower, 1.0 / slower) > RATE_FAULT_RATIO:
-            text = f"{NS_PER_S / (slower * usual_ns):.1f} frames a second arrive; {NS_PER_S / usual_ns:.1f} were usual"
-            self._fault = StreamFault("rate", Cause.CLOCK, text)
-        elif max(slower, 1.0 / slower) < RATE_RELEASE_RATIO:
-            self._fault = None
-
-    def _learn(self) -> None:
-        lasted_ns = sum(block.lasted_ns for block in self._blocks)
-        if len(self._blocks) < LEARN_BLOCKS or lasted_ns < NS_PER_S * self._settings.rate_s:
-            return
-        # Frames at irregular intervals have no usual rate.
-        if statistics.median(block.uneven for block in self._blocks) < REGULAR_INTERVAL_DEVIATION:
-            self.usual_ns = _middle_ns(list(self._blocks))
-
-
-class _Block(NamedTuple):
-    """A block of intervals: their median, their sum, and their median deviation over the median."""
-
-    middle_ns: float
-    lasted_ns: float
-    uneven: float
-
-
-def _middle_ns(blocks: list[_Block]) -> float:
-    """The median interval, weighted by time: half of the time passed with shorter ones."""
-    half_ns, passed_ns = 0.5 * sum(block.lasted_ns for block in blocks), 0.0
-    for block in sorted(blocks):
-        passed_ns += block.lasted_ns
-        if passed_ns >= half_ns:
-            break
-    return block.middle_ns
 
 
 class _Kind:

@@ -122,9 +122,9 @@ class Monitor:
         return self._trust.unexplained is not None
 
     @property
-    def look_refused(self) -> str | None:
-        """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
-        return self._trust.look_refused
+    def strips_refused(self) -> str | None:
+        """Why the strips that were kept over a restart aren't used; None where they are, or none were kept."""
+        return self._trust.strips_refused
 
     @property
     def since_refused(self) -> str | None:
@@ -143,7 +143,7 @@ class Monitor:
 
     @property
     def state_revision(self) -> int:
-        """Grows with each change of :meth:`state`, except of the last transform and the look."""
+        """Grows with each change of :meth:`state`, except of the last transform and the strips."""
         known = int(self._analysis.of_configured.error is not None) + int(self._trust.question is not None)
         known += self._trust.since.changes
         return self._renewal.book.changes + self._policy.alerts.changes + known
@@ -161,7 +161,7 @@ class Monitor:
             reference_error=None if error is None else tuple(error.tolist()),
             unexplained=msgspec.UNSET if question is None else tuple(question.away.tolist()),
             explained_from=msgspec.UNSET if answered is None else answered,
-            look=self._trust.look_state(self.reference),
+            strips=self._trust.strips_state(),
             at_reference=self._trust.since.state() or msgspec.UNSET,
         )
 
@@ -311,8 +311,8 @@ class Monitor:
             self._begin()
         wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
         state = self.state() if wanted else None
-        if state is not None:  # without the 150 kB that only a restart needs
-            state = msgspec.structs.replace(state, look=None, at_reference=msgspec.UNSET)
+        if state is not None:  # without what only a restart needs, some kB
+            state = msgspec.structs.replace(state, strips=msgspec.UNSET, at_reference=msgspec.UNSET)
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:

@@ -16,7 +16,7 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
+from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord, StripsRecord
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
@@ -24,7 +24,7 @@ from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
 from gripmon.track.edges import Measurement
-from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, LookRefused, StripsSeen
+from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
@@ -62,8 +62,8 @@ class Integrity:
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
-        self.look_refused: str | None = None
-        """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
+        self.strips_refused: str | None = None
+        """Why strips that were kept over a restart aren't used; None where they are, or none were kept."""
         self.since_refused: str | None = None
         """Why what a state has about the reference's frames isn't used; None where it is, or there is nothing."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
@@ -73,12 +73,9 @@ class Integrity:
         self._believed = False
         self._ends_seen = False
 
-    def look_state(self, reference: ReferenceRecord) -> LookRecord | None:
-        """The gripper's look for the state file; None before it is learnt."""
-        record = self._look.state(reference.reference_id)
-        if record is None:
-            return None
-        return msgspec.structs.replace(record, strips=self._strips.state() or msgspec.UNSET)
+    def strips_state(self) -> StripsRecord | msgspec.UnsetType:
+        """The fingers' strips for the state file; unset before they are learnt."""
+        return self._strips.state() or msgspec.UNSET
 
     @property
     def unexplained(self) -> Array | None:
@@ -111,20 +108,20 @@ class Integrity:
         self._weigher.rebase(reference)
 
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
-        """Continue after a restart: from the last known pose (4, 4), with the kept look."""
+        """Continue after a restart: from the last known pose (4, 4), with the kept strips: without them
+        a mark that a knock has brought to where the tips were shows only once another place is proven.
+        """
         if state is not None and state.unexplained is not msgspec.UNSET:
             # What an earlier run couldn't explain, a restart doesn't either.
             answered = None if state.explained_from is msgspec.UNSET else state.explained_from
             revision = state.references[-1].revision
             self._weigher.question = Question(np.array(state.unexplained), revision, answered)
         self._weigher.rebase(reference, last_T)
-        if state is not None and state.look is not None:
+        if state is not None and state.strips is not msgspec.UNSET:
             try:
-                self._look.restore(state.look, reference.reference_id)
-                if state.look.strips is not msgspec.UNSET:
-                    self._strips.restore(state.look.strips)
-            except LookRefused as refused:
-                self.look_refused = str(refused)
+                self._strips.restore(state.strips)
+            except StripsRefused as refused:
+                self.strips_refused = str(refused)
         if state is not None:
             known = () if state.at_reference is msgspec.UNSET else state.at_reference
             self.since_refused = self._weigher.restore(known)
@@ -284,10 +281,9 @@ class Integrity:
                 self.since.forget()  # what was known until now was so without the fingers' ends
             self._jaw_opening_m = measurement.jaw_opening_m
             self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
-        if proves:
-            if frame.image is not None and not (moved or trust.may_have_slid):
-                # A copy: learning can wait, and the caller may read the next image into the same memory.
-                self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
+        if proves and frame.image is not None and not (moved or trust.may_have_slid):
+            # A copy: learning can wait, and the caller may read the next image into the same memory.
+            self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         at = measurement, cam_T_grip, covariance, trust.bounds
         standing = Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)

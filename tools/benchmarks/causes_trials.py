@@ -259,18 +259,6 @@ def _clock(rng: Rng, rig: Rig) -> Trial:
     return _ring(rig, AFTER, change, _seconds(rig, 3.0), f"{kind}, {1e-9 * jump_ns:.1f} s")
 
 
-def _rate(rng: Rng, rig: Rig) -> Trial:
-    """About half or double the rate, or further from it."""
-    factor = _log_uniform(rng, 1.8, 4.0) ** float(rng.choice([-1.0, 1.0]))
-
-    def change(after: int, frame: Frame, last: Frame) -> Frame:
-        if after < 0:
-            return frame
-        return replace(frame, stamp_ns=last.stamp_ns + round((after + 1) * 1e9 / rig.scenario.fps / factor))
-
-    return _ring(rig, _seconds(rig, 3.0 * max(factor, 1.0)), change, _seconds(rig, 3.0), f"{factor:.2f} times")
-
-
 def _replaced(rng: Rng, rig: Rig) -> Trial:
     """Images of another size or type; or, after some time without any, of the same from another camera."""
     if rng.random() < 0.5:
@@ -319,6 +307,5 @@ ROWS: dict[str, Row] = {
         Row("frozen", Cause.CAMERA_FROZEN, _frozen),
         Row("replaced", Cause.CAMERA_REPLACED, _replaced),
         Row("clock", Cause.CLOCK, _clock),
-        Row("rate", Cause.CLOCK, _rate),
     )
 }

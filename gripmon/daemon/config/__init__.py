@@ -24,7 +24,6 @@ from gripmon.daemon.config.checks import (
     reference_transform,
     source_fault,
     view_fault,
-    with_alert_limit,
 )
 from gripmon.daemon.config.earlier import without_gone
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
@@ -135,25 +134,21 @@ class Config:
 
 
 def load_config(
-    path: str | Path, *, check_source: bool = True, with_taught: bool = True, say_deprecated: bool = True
+    path: str | Path, *, check_source: bool = True, with_taught: bool = True, say_gone: bool = True
 ) -> Config:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
     ``check_source=False``: don't check that the source's files exist, for callers with their own input;
-    ``with_taught=False``: ignore the taught model, for callers that teach it again; ``say_deprecated=False``: no
-    warning about replaced settings, for files that can't be edited.
+    ``with_taught=False``: ignore the taught model, for callers that teach it again; ``say_gone=False``: of settings
+    that are gone only those that had an effect are told, for files that can't be edited.
     """
     path = Path(path)
     values = read_configuration(path)
     if SECTION in values:
         right = "a wrist camera's configuration; gripmon run, check and replay take both"
         raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
-    values, calibrated = with_sections(path, without_gone(path, values, say=say_deprecated))
+    values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
-    try:
-        settings = with_alert_limit(path, values, settings, say=say_deprecated)
-    except SettingsError as error:
-        raise ConfigError.of(path, error.fault) from None
     camera = _camera(path, settings, calibrated)
     gripper_path = named_file(path, "gripper", settings.gripper, "a gripper file")
     gripper = read_gripper(gripper_path)

@@ -8,9 +8,8 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -359,33 +358,3 @@ def _split(text: str) -> Fault:
     key, _, rest = text.partition(": ")
     wrong, _, right = rest.partition("; ")
     return Fault(key, wrong, right)
-
-
-_OLD, _NEW = "suspect_sigma_m", "alert_limit_m"
-_SECTION = "monitor.policy"
-_LARGEST_LIMIT_M = 1.0
-
-
-def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings:
-    """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: log a warning that names both.
-
-    ``values``: the content of the file; if it has both keys it is ambiguous.
-    """
-    policy = settings.monitor.policy
-    if policy.suspect_sigma_m is None:
-        return settings
-    limit_m = round(policy.position_limit_m, 6)
-    if _NEW in values["monitor"]["policy"]:
-        wrong = f"stands beside {_NEW}, which replaces it"
-        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW} alone"))
-    if not 0.0 < limit_m <= _LARGEST_LIMIT_M:
-        wrong = f"{policy.suspect_sigma_m:g} stands for {_NEW}: {limit_m:g}, which is not within 0 and 1"
-        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task tolerates (m)"))
-    if say:
-        _log.warning(
-            "%s: %s.%s: %g is deprecated; write %s: %g, which it stands for",
-            path, _SECTION, _OLD, policy.suspect_sigma_m, _NEW, limit_m,
-        )  # fmt: skip
-    policy = msgspec.structs.replace(policy, alert_limit_m=limit_m, suspect_sigma_m=None)
-    monitor = msgspec.structs.replace(settings.monitor, policy=policy)
-    return msgspec.structs.replace(settings, monitor=monitor)

@@ -78,7 +78,7 @@ def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:
             raise ConfigError(path, "", "the recorded file is damaged", "base64") from None
     if recorded.main not in recorded.files:
         raise ConfigError(folder, "", f"the recorded configuration lacks its file {recorded.main!r}", "all its files")
-    return load_config(folder / recorded.main, check_source=False, say_deprecated=False)
+    return load_config(folder / recorded.main, check_source=False, say_gone=False)
 
 
 def _file(config_path: Path, path: Path) -> RecordedFile:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from typing import Annotated
 
 import msgspec
@@ -118,28 +117,6 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             description="how often the camera's mount is knocked or slips (1/month)",
         ),
     ] = 1.0
-    suspect_sigma_m: (
-        Annotated[
-            float,
-            Meta(
-                gt=0.0,
-                le=1.0,
-                description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
-                "transform is suspect; replaced by an alert limit when a configuration is read (m)",
-            ),
-        ]
-        | None
-    ) = None
-
-    @property
-    def position_limit_m(self) -> float:
-        """The alert limit; where ``suspect_sigma_m`` still stands in its place, what that stands for (m).
-
-        A normal error with that standard deviation along one axis exceeds it with the probability ``integrity_risk``.
-        """
-        if self.suspect_sigma_m is None:
-            return self.alert_limit_m
-        return statistics.NormalDist().inv_cdf(1.0 - 0.5 * self.integrity_risk) * self.suspect_sigma_m
 
 
 def time_left_s(shift: Array, velocity: Array, limit_m: float, limit_rad: float) -> float | None:

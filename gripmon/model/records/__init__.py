@@ -41,12 +41,17 @@ from gripmon.model.records.frames import (
 )
 from gripmon.model.records.json_schema import json_schema, summary
 from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
-from gripmon.model.records.looks import LookRecord, StripsRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
 from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
-from gripmon.model.records.references import AtReferenceRecord, MonitorState, ReferenceInputs, ReferenceRecord
+from gripmon.model.records.references import (
+    AtReferenceRecord,
+    MonitorState,
+    ReferenceInputs,
+    ReferenceRecord,
+    StripsRecord,
+)
 from gripmon.model.records.schemas import MESSAGES, OLDER, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.model.records.values import (
     NOTHING_WRONG,
@@ -99,7 +104,6 @@ __all__ = [
     "JawReading",
     "LaserPulse",
     "Limits",
-    "LookRecord",
     "MeasurementTrace",
     "MessageRefused",
     "Meta",

@@ -8,7 +8,6 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.model.records.alerts import Cause, OpenAlert
-from gripmon.model.records.looks import LookRecord
 from gripmon.model.records.values import Covariance, Since, Transform
 
 
@@ -45,6 +44,18 @@ class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="grip
     inputs: Annotated[
         ReferenceInputs | None, Meta(description="what it was measured from; null if it was not measured here")
     ] = None
+
+
+class StripsRecord(msgspec.Struct, frozen=True):
+    """What the fingers show along themselves; bytes are little-endian and base64 in JSON."""
+
+    cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when the strips were chosen")]
+    jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
+    frames: Annotated[int, Meta(ge=1, description="that they were learned from")]
+    mean: Annotated[
+        bytes, Meta(description="float32 (n, 64): grey levels from the finger's end on, slow changes left out")
+    ]
+    usual: Annotated[bytes, Meta(description="float32 (193,): correlation with them at each px along, from -96 to 96")]
 
 
 class AtReferenceRecord(msgspec.Struct, frozen=True):
@@ -96,9 +107,10 @@ class MonitorState(msgspec.Struct, frozen=True):
         int | msgspec.UnsetType,
         Meta(description="revision of the reference that an operator accepted then; absent while there is none"),
     ] = msgspec.UNSET
-    look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
-        None
-    )
+    strips: Annotated[
+        StripsRecord | msgspec.UnsetType,
+        Meta(description="what the fingers show along themselves; absent before it was learned, and in replies"),
+    ] = msgspec.UNSET
     at_reference: Annotated[
         tuple[AtReferenceRecord, ...] | msgspec.UnsetType,
         Meta(description="what was measured at the references, from which motion counts; absent before that is known"),

@@ -1,14 +1,14 @@
 """The gripper's own learned look: a second witness of where it is."""
 
-from gripmon.track.look.agreement import LookAgreement, LookRefused
+from gripmon.track.look.agreement import LookAgreement
 from gripmon.track.look.core import GripperLook
-from gripmon.track.look.strips import ONE_EDGE_PX, FingerStrips, StripsSeen
+from gripmon.track.look.strips import ONE_EDGE_PX, FingerStrips, StripsRefused, StripsSeen
 
 __all__ = [
     "ONE_EDGE_PX",
     "FingerStrips",
     "GripperLook",
     "LookAgreement",
-    "LookRefused",
+    "StripsRefused",
     "StripsSeen",
 ]

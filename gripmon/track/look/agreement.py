@@ -35,10 +35,6 @@ take a few of thirty, a slide of a millimetre left 0 to 8 of them.
 """
 
 
-class LookRefused(ValueError):
-    """A kept look belongs to something else, or doesn't hold together; the text says what."""
-
-
 def patch_evidence(hit: Array, chance: Array) -> tuple[Array, Array]:
     """Log odds (n,), nats, that the gripper is at a pose rather than elsewhere: of a patch that agrees there, and of
     one that doesn't.

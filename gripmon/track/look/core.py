@@ -9,25 +9,21 @@ too: one that looks the same there tells nothing, and a finger of one shade has 
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, to_record
-from gripmon.model.gripper import Gripper, contents_of
+from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
-from gripmon.model.records import Array, Image, LookRecord
+from gripmon.model.records import Array, Image
 from gripmon.track.look.agreement import (
     AGREEING_CORRELATION,
     CHANCE_BOUNDS,
     LookAgreement,
-    LookRefused,
     patch_evidence,
 )
 from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
@@ -93,10 +89,6 @@ class GripperLook:
         self._slides_grip_m = steps_m[:, None] * (axis / np.linalg.norm(axis))
         self._far = np.abs(steps_m) > SLIDES_M[0]
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
-        self.forget()
-
-    def forget(self) -> None:
-        """Learn again: the gripper, its camera or what they look like from each other was changed."""
         self.views = 0
         self._laid_out: tuple[Array, float | None] | None = None
         self._last_s: float | None = None
@@ -184,68 +176,6 @@ class GripperLook:
             out.log_odds[:, finger] = odds[:, start:end].sum(axis=1)
             out.correlation[:, finger] = np.sort(alike[:, start:end], axis=1)[:, (end - start) // 2]
         return out
-
-    def state(self, reference_id: str) -> LookRecord | None:
-        """What survives a restart, some 15 kB; None before the first frame with a finger in view."""
-        if self._laid_out is None or not len(self._points):
-            return None
-        cam_T_grip, jaw_opening_m = self._laid_out
-        camera, gripper = self._digests()
-        return LookRecord(
-            camera,
-            gripper,
-            reference_id,
-            to_record(cam_T_grip),
-            jaw_opening_m,
-            self.views,
-            self._mean.astype("<f2").tobytes(),
-            self._weight.astype("<f4").tobytes(),
-            self._hit.astype("<f2").tobytes(),
-            self._chance.astype("<f2").tobytes(),
-            self._tried.astype("<f4").tobytes(),
-        )
-
-    def restore(self, record: LookRecord, reference_id: str) -> None:
-        """Go on with a kept look.  Raises :class:`LookRefused`, and begins again, if it is of something else."""
-        self.forget()
-        camera, gripper = self._digests()
-        changed = [
-            name
-            for name, was, now in (
-                ("camera model", record.camera, camera),
-                ("gripper file", record.gripper, gripper),
-                ("reference", record.reference_id, reference_id),
-            )
-            if was != now
-        ]
-        if changed:
-            raise LookRefused(f"the kept look is of another {' and '.join(changed)}; it is learnt again")
-        laid_out = from_record(record.cam_T_grip), record.jaw_opening_m
-        layout = lay_out(self._camera, self._gripper, *laid_out)
-        count, slides = int(np.count_nonzero(~layout.guard)), len(self._slides_grip_m)
-        parts = [
-            (record.mean, "<f2", (count, POINTS)),
-            (record.weight, "<f4", (count,)),
-            (record.hit, "<f2", (count,)),
-            (record.chance, "<f2", (slides, count)),
-            (record.tried, "<f4", (slides,)),
-        ]
-        if any(len(data) != np.dtype(kind).itemsize * math.prod(shape) for data, kind, shape in parts):
-            raise LookRefused("the kept look has other patches than this version's; it is learnt again")
-        mean, weight, hit, chance, tried = (np.frombuffer(data, kind).reshape(shape) for data, kind, shape in parts)
-        if not all(np.isfinite(part).all() for part in (mean, weight, hit, chance, tried)):
-            raise LookRefused("the kept look holds values that are not finite; it is learnt again")
-        self._begin(layout)
-        self._laid_out, self.views = laid_out, record.views
-        self._mean, self._weight = mean.astype(np.float32), weight.astype(float)
-        self._hit, self._chance, self._tried = hit.astype(float), chance.astype(float), tried.astype(float)
-        if self.views >= FEWEST_VIEWS:
-            self._choose()
-
-    def _digests(self) -> tuple[str, str]:
-        values = self._camera.settings, contents_of(self._gripper.model)
-        camera, gripper = (hashlib.sha256(msgspec.json.encode(value)).hexdigest()[:16] for value in values)
-        return camera, gripper
 
     def _begin(self, layout: Layout) -> None:
         own = ~layout.guard

@@ -21,7 +21,6 @@ from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image, StripsRecord
-from gripmon.track.look.agreement import LookRefused
 
 LENGTH_PX, REACH_PX = 64, 96
 """How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: as far as a
@@ -85,6 +84,10 @@ class _Layout(NamedTuple):
     fingers_m: Array
 
 
+class StripsRefused(ValueError):
+    """Kept strips belong to something else, or don't hold together; the text says so."""
+
+
 class StripsSeen(NamedTuple):
     """What the strips show at a pose."""
 
@@ -143,8 +146,8 @@ class FingerStrips:
         return StripsRecord(to_record(cam_T_grip), jaw_opening_m, self.frames, mean, usual)
 
     def restore(self, record: StripsRecord) -> None:
-        """Go on with kept strips of the same gripper and camera.  Raises :class:`LookRefused`, and begins again, if
-        they don't fit.
+        """Go on with kept strips of the same gripper and camera.  Raises :class:`StripsRefused`, and begins again,
+        if they don't fit.
         """
         self._lay_out(from_record(record.cam_T_grip), record.jaw_opening_m)
         layout = self._layout
@@ -152,7 +155,7 @@ class FingerStrips:
         fits = all(len(data) == 4 * size for data, size in zip((record.mean, record.usual), sizes, strict=True))
         if layout is None or not fits or not np.isfinite(np.frombuffer(record.mean + record.usual, "<f4")).all():
             self._laid_out = self._layout = None
-            raise LookRefused("the kept look along the fingers isn't this gripper's; it is learnt again")
+            raise StripsRefused("the kept strips along the fingers aren't this gripper's; they are learnt again")
         self._mean = np.frombuffer(record.mean, "<f4").reshape(layout.within.shape).astype(np.float32)
         self._usual = np.frombuffer(record.usual, "<f4").astype(float)
         self._farther = _farther_on(self._usual)
