@@ -30,6 +30,12 @@ PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
 
 
+STRICT_FROM_RATIO = 0.1
+"""Probability over the integrity risk that what looked like the ends was something else in every frame so far, from
+which ends are also checked strictly: below it is lost in the bound's other parts.
+"""
+
+
 class _Candidate(NamedTuple):
     """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), the fingers' slide from
     there according to their strips, and how far the place is trusted.
@@ -176,8 +182,11 @@ class Integrity:
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
         if due or self._past_limit(trust.bounds) or trust.displaced or not self._weigher.proved:
-            ends = self._tracker.ends(frame, measurement)
-            trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
+            ends, strictly = self._tracker.ends(frame, measurement), 0
+            if self._weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
+                strict = self._tracker.ends(frame, measurement, strict=True)
+                strictly = int(np.count_nonzero((strict.seen > 0) & (strict.seen >= ends.seen)))
+            trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)
             self._ends_seen = trust.proven
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
         measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
@@ -185,7 +194,8 @@ class Integrity:
             return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
-            strictly = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here)
+            fingers = int(np.count_nonzero(ends.seen))
+            strictly = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None

@@ -180,6 +180,13 @@ class Weigher:
         return np.maximum(self._swing, 0.0)
 
     @property
+    def misread_ever(self) -> float:
+        """Probability that what looked like the fingers' ends was something else in every frame that the anchor is the
+        average of.
+        """
+        return 1.0 if self.anchor is None else self.anchor.misread
+
+    @property
     def proved(self) -> bool:
         """Whether a frame has proven a pose."""
         return self.anchor is not None and self.anchor.proven
@@ -201,13 +208,15 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
         seen_along: bool = False,
+        strictly: int = 0,
     ) -> Trust:
         """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
-        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.
+        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
+        how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -225,6 +234,8 @@ class Weigher:
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._misread(measurement, ends, kept)
+        if proven:
+            misread *= MISREAD_PROBABILITY**strictly
         # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
@@ -256,6 +267,8 @@ class Weigher:
             return Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         # The most probable hypothesis since the anchor.
         possible = holds * prior
+        if proven:
+            possible[hypotheses.ends] = 0.0
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
