@@ -10,7 +10,6 @@ import json
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import machine
+from benchmarks.revision import commit_of, package_of
 from benchmarks.rings import Rings
 
 _SIDE = Path(__file__).parent / "latency_side.py"
@@ -78,11 +78,9 @@ def compared(what: str, before_us: NDArray[np.float64], after_us: NDArray[np.flo
 
 def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
     """The rows, those of the stages last, and what each side was.  ValueError for a revision that git doesn't know."""
+    name, roots = commit_of(revision)[:10], (package_of(revision), machine.ROOT)
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
-        other = Path(scratch) / "other"
-        name = checked_out(revision, other)
         ring = Rings(Path(scratch)).of(plan.size, plan.ring)
-        roots = (other, machine.ROOT)
         timed = _alternating(roots, ring, plan.settle, plan.frames, plan.block, staged=False)
         staged = _alternating(roots, ring, plan.settle, plan.staged, plan.block, staged=True)
     rows = [
@@ -100,26 +98,6 @@ def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
 def _of(sides: list[dict[str, Any]], what: str, key: str, block: int) -> Compared:
     before, after = (np.array(side[key]) for side in sides)
     return compared(what, before, after, block)
-
-
-def checked_out(revision: str, folder: Path) -> str:
-    """The checkout's files at a revision into a new folder; its short hash."""
-    known = subprocess.run(
-        ["git", "rev-parse", "--short=10", "--verify", f"{revision}^{{commit}}"],
-        cwd=machine.ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if known.returncode:
-        raise ValueError(f"{revision}: git knows no such revision here; a commit, branch or tag")
-    folder.mkdir()
-    packed = folder.with_suffix(".tar")
-    subprocess.run(["git", "archive", "-o", str(packed), known.stdout.strip()], cwd=machine.ROOT, check=True)
-    with tarfile.open(packed) as archive:
-        archive.extractall(folder, filter="data")
-    packed.unlink()
-    return known.stdout.strip()
 
 
 def _alternating(

@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.machine import ROOT
 
 _KEPT = ROOT / "build" / "revisions"
+_PARTS = ("gripmon", "configs", "tools")
 
 
 def commit_of(revision: str) -> str:
@@ -23,11 +24,13 @@ def commit_of(revision: str) -> str:
 
 
 def package_of(revision: str) -> Path:
-    """A folder in which ``gripmon`` is as it was; kept, since its compiled code is kept beside it."""
+    """A folder in which ``gripmon``, its configurations and tools are as they were; kept, since its compiled code is
+    kept beside it.
+    """
     commit = commit_of(revision)
     folder = _KEPT / commit
     if not folder.exists():
-        packed = subprocess.run(["git", "archive", commit, "gripmon"], cwd=ROOT, capture_output=True, check=True).stdout
+        packed = subprocess.run(["git", "archive", commit, *_PARTS], cwd=ROOT, capture_output=True, check=True).stdout
         unpacked = _KEPT / f"{commit}.{os.getpid()}"
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
             archive.extractall(unpacked, filter="data")
