@@ -136,7 +136,6 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
         alerts += [[index, alert.text] for alert in record.alerts if is_false(alert, watched.wrong)]
         moved += [index for alert in record.alerts if names_a_move(alert)]
         grey_dn = _grey_dn(look.frame) if grey_dn is None else grey_dn
-    policy = settings.policy
     return {
         "condition": name,
         "seed": seed,
@@ -144,21 +143,28 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
         "asked": frames,
         "commit": commit(),
         "grey_dn": grey_dn,
+        **_setting(watched, settings),
+        "valid_by": str(getattr(record, "valid_by", "absolute")),
+        "false_alerts": alerts,
+        "moved_alerts": moved,
+        "seconds": round(time.perf_counter() - start_s, 2),
+        "cpu_s": round(time.process_time() - start_cpu_s, 2),
+        **{key: [row[key] for row in rows] for key in rows[0]},
+    }
+
+
+def _setting(watched: Watched, settings: MonitorSettings) -> dict[str, Any]:
+    """What a scene is, apart from its frames."""
+    return {
         "gripper": watched.gripper.name,
         "fps": watched.fps,
         "depth_m": _short(watched.start_cam_T_grip[2, 3]),
         "focal_px": _short(watched.camera.fx_px),
         "jaw_exact": watched.jaw_sigma_m == 0.0,
         "inside": watched.inside,
-        "valid_by": str(getattr(record, "valid_by", "absolute")),
-        "limit_m": policy.alert_limit_m,
-        "limit_rad": policy.alert_limit_rad,
-        "false_alerts": alerts,
+        "limit_m": settings.policy.alert_limit_m,
+        "limit_rad": settings.policy.alert_limit_rad,
         "knock": None if watched.knock is None else list(watched.knock),
-        "moved_alerts": moved,
-        "seconds": round(time.perf_counter() - start_s, 2),
-        "cpu_s": round(time.process_time() - start_cpu_s, 2),
-        **{key: [row[key] for row in rows] for key in rows[0]},
     }
 
 
