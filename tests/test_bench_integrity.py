@@ -36,6 +36,7 @@ def line(**columns: Any) -> dict[str, Any]:
         "floor_m": [5e-5] * n,
         "reference_m": [None] * n,
         "absolute_m": [1e-4] * n,
+        "absolute_error_m": [1e-5] * n,
         "nees": [6.0] * n,
         "why": [""] * n,
         "valid_by": "absolute",
@@ -174,16 +175,15 @@ def test_the_monitor_that_is_judged_gets_the_frozen_limits():
 
 
 class _Bound:
-    position_m, rotation_rad, since = 1e-4, 2e-3, "reference"
+    position_m, rotation_rad, since, since_ns = 1e-4, 2e-3, "reference", 0
 
 
 class _Record:
     """As a record of schema 2."""
 
-    protection = _Bound()
-    since_reference = _Bound()
-    absolute = None
-    valid_by = "reference"
+    def __init__(self, valid_by: str = "reference", stamp_ns: int = 0, since: _Bound | None = None):
+        self.valid_by, self.stamp_ns, self.protection, self.absolute = valid_by, stamp_ns, _Bound(), None
+        self.since_reference = since or _Bound()
 
 
 def test_both_bounds_are_read_where_a_record_has_them():
@@ -208,11 +208,21 @@ def test_by_the_reference_its_own_error_is_no_error():
     now = perturb(true_start, motion)
     truth = Truth(wrong, true_start)
     assert np.allclose(truth.of(_Record(), now), perturb(wrong, motion), atol=1e-12)  # type: ignore[arg-type]
+    assert np.array_equal(truth.of(_Record("absolute"), now), now)  # type: ignore[arg-type]
+    # Since the first proved frame, stamp 7: what moved before it is not in it.
+    proved = _Bound()
+    proved.since, proved.since_ns = "first_proved", 7
+    assert np.allclose(truth.of(_Record(stamp_ns=7, since=proved), now), wrong, atol=1e-12)  # type: ignore[arg-type]
+    later = perturb(now, motion)
+    assert np.allclose(truth.of(_Record(stamp_ns=8, since=proved), later), perturb(wrong, motion), atol=1e-12)  # type: ignore[arg-type]
 
-    class Absolute(_Record):
-        valid_by = "absolute"
 
-    assert np.array_equal(Truth(wrong, true_start).of(Absolute(), now), now)  # type: ignore[arg-type]
+def test_valid_frames_beyond_the_absolute_bound_are_counted_whatever_makes_them_valid():
+    from benchmarks.integrity_stats import figures
+
+    error_m = [1e-5] * 3 + [2e-4, 2e-4] + [1e-5] * 5
+    valid = [True] * 4 + [False] + [True] * 5
+    assert figures([line(absolute_error_m=error_m, valid=valid), line()])["beyond_absolute"] == [1, 1]
 
 
 def test_a_page_beside_another_revision():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import textwrap
 from pathlib import Path
 
@@ -85,18 +84,6 @@ def test_another_package_than_asked_for_is_an_error(tmp_path: Path, monkeypatch:
         latency_against._alternating((tmp_path,), tmp_path / "ring", 0, 10, 10, staged=False)
 
 
-def test_a_revision_is_checked_out_beside(tmp_path: Path):
-    from benchmarks import latency_against
-    from benchmarks.machine import ROOT
-
-    name = latency_against.checked_out("HEAD", tmp_path / "other")
-    shown = subprocess.run(["git", "show", "HEAD:pyproject.toml"], cwd=ROOT, capture_output=True, check=True).stdout
-    assert (tmp_path / "other" / "pyproject.toml").read_bytes() == shown
-    assert (tmp_path / "other" / "gripmon" / "__init__.py").exists() and len(name) == 10
-    with pytest.raises(ValueError, match="nothing-like-it: git knows no such revision"):
-        latency_against.checked_out("nothing-like-it", tmp_path / "third")
-
-
 @pytest.mark.slow("20 s: the real loop in small; the figures and the order of blocks are tested beside it")
 def test_one_side_measures_each_frame_and_each_stage(tmp_path: Path):
     from benchmarks import latency_against, stages
@@ -115,7 +102,7 @@ def test_one_side_measures_each_frame_and_each_stage(tmp_path: Path):
     assert 0.5 * np.sum(staged["loop_us"]) < whole_us <= 1.05 * np.sum(staged["loop_us"])
 
 
-def test_the_table_names_what_is_slower(capsys: pytest.CaptureFixture[str]):
+def test_the_table_names_what_is_slower():
     from benchmarks.latency_against import Compared, as_lines
 
     rows = [Compared("a", 100.0, 110.0, 1.1, 0.01, 1.2), Compared("b", 100.0, 101.0, 1.01, 0.01, 1.0)]

@@ -52,6 +52,7 @@ class Plan:
     scene: int | None = None
     state: Path | None = None
     code: str = ""
+    valid_by: str = ""
 
 
 def add_parser(commands: Any) -> None:
@@ -96,6 +97,12 @@ def add_parser(commands: Any) -> None:
         "run again",
     )
     parser.add_argument(
+        "--valid-by",
+        choices=("reference", "absolute"),
+        default="",
+        help="which bound makes a transform valid (default: the product's); by the reference both are judged",
+    )
+    parser.add_argument(
         "--against",
         type=Path,
         metavar="FILE",
@@ -132,6 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.scene,
         arguments.resume,
         digest_of(*_CODE),
+        arguments.valid_by,
     )
     try:
         other = read_lines(arguments.against)
@@ -169,7 +177,7 @@ def measure(plan: Plan) -> list[dict[str, Any]]:
         file=sys.stderr,
     )
     for task, line in _in_processes(missing, plan):
-        line["code"] = plan.code
+        line |= {"code": plan.code, "asked_by": plan.valid_by}
         lines[task] = line
         if plan.state is not None:
             append_line(plan.state, line)
@@ -188,12 +196,12 @@ def _tasks(plan: Plan, wanted: list[str]) -> Iterator[tuple[str, int]]:
 
 
 def _key(task: tuple[str, int], plan: Plan) -> tuple[Any, ...]:
-    return (*task, plan.seed, plan.frames)
+    return (*task, plan.seed, plan.frames, plan.valid_by)
 
 
 def read_lines(file: Path | None, code: str | None = None) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Finished scenes by condition, number, seed and frames, of some ``code`` or of any; the last of each counts.  A
-    last line that was cut off doesn't count.
+    """Finished scenes by condition, number, seed, frames and the bound asked for, of some ``code`` or of any; the last
+    of each counts.  A last line that was cut off doesn't count.  Those of before there were two bounds have one error.
     """
     if file is None or not file.exists():
         return {}
@@ -204,7 +212,8 @@ def read_lines(file: Path | None, code: str | None = None) -> dict[tuple[Any, ..
         except json.JSONDecodeError:
             continue
         if "code" in line and code in (None, line["code"]):
-            out[line["condition"], line["scene"], line["seed"], line["asked"]] = line
+            line.setdefault("absolute_error_m", line["error_m"])
+            out[line["condition"], line["scene"], line["seed"], line["asked"], line.get("asked_by", "")] = line
     return out
 
 
@@ -228,7 +237,7 @@ def _in_processes(tasks: list[tuple[str, int]], plan: Plan) -> Iterator[tuple[tu
         ProcessPoolExecutor(max_workers=jobs, mp_context=context, initializer=_prepare) as pool,
         tqdm(total=len(tasks), desc="integrity", unit="scene", file=sys.stderr, disable=None) as bar,
     ):
-        waiting = {pool.submit(_scene, *task, plan.seed, plan.frames): task for task in tasks}
+        waiting = {pool.submit(_scene, *task, plan.seed, plan.frames, plan.valid_by): task for task in tasks}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
             bar.update()
@@ -244,7 +253,7 @@ def _prepare() -> None:
     cv2.setNumThreads(1)
 
 
-def _scene(name: str, number: int, seed: int, frames: int) -> dict[str, Any]:
+def _scene(name: str, number: int, seed: int, frames: int, valid_by: str) -> dict[str, Any]:
     from benchmarks.integrity_runs import run_scene
 
-    return run_scene(name, seed, number, frames)
+    return run_scene(name, seed, number, frames, valid_by)

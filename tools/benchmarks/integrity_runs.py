@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -39,6 +39,7 @@ from gripmon.model.records import (
     FrameRecord,
     Origin,
     ReferenceRecord,
+    ValidBy,
     Verdict,
 )
 from gripmon.monitor import Monitor, MonitorSettings
@@ -112,14 +113,17 @@ def scene_numbers(name: str, scenes: int) -> range:
     return range(len(rendered.sequences(name)) if is_rendered(name) else scenes)
 
 
-def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
-    """One scene, judged."""
+def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = "") -> dict[str, Any]:
+    """One scene, judged; ``valid_by``: as the product's setting, empty for its default."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     if is_rendered(name):
         watched = _rendered(rendered.sequences(name)[number])
     else:
         watched = _simulated(make_integrity_scene(_BY_NAME[name], seed, number, frames))
     settings = _settings(watched)
+    if valid_by:
+        policy = msgspec.structs.replace(settings.policy, valid_by=msgspec.convert(valid_by, ValidBy))
+        settings = msgspec.structs.replace(settings, policy=policy)
     monitor = Monitor(watched.camera, watched.gripper, settings, _reference(watched), None)
     truth = Truth(watched.start_cam_T_grip, watched.true_start_cam_T_grip)
     rows: list[dict[str, Any]] = []
@@ -132,7 +136,6 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
         alerts += [[index, alert.text] for alert in record.alerts if is_false(alert, watched.wrong)]
         moved += [index for alert in record.alerts if names_a_move(alert)]
         grey_dn = _grey_dn(look.frame) if grey_dn is None else grey_dn
-    policy = settings.policy
     return {
         "condition": name,
         "seed": seed,
@@ -140,21 +143,28 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
         "asked": frames,
         "commit": commit(),
         "grey_dn": grey_dn,
+        **_setting(watched, settings),
+        "valid_by": str(getattr(record, "valid_by", "absolute")),
+        "false_alerts": alerts,
+        "moved_alerts": moved,
+        "seconds": round(time.perf_counter() - start_s, 2),
+        "cpu_s": round(time.process_time() - start_cpu_s, 2),
+        **{key: [row[key] for row in rows] for key in rows[0]},
+    }
+
+
+def _setting(watched: Watched, settings: MonitorSettings) -> dict[str, Any]:
+    """What a scene is, apart from its frames."""
+    return {
         "gripper": watched.gripper.name,
         "fps": watched.fps,
         "depth_m": _short(watched.start_cam_T_grip[2, 3]),
         "focal_px": _short(watched.camera.fx_px),
         "jaw_exact": watched.jaw_sigma_m == 0.0,
         "inside": watched.inside,
-        "valid_by": str(getattr(record, "valid_by", "absolute")),
-        "limit_m": policy.alert_limit_m,
-        "limit_rad": policy.alert_limit_rad,
-        "false_alerts": alerts,
+        "limit_m": settings.policy.alert_limit_m,
+        "limit_rad": settings.policy.alert_limit_rad,
         "knock": None if watched.knock is None else list(watched.knock),
-        "moved_alerts": moved,
-        "seconds": round(time.perf_counter() - start_s, 2),
-        "cpu_s": round(time.process_time() - start_cpu_s, 2),
-        **{key: [row[key] for row in rows] for key in rows[0]},
     }
 
 
@@ -184,23 +194,26 @@ def normal_level_m(covariance: Array, risk: float) -> float:
 
 @dataclass
 class Truth:
-    """What a transform has to be: the true pose, or the reference moved as the gripper has truly moved.
+    """What a transform has to be: the true pose, or the reference moved as the gripper has truly moved since the frames
+    that the record counts from.
 
-    ``since_cam_T_grip``: the true pose from which motions count, at first that of the reference.
+    ``true_start_cam_T_grip``: the true pose of which the reference is a measurement.
     """
 
     reference_cam_T_grip: Array
-    since_cam_T_grip: Array
-    proved: bool = False
+    true_start_cam_T_grip: Array
+    seen: dict[int, Array] = field(default_factory=dict)
+    """True poses by the stamps of the frames."""
 
     def of(self, record: FrameRecord, true_cam_T_grip: Array) -> Array:
-        """What a record's ``cam_T_grip`` bounds: by the reference, where that is what is promised."""
+        """What a record's ``cam_T_grip`` has to be, at the true pose."""
+        self.seen[record.stamp_ns] = true_cam_T_grip
         since = getattr(record, "since_reference", None)
-        if since is not None and str(since.since) == "first_proved" and not self.proved:
-            self.proved, self.since_cam_T_grip = True, true_cam_T_grip
-        if str(getattr(record, "valid_by", "absolute")) != "reference":
+        if since is None or str(record.valid_by) != "reference":
             return true_cam_T_grip
-        return perturb(self.reference_cam_T_grip, perturbation_between(self.since_cam_T_grip, true_cam_T_grip))
+        proved = str(since.since) == "first_proved"
+        then = self.seen[since.since_ns] if proved else self.true_start_cam_T_grip
+        return perturb(self.reference_cam_T_grip, perturbation_between(then, true_cam_T_grip))
 
 
 def bounds_of(record: FrameRecord) -> dict[str, tuple[float, float] | None]:
@@ -224,14 +237,18 @@ def _judged(record: FrameRecord, look: Look, truth: Truth, risk: float) -> dict[
         "level_rad": None,
         "floor_m": None,
         "nees": None,
+        "absolute_error_m": None,
         "why": "",
         "reason": record.reason or "",
     }
+    true_T = truth.of(record, look.cam_T_grip)
     for name, bound in bounds_of(record).items():
         out[f"{name}_m"], out[f"{name}_rad"] = (None, None) if bound is None else (_short(b) for b in bound)
     if record.cam_T_grip is None or record.covariance is None:
         return out
-    cam_T_grip, true_T = from_record(record.cam_T_grip), truth.of(record, look.cam_T_grip)
+    cam_T_grip = from_record(record.cam_T_grip)
+    measured_T = from_record(getattr(record, "measured_T", None) or record.cam_T_grip)
+    out["absolute_error_m"] = _short(np.linalg.norm(measured_T[:3, 3] - look.cam_T_grip[:3, 3]))
     error = perturbation_between(cam_T_grip, true_T)
     out["error_m"] = _short(np.linalg.norm(error[:3]))
     out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ true_T[:3, :3]))

@@ -51,6 +51,8 @@ class Frames:
     """(n, len(POSITIONS_M)): the frame would be valid with this alert limit of the position, by its bound."""
     both_m: NDArray[np.float64]
     """(n, 2): position's bound since the reference, and the absolute one."""
+    beyond_absolute: NDArray[np.bool_]
+    """Valid, and the transform as measured is farther from the true one than the absolute bound on its position."""
     possible: NDArray[np.bool_]
     """The published covariance alone would allow a protection level within the alert limit."""
     excess: NDArray[np.float64]
@@ -100,6 +102,7 @@ def _columns(number: int, line: dict[str, Any]) -> dict[str, NDArray[Any]]:
         "level_m": values["level_m"],
         "within": _within(line, values["level_m"], values["level_rad"]),
         "both_m": np.array([line["reference_m"], line["absolute_m"]], dtype=float).T,
+        "beyond_absolute": _beyond_absolute(line),
         "possible": np.array(line["floor_m"], dtype=float) <= line["limit_m"],
         "excess": excess,
         "over_limit": over_limit,
@@ -116,6 +119,12 @@ def _within(line: dict[str, Any], level_m: NDArray[Any], level_rad: NDArray[Any]
         turned = level_rad <= line["limit_rad"]
         doubted = turned & (level_m <= line["limit_m"]) & ~np.array(line["valid"], dtype=bool)
         return (level_m[:, None] <= np.array(POSITIONS_M)) & (turned & ~doubted)[:, None]
+
+
+def _beyond_absolute(line: dict[str, Any]) -> NDArray[np.bool_]:
+    error_m, level_m = (np.array(line[key], dtype=float) for key in ("absolute_error_m", "absolute_m"))
+    with np.errstate(invalid="ignore"):
+        return np.array(line["valid"], dtype=bool) & (error_m > level_m)
 
 
 def _freed(view: NDArray[np.intp]) -> list[int]:
@@ -224,6 +233,7 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
             "unbounded_scenes_at_most": upper_bound(_scenes(frames, frames.unbounded & kept), len(own)),
             "worst_excess": float(kept_excess.max()) if len(kept_excess) else None,
         },
+        "beyond_absolute": [int(frames.beyond_absolute.sum()), _scenes(frames, frames.beyond_absolute)],
         "valid_share": float(frames.valid.mean()),
         "asked_share": _share(frames.valid[frames.asked]),
         "within": [_share(frames.within[frames.asked, k]) for k in range(len(POSITIONS_M))],

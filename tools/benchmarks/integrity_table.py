@@ -249,5 +249,6 @@ def about(results: dict[str, Any]) -> list[str]:
         f"seed {plan['seed']}, {plan['scenes']} scenes a condition, {plan['frames']} frames a scene",
         f"alert limits, fixed beforehand: {1e3 * low_m:.3g} to {1e3 * high_m:.3g} mm and {degrees} degrees",
         beyond,
+        "position beyond the absolute bound: {} valid frames in {} scenes".format(*results["total"]["beyond_absolute"]),
         f"{each_s:.1f} s a scene, {seconds / 60.0:.1f} min in all",
     ]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import machine
-from benchmarks.revision import checkout_of
+from benchmarks.revision import checkout_of, commit_of
 from benchmarks.rings import Rings
 
 _SIDE = Path(__file__).parent / "latency_side.py"
@@ -78,10 +78,9 @@ def compared(what: str, before_us: NDArray[np.float64], after_us: NDArray[np.flo
 
 def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
     """The rows, those of the stages last, and what each side was.  ValueError for a revision that git doesn't know."""
-    other = checkout_of(revision)
+    name, roots = commit_of(revision)[:10], (checkout_of(revision), machine.ROOT)
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
         ring = Rings(Path(scratch)).of(plan.size, plan.ring)
-        roots = (other, machine.ROOT)
         timed = _alternating(roots, ring, plan.settle, plan.frames, plan.block, staged=False)
         staged = _alternating(roots, ring, plan.settle, plan.staged, plan.block, staged=True)
     rows = [
@@ -93,7 +92,7 @@ def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
         before, after = (np.array(side["stages_us"].get(stage, [np.nan] * plan.staged)) for side in staged)
         rows.append(compared(f"stage: {stage}", before, after, plan.block))
     seen = [{key: side[key] for key in ("measured", "valid")} for side in timed]
-    return rows, {"before": other.name[:10], "after": machine.commit(), "frames": plan.frames, "seen": seen}
+    return rows, {"before": name, "after": machine.commit(), "frames": plan.frames, "seen": seen}
 
 
 def _of(sides: list[dict[str, Any]], what: str, key: str, block: int) -> Compared:
