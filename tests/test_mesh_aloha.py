@@ -23,7 +23,8 @@ from gripmon.model.camera import BrownConradyLens, Camera, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.track.edges import EdgeSettings, FingertipMeter, MeasurementSettings, Patience
+from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
+from gripmon.track.edges.settings import EdgeSettings
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "mesh_aloha"
 GRIPPER = Path(__file__).parent / "support" / "aloha_from_cad.yaml"
@@ -77,8 +78,8 @@ def error_m(number: int) -> float:
     return float(np.linalg.norm(np.array(record.cam_T_grip.translation_m) - truth(number)[:3, 3]))
 
 
-def test_after_a_knock_of_2_mm_it_is_found_in_the_same_frame_though_half_of_its_edges_never_show():
-    assert np.linalg.norm(difference(truth(JUMP - 1), truth(JUMP))[:3]) == pytest.approx(2e-3, abs=1e-4)
+def test_after_a_knock_it_is_found_in_the_same_frame_though_half_of_its_edges_never_show():
+    assert np.linalg.norm(difference(truth(JUMP - 1), truth(JUMP))[:3]) == pytest.approx(2.5e-3, abs=1e-4)
     for number in range(JUMP, LAST):
         assert watched()[number].source is Origin.UPDATE and error_m(number) < 3e-4
 
