@@ -16,7 +16,7 @@ from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 from gripmon.judge.causes import CauseSettings
 from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
-from gripmon.model.records import Cause
+from gripmon.model.records import Cause, Explanation
 
 
 def zoomed(factor: float) -> PaperLens:
@@ -80,6 +80,22 @@ def test_another_focal_length_is_named(change: float):
     assert cause is Cause.LENS
     assert stated(text) == pytest.approx(100.0 * change, abs=0.05)
     assert "along its axis" in text
+
+
+def test_a_gripper_that_is_not_found_is_not_blamed_on_the_focal_length():
+    """It would be measured at another scale, too; but a blur hides it."""
+    shown = Shown(sharp_gripper())
+
+    def lost(**scene: Any) -> Explanation:
+        judge = shown.judge()
+        for _ in range(FRAMES):
+            judge.add(dataclasses.replace(shown.evidence(**scene), found=False))
+        return judge.explanation(shown.reference)
+
+    zoomed_in = lost(camera=make_camera(zoomed(1.03)))
+    assert zoomed_in.probable.cause is Cause.UNKNOWN and "foc" not in zoomed_in.text
+    assert Cause.LENS not in [weight.cause for weight in zoomed_in.causes]
+    assert lost(blur_px=1.8).probable.cause is Cause.LENS
 
 
 def test_another_focus_is_named_and_a_smear_is_not():

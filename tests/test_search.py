@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import yaml
+from support.grippers import gripper_from_dict
 from support.meters import (
     EVERYWHERE,
     NARROW,
@@ -17,12 +19,14 @@ from support.meters import (
     picture,
     simulated,
 )
-from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
 from gripmon.simulate import make_scenario
 from gripmon.track.edges import Effort, Measurement
-from gripmon.track.edges.search import search_poses
+from gripmon.track.edges.hypotheses import outline_points
+from gripmon.track.edges.reduced import evidence_maps, rectify, window_about
+from gripmon.track.edges.search import _Place, search_poses
 from gripmon.track.edges.settings import SearchSettings
 
 SETTINGS = SearchSettings()
@@ -114,6 +118,37 @@ def test_a_proposed_pose_puts_the_gripper_where_it_is():
         poses = searched(image, moved(true, xi))
         assert 0 < len(poses) <= SETTINGS.starts
         assert min(outline_misses_px(pose, true) for pose in poses[:3]) < 7.0
+
+
+@pytest.mark.parametrize("shift_m", [(0.009, 0.0, 0.0), (0.0, -0.009, 0.0), (0.0, 0.0, 0.009), (0.006, 0.006, -0.008)])
+def test_the_votes_know_that_what_is_nearer_is_shifted_by_more(shift_m: tuple[float, float, float]):
+    """Fingers 40 mm long at 115 mm: a shift and a scale of the image leave up to 3.3 cells."""
+    image, expected = picture(plain_scenario()), nominal_cam_T_grip()
+    camera, gripper, true = make_camera(PAPER_LENS), box_gripper(), expected.copy()
+    expected[:3, 3] -= shift_m
+    points = outline_points(camera, gripper, expected, 0.034, 60.0, 80)
+    place = _Place(expected, points, SETTINGS)
+    window = window_about(camera, place.xy, place.reach_m / place.depth_m, SETTINGS.coarse_columns)
+    voted = place.voted(evidence_maps(*rectify(image, camera, window)), window)
+    misses_px = [outline_misses_px(pose, true) for pose in voted.matrices()[:8]]
+    assert min(misses_px) < 1.5 * window.pitch * camera.fx_px
+
+
+def test_edges_that_never_show_in_place_are_not_asked_for_elsewhere():
+    """Without faces a file doesn't say which of its edges the fingers hide themselves."""
+    model = yaml.safe_load(BOX_FINGERS.read_text())
+    del model["faces"]
+    for edge in model["edges"].values():
+        edge.pop("bevel_m", None)
+    image, true = picture(make_scenario("static"), 0, 3), nominal_cam_T_grip()
+    using = meter(gripper_from_dict(model))
+    here = measure(image, using=using)
+    assert here.trusted and here.consensus.edge_seen.sum() < 0.7 * len(here.consensus.edge_seen)
+    away = moved(true, np.array([0.006, -0.004, 0.003, 0.0, 0.0, 0.03]))
+    assert not measure(image, away, using=using, patience=EVERYWHERE).trusted
+    using.shown = here.consensus.edge_seen.astype(float)
+    again = measure(image, away, using=using, patience=EVERYWHERE)
+    assert again.trusted and again.effort is Effort.SEARCH and is_true(again, true)
 
 
 def test_no_proposed_pose_lies_far_beyond_the_reach():
