@@ -36,7 +36,7 @@ from test_run_on_the_network import PREFIX, configured, refused, running
 from gripmon.cli import main
 from gripmon.io.metrics import LATENCY_BOUNDS_S, MetricsError, MetricsServer, MetricsSettings
 from gripmon.judge.policy import PolicySettings
-from gripmon.model.records import AlertEvent, Severity, State, StateRecord, Verdict
+from gripmon.model.records import AlertEvent, Severity, State, StateRecord, ValidBy, Verdict
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -178,8 +178,10 @@ def test_what_is_not_known_has_no_sample(server: tuple[MetricsServer, int]):
 
 def test_the_bound_and_its_limit_are_gauges(server: tuple[MetricsServer, int]):
     tally, port = server
-    tally.state(msgspec.structs.replace(state_record(), protection_m=3.5e-4, alert_limit_m=1e-3))
+    by = ValidBy.REFERENCE
+    tally.state(msgspec.structs.replace(state_record(), protection_m=3.5e-4, alert_limit_m=1e-3, valid_by=by))
     found = scraped(port)
+    assert found["gripmon_valid_by"] == {(("valid_by", "reference"),): 1.0, (("valid_by", "absolute"),): 0.0}
     assert (only(found, "gripmon_protection_meters"), only(found, "gripmon_alert_limit_meters")) == (3.5e-4, 1e-3)
 
 

@@ -11,7 +11,7 @@ from support.playback_runs import lines, records_of_a_run, table_of
 from support.recorded import record
 
 from gripmon.model.geometry import from_record
-from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
+from gripmon.model.records import FrameRecord, Origin, State, ValidBy, Verdict, to_json
 from gripmon.record.read import open_recordings
 from gripmon.record.table import FrameTable, TableBuilder, pose_matrices
 
@@ -40,6 +40,15 @@ def test_every_number_stands_in_its_column(records: list[FrameRecord], table: Fr
         if r.protection is not None:
             bounds = table.protection_m[i], table.protection_rad[i], table.integrity_risk[i]
             assert bounds == (r.protection.position_m, r.protection.rotation_rad, r.protection.risk)
+        assert FrameTable.VALID_BY[table.valid_by[i]] == r.valid_by
+        if r.since_reference is not None:
+            since = r.since_reference
+            assert (table.since_reference_m[i], table.since_reference_rad[i]) == (since.position_m, since.rotation_rad)
+            assert (FrameTable.SINCE[table.since[i]], table.since_ns[i]) == (since.since, since.since_ns)
+        if r.absolute is not None:
+            bound = r.absolute
+            assert (table.absolute_m[i], table.absolute_rad[i]) == (bound.position_m, bound.rotation_rad)
+            assert tuple(table.absolute[i]) == (*bound.translation_m, *bound.rotation_xyzw)
         if r.drift is not None:
             assert table.d_m[i] == r.drift.translation_m and table.delta_rad[i] == r.drift.rotation_rad
             assert tuple(table.tcp_shift_m[i]) == r.drift.tcp_shift_m
@@ -65,6 +74,16 @@ def test_null_is_not_a_number(records: list[FrameRecord], table: FrameTable):
     ):
         null = [getattr(r, name) is None for r in records]
         assert any(null) and np.array_equal(np.isnan(column), null), name
+
+
+def test_a_record_of_schema_1_is_absolute():
+    made = record(0)
+    old = msgspec.structs.replace(made, valid_by=ValidBy.ABSOLUTE, since_reference=None, absolute=None)
+    table = table_of([old])
+    assert FrameTable.VALID_BY[table.valid_by[0]] == "absolute" and (table.since[0], table.since_ns[0]) == (-1, -1)
+    assert table.absolute_m[0] == table.protection_m[0] and np.array_equal(table.absolute, table.cam_T_grip)
+    unbounded = msgspec.structs.replace(old, valid_by=ValidBy.REFERENCE)
+    assert np.isnan(table_of([unbounded]).absolute_m[0]) and np.isnan(table_of([unbounded]).absolute[0]).all()
 
 
 def test_a_suspect_frame_was_measured_and_a_held_one_was_not():

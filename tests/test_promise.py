@@ -208,3 +208,40 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
     )
     lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert {line["verdict"] for line in lines} <= {"suspect", "unknown"} and all(line["reason"] for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("position_sigma_m", "policy", "said"),
+    [
+        (None, "{}", "reference.position_sigma_m isn't stated, 1 mm are assumed, but transforms are valid by"),
+        (
+            "0.002",
+            "{}",
+            "alert_limit_m is 0.001, below the reference's own standard deviation of 0.002 m; at least that",
+        ),
+        ("0.002", "{valid_by: reference}", None),
+        (None, "{valid_by: reference}", None),
+        ("0.0002", "{}", None),
+    ],
+)
+def test_an_absolute_bound_says_in_a_line_if_the_reference_is_not_known_well_enough(
+    tmp_path: Path, position_sigma_m: str | None, policy: str, said: str | None
+):
+    text = DEMO.read_text().replace("gripper: grippers/", f"gripper: {DEMO.parent}/grippers/")
+    sigma = r"\n  position_sigma_m: .*\n  rotation_sigma_rad: .*"
+    stated = "" if position_sigma_m is None else f"\n  position_sigma_m: {position_sigma_m}"
+    text, count = re.subn(sigma, stated, text)
+    assert count == 1
+    path = tmp_path / "config.yaml"
+    path.write_text(text.replace("\nmonitor:\n", f"\nmonitor:\n  policy: {policy}\n"))
+    line = limits_warning(load_config(path))
+    assert line is None if said is None else (said in (line or "") and "valid_by: reference" in (line or ""))
+
+
+def test_a_rate_of_zero_is_refused_with_what_would_be_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    text = DEMO.read_text().replace("gripper: grippers/", f"gripper: {DEMO.parent}/grippers/")
+    path = tmp_path / "config.yaml"
+    path.write_text(text.replace("\nmonitor:\n", "\nmonitor:\n  policy: {mount_jumps_per_month: 0}\n"))
+    assert main(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "monitor.policy.mount_jumps_per_month: is 0; 0.001 to 100000" in line

@@ -51,21 +51,26 @@ def test_there_is_one_of_each():
     assert {name: type(message) for name, message in ONE_OF_EACH.items()} == MESSAGES
 
 
+VERSIONS = {"transform": 2}
+"""Major versions of messages; of the others 1."""
+
+
 @pytest.mark.parametrize("name", MESSAGES)
 def test_every_message_says_its_schema_and_comes_back(name: str):
     payload = to_json(ONE_OF_EACH[name])
-    assert payload.startswith(b'{"schema":"gripmon.%s/1",' % name.encode())
+    assert payload.startswith(b'{"schema":"gripmon.%s/%d",' % (name.encode(), VERSIONS.get(name, 1)))
     assert from_json(payload, MESSAGES[name]) == ONE_OF_EACH[name]
 
 
 @pytest.mark.parametrize("name", MESSAGES)
 def test_another_major_version_is_refused_whatever_it_looks_like(name: str):
     for content in ({}, json.loads(to_json(ONE_OF_EACH[name])), {"all": "different"}):
-        payload = json.dumps({**content, "schema": f"gripmon.{name}/2"}).encode()
+        known = VERSIONS.get(name, 1)
+        payload = json.dumps({**content, "schema": f"gripmon.{name}/{known + 1}"}).encode()
         with pytest.raises(MessageRefused) as caught:
             from_json(payload, MESSAGES[name])
         assert str(caught.value) == (
-            f"its schema is 'gripmon.{name}/2', and this version of gripmon reads 'gripmon.{name}/1'; "
+            f"its schema is 'gripmon.{name}/{known + 1}', and this version of gripmon reads 'gripmon.{name}/{known}'; "
             "update the older one"
         )
 

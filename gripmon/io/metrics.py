@@ -233,12 +233,13 @@ def _of_state(state: StateRecord) -> Iterator[_Family]:
         ("gripmon_reference_revision", "Revision of the reference in force", state.revision),
         ("gripmon_state_timestamp_seconds", "Time of the last state message, Unix time", 1e-9 * state.stamp_ns),
         ("gripmon_sigma_meters", "Largest standard deviation of the TCP along a camera axis", state.sigma_m),
+        ("gripmon_protection_meters", "Bound on the TCP's position error", state.protection_m),
         ("gripmon_alert_limit_meters", "Position error of the TCP that the task tolerates", state.alert_limit_m),
     ):
         yield _Family("gauge", name, text, {} if value is None else {(): value})
-    text = "Bound on the TCP's position error; reference: of the motion since the reference"
-    bound = {} if state.protection_m is None else {(str(state.valid_by or ValidBy.ABSOLUTE),): state.protection_m}
-    yield _Family("gauge", "gripmon_protection_meters", text, bound, ("valid_by",))
+    text = "1 for the error that protection bounds: absolute, or reference, of the motion since the reference"
+    by = {} if state.valid_by is None else {(each.value,): float(each is state.valid_by) for each in ValidBy}
+    yield _Family("gauge", "gripmon_valid_by", text, by, ("valid_by",))
     shift = {(axis,): value for axis, value in zip("xyz", state.tcp_shift_m or (), strict=False)}
     text = "Displacement of the TCP from the reference, along the camera's axes"
     yield _Family("gauge", "gripmon_tcp_shift_meters", text, shift, ("axis",))

@@ -16,6 +16,7 @@ from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, to_record
 from gripmon.model.records import (
+    Absolute,
     Alert,
     CornerFault,
     CornerRecord,
@@ -27,7 +28,10 @@ from gripmon.model.records import (
     Protection,
     RecordedConfiguration,
     ReferenceRecord,
+    Since,
+    SinceReference,
     State,
+    ValidBy,
     Verdict,
 )
 from gripmon.record.recorder import RecordingSettings
@@ -125,6 +129,9 @@ def record(
         alerts=alerts,
         latency_ns=int(rng.integers(100_000, 200_000)),
         protection=Protection(rng.uniform(), rng.uniform(), 1e-5, "nothing is wrong"),
+        valid_by=ValidBy.REFERENCE,
+        since_reference=SinceReference(rng.uniform(), rng.uniform(), Since.FIRST_PROVED, START_NS + i),
+        absolute=Absolute(rng.uniform(), rng.uniform(), *msgspec.structs.astuple(to_record(cam_T_grip))),
     )
     return msgspec.structs.replace(made, **changes)
 

@@ -101,7 +101,8 @@ def records(shifts_m: np.ndarray, seed: int = 0, start_ns: int = START_NS) -> li
         made = msgspec.structs.replace(shown[i % _DIFFERENT], seq=i, cam_T_grip=to_record(cam_T_grip), drift=drift)
         if np.isnan(shift_m).any():
             made = msgspec.structs.replace(
-                made, cam_T_grip=None, covariance=None, drift=None, protection=None, verdict=Verdict.UNKNOWN,
+                made, cam_T_grip=None, covariance=None, drift=None, protection=None, since_reference=None,
+                absolute=None, verdict=Verdict.UNKNOWN,
                 state=State.LOST, source=Origin.HELD, reason="nothing is seen",
             )  # fmt: skip
         out.append(msgspec.structs.replace(made, stamp_ns=start_ns + i * PERIOD_NS, latency_ns=2_000_000 + 1000 * i))
