@@ -9,6 +9,7 @@ import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.monitor.refits import CONFIRMING_FRAMES, Anchor, Lasting, ModelError
+from gripmon.monitor.since import Opened
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -36,6 +37,7 @@ class Frame:
     covariance: np.ndarray
     longer: float = 0.0
     model: ModelError = NOTHING_COMMON
+    opened = Opened(0.03, np.zeros(6))
 
     @property
     def cam_T_grip(self) -> np.ndarray:
@@ -83,7 +85,7 @@ def averaged(frames: list[Frame], creep: np.ndarray = STILL) -> Anchor:
 
 
 def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray = STILL) -> float:
-    return anchor.doubts(frame.cam_T_grip, frame, ROWS, wander).levels(risk)[0]
+    return anchor.doubts(frame.cam_T_grip, frame, ROWS, wander).absolute.levels(risk)[0]
 
 
 def error_m(frame: Frame, truth: np.ndarray = STILL) -> float:

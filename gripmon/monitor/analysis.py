@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.judge.causes import CauseJudge, Watches
-from gripmon.judge.drift import Baseline, Lasting, MotionWatch
+from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.judge.policy import Evidence
 from gripmon.judge.stream import CALM_FRAMES, StreamFault, StreamWatch
 from gripmon.model.camera import Camera
@@ -181,7 +181,7 @@ class FrameAnalysis:
         error: Array | None,
     ):
         """``configured``: the reference of the configuration; ``error`` (6,): its error, if known."""
-        self._gripper, self._tracker = gripper, tracker
+        self._gripper, self._tracker, self._valid_by = gripper, tracker, settings.policy.valid_by
         self._reach_px = settings.corners.sampling.reach_px
         self.stream = StreamWatch(settings.stream)
         self.watch = MotionWatch(settings.drift)
@@ -246,10 +246,7 @@ class FrameAnalysis:
         if 0 < self._astray < DOUBTED_FRAMES or not standing.believed:
             motion = self.watch.skip()
         else:
-            since_start, changes, bias, finer = self._since_start(shift, covariance), covariance, None, standing.finer
-            if finer is not None:
-                changes, bias = finer.of_change, Lasting(finer.of_bias, finer.renewed)
-            motion = self.watch.add(since_start, changes, now_s, bias)
+            motion = self.watch.add(self._since_start(shift, covariance), covariance, now_s)
         if motion.stepped:
             self.causes.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
@@ -269,7 +266,7 @@ class FrameAnalysis:
             self.explain(frame, measurement, wrong, standing.believed, now_s),
             astray,
             doubtful,
-            standing.protection,
+            standing.bounds.by(self._valid_by),
             standing.where_it_was,
             swing,
             standing.believed,

@@ -29,9 +29,11 @@ from gripmon.model.records import (
     Refusal,
     Severity,
     Smoothed,
+    ValidBy,
 )
 from gripmon.model.records.notes import SixNumbers
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import AtReferences, Named
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import USUAL_SHARE
 from gripmon.track.edges import Measurement
@@ -52,12 +54,15 @@ def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     return Drift(*motion_between(ref_cam_T_grip, cam_T_grip), (x, y, z))
 
 
-def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:
-    """The average, its covariance increased by ``more`` (6, 6); None before the first measurement."""
+def smoothed_record(average: PoseAverage, more: Array, since: AtReferences) -> Smoothed | None:
+    """The average, its covariance increased by ``more`` (6, 6), as ``since`` has it published; None before the first
+    measurement.
+    """
     if average.cam_T_grip is None:
         return None
-    transform = to_record(average.cam_T_grip)
-    return Smoothed(transform.translation_m, transform.rotation_xyzw, flat(average.claimed_covariance + more))
+    cam_T_grip, covariance = since.quantity(average.cam_T_grip, average.claimed_covariance + more)
+    transform = to_record(cam_T_grip)
+    return Smoothed(transform.translation_m, transform.rotation_xyzw, flat(covariance))
 
 
 def corner_records(
@@ -81,34 +86,39 @@ def measured_record(
     reference: ReferenceRecord,
     judgement: Judgement,
     standing: Standing,
+    named: Named,
     corners: tuple[CornerRecord, ...],
     origin: Origin,
     smoothed: Smoothed | None,
     drift: Drift,
     alerts: tuple[Alert, ...],
     has_jaw: bool,
+    valid_by: ValidBy,
 ) -> FrameRecord:
     """The record of a frame with a measured pose."""
-    measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
+    measurement = standing.measurement
     return FrameRecord(
         seq=frame.seq,
         stamp_ns=frame.stamp_ns,
         verdict=judgement.verdict,
         state=judgement.state,
         source=origin,
-        cam_T_grip=to_record(cam_T_grip),
-        covariance=flat(standing.covariance),
+        cam_T_grip=to_record(named.cam_T_grip),
+        covariance=flat(named.covariance),
         smoothed=smoothed,
         drift=drift,
         reference_id=reference.reference_id,
         revision=reference.revision,
-        rms_px=measurement.corner_rms_px(cam_T_grip),
+        rms_px=measurement.corner_rms_px(standing.cam_T_grip),
         jaw_opening_m=measurement.jaw_opening_m if has_jaw else None,
         corners=corners,
         alerts=alerts,
         reason=judgement.reason,
         name=frame.name,
-        protection=standing.protection,
+        protection=named.protection,
+        valid_by=valid_by,
+        since_reference=named.since_reference,
+        absolute=named.absolute,
     )
 
 

@@ -140,6 +140,7 @@ class Monitor:
     def state_revision(self) -> int:
         """Grows with each change of :meth:`state`, except of the last transform and the look."""
         known = int(self._analysis.of_configured.error is not None) + int(self._trust.question is not None)
+        known += self._trust.since.changes
         return self._renewal.book.changes + self._policy.alerts.changes + known
 
     def state(self) -> MonitorState:
@@ -156,6 +157,7 @@ class Monitor:
             unexplained=msgspec.UNSET if question is None else tuple(question.away.tolist()),
             explained_from=msgspec.UNSET if answered is None else answered,
             look=self._trust.look_state(self.reference),
+            at_reference=self._trust.since.state() or msgspec.UNSET,
         )
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -163,7 +165,6 @@ class Monitor:
         isn't used afterwards.
         """
         self.learn()
-        self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         opening: object = frame.jaw_opening_m
@@ -188,7 +189,9 @@ class Monitor:
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         # Whether that is still the reference, and what has moved if it isn't.
-        drift = drift_between(self._ref_cam_T_grip, self._cam_T_grip)
+        since = self._trust.since
+        named = since.named(self._cam_T_grip, self._covariance, standing.bounds)
+        drift = drift_between(self._ref_cam_T_grip, named.cam_T_grip)
         swing, doubtful = self._trust.swing, bool(faults)
         evidence = self._analysis.evidence(frame, standing, drift, before_T, swing, doubtful, self._now_s)
         self._jumped = self._jumped or evidence.jumped
@@ -201,18 +204,34 @@ class Monitor:
         # Past the limit, or when an operator wants it, the still frames become a new reference.
         origin = Origin.UPDATE
         if self._renewal.collect(frame, standing, judgement):
-            before, cause = self.reference, evidence.explanation
+            book, cause = self._renewal.book, evidence.explanation
+            before, proposed = book.current, book.proposal
             alerts += self._renewal.recalibrate(
                 drift, self._cam_T_grip, cause, self._trust.unexplained, self._now_s, frame.stamp_ns
             )
-            if self.reference is not before:
+            if book.proposal is not None and book.proposal is not proposed:
+                self._trust.measured_again(book.proposal)
+            if book.current is not before:
+                self._trust.measured_again(book.current)
                 self._begin()
-                drift, origin = drift_between(self._ref_cam_T_grip, self._cam_T_grip), Origin.RECALIBRATION
-        smoothed, alerts = smoothed_record(self._average, self._tracker.floor), (*self._take_due(), *alerts)
+                named = since.named(self._cam_T_grip, self._covariance, standing.bounds)
+                drift, origin = drift_between(self._ref_cam_T_grip, named.cam_T_grip), Origin.RECALIBRATION
+        smoothed, alerts = smoothed_record(self._average, self._tracker.floor, since), (*self._take_due(), *alerts)
         taken = self._tracker.taken(standing.measurement)
         corners = corner_records(standing.measurement, self._gripper.corner_ids, taken)
         return measured_record(
-            frame, self.reference, judgement, standing, corners, origin, smoothed, drift, alerts, self._gripper.has_jaw
+            frame,
+            self.reference,
+            judgement,
+            standing,
+            named,
+            corners,
+            origin,
+            smoothed,
+            drift,
+            alerts,
+            self._gripper.has_jaw,
+            self._settings.policy.valid_by,
         )
 
     def _after_restart(self, judgement: Judgement, evidence: Evidence) -> Judgement:
@@ -226,7 +245,8 @@ class Monitor:
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The measured pose is believed: update the averages and what is learnt."""
-        self._tracker.learn(standing.measurement, opening=not standing.grasped)
+        proven = standing.where_it_was and not standing.unproven
+        self._tracker.learn(standing.measurement, opening=not standing.grasped, proven=proven)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()
@@ -284,7 +304,9 @@ class Monitor:
         if self.reference is not before:
             self._begin()
         wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
-        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # 150 kB that only a restart needs
+        state = self.state() if wanted else None
+        if state is not None:  # without the 150 kB that only a restart needs
+            state = msgspec.structs.replace(state, look=None, at_reference=msgspec.UNSET)
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _begin(self) -> None:
@@ -315,19 +337,24 @@ class Monitor:
             state=judgement.state,
             corners=unmeasured_corners(self._gripper.corner_ids, fault),
             alerts=(*self._take_due(), *judgement.alerts),
+            valid_by=self._settings.policy.valid_by,
         )
         if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
             return blank
         unseen_s = self._now_s - self._measured_s
         growth = np.diag(self._policy.hold_variance(unseen_s))
-        standing, hidden = self._standing, refusal is None
+        assert self._standing is not None
+        since, both = self._trust.since, self._trust.held(self._standing, growth, unseen_s, refusal is None)
+        named = since.named(self._cam_T_grip, self._covariance + growth, both)
         return msgspec.structs.replace(
             blank,
-            cam_T_grip=to_record(self._cam_T_grip),
-            covariance=flat(self._covariance + growth),
-            smoothed=smoothed_record(self._average, self._tracker.floor + growth),
-            drift=drift_between(self._ref_cam_T_grip, self._cam_T_grip),
-            protection=None if standing is None else self._trust.held(standing, growth, unseen_s, hidden),
+            cam_T_grip=to_record(named.cam_T_grip),
+            covariance=flat(named.covariance),
+            smoothed=smoothed_record(self._average, self._tracker.floor + growth, since),
+            drift=drift_between(self._ref_cam_T_grip, named.cam_T_grip),
+            protection=named.protection,
+            since_reference=named.since_reference,
+            absolute=named.absolute,
         )
 
     def _take_due(self) -> list[Alert]:

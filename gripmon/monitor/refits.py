@@ -8,7 +8,7 @@ in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
+from gripmon.model.geometry import log_rotation
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
+from gripmon.monitor.since import AtReference, Bounds, Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, follow, telling, with_and_without
 
@@ -92,10 +94,35 @@ class CommonError(NamedTuple):
         lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
         return replace(doubts, away=doubts.away + lengths[:, None])
 
+    def of_motion(self, motion: Array, at_T: Array) -> Array:
+        """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T
+        (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
+        """
+        rows = np.vstack([self.taught, self.offset])
+        share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
+        moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
+        return np.diag(share * np.repeat([moved, turned], 3))
+
+
+@dataclass(frozen=True, slots=True)
+class TwoDoubts:
+    """What may be wrong with a measured pose, and with the motion since the reference that it shows."""
+
+    absolute: Doubts
+    since: Doubts
+
+    def among(self, chosen: NDArray[np.bool_]) -> TwoDoubts:
+        """Those that are ``chosen`` (h,)."""
+        return TwoDoubts(self.absolute.among(chosen), self.since.among(chosen))
+
+    def __add__(self, other: TwoDoubts) -> TwoDoubts:
+        return TwoDoubts(self.absolute + other.absolute, self.since + other.since)
+
 
 class ModelError(NamedTuple):
     """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
     (3,); ``finger`` (e,): which of the ``fingers`` each edge belongs to; ``common``: None where there is no such error.
+    ``first``: what was measured at the reference, None until a frame proves a pose, and the reference (4, 4).
     """
 
     sigma_m: float
@@ -103,12 +130,38 @@ class ModelError(NamedTuple):
     finger: NDArray[np.intp]
     fingers: int
     common: CommonError | None
+    first: tuple[AtReference | None, Array] = (None, np.eye(4))
 
-    def doubts(self, name: tuple[str, ...], prior: Array, fits: Separation, cam_T_grip: Array) -> Doubts:
-        """The doubts about a pose (4, 4) under the hypotheses of these fits, with what is common to all of them."""
-        if self.common is None:
-            return Doubts.of(name, prior, fits, SIGMA_INFLATION)
-        return self.common.reaching(Doubts.of(name, prior, self.common.on(fits, cam_T_grip), SIGMA_INFLATION))
+    def doubts(
+        self,
+        name: tuple[str, ...],
+        prior: Array,
+        fits: Separation,
+        cam_T_grip: Array,
+        opened: Opened,
+        lasting: NDArray[np.intp] | None = None,
+    ) -> TwoDoubts:
+        """The doubts about a pose (4, 4) under the hypotheses of these fits, with what is common to all of them.
+
+        ``lasting`` (h,): which of the lasting hypotheses each is, that held in the reference's frames, too; 0 for none.
+        """
+        common, (first, reference_T) = self.common, self.first
+        if common is None:
+            absolute = Doubts.of(name, prior, fits, SIGMA_INFLATION)
+        else:
+            absolute = common.reaching(Doubts.of(name, prior, common.on(fits, cam_T_grip), SIGMA_INFLATION))
+        if first is None:
+            # This frame is the first one: as uncertain again.
+            since = fits._replace(covariance=2.0 * fits.covariance, of_model=np.zeros_like(fits.of_model))
+        else:
+            held = np.zeros(len(prior), dtype=np.intp) if lasting is None else lasting
+            since = first.of_motion(fits, cam_T_grip, reference_T, held, opened, common)
+        return TwoDoubts(absolute, Doubts.of(name, prior, since, SIGMA_INFLATION))
+
+
+def bounds_of(doubts: TwoDoubts, risk: float) -> Bounds:
+    """The protection levels of both at an integrity ``risk``."""
+    return Bounds(protection_of(doubts.absolute, risk), protection_of(doubts.since, risk))
 
 
 def protection_of(doubts: Doubts, risk: float) -> Protection:
@@ -156,6 +209,9 @@ class Refits:
         """(h, 6, 6) of the fits by the frame alone, without the model's error."""
         self.of_model = self._free.of_model
         """(h, f, 6) their errors if a finger is longer by its standard deviation."""
+        jaw = measurement.covariance
+        rate = jaw[:6, 6] / jaw[6, 6] if m == 7 and jaw[6, 6] > 0.0 else np.zeros(6)
+        self.opened = Opened(measurement.jaw_opening_m, rate)
 
     @property
     def edges(self) -> NDArray[np.intp]:
@@ -166,14 +222,35 @@ class Refits:
         """(h, 6) perturbations from a pose (4, 4) near by to the fits by the frame alone."""
         return perturbation_between(base_T, self._fit_T) + self._free.shift
 
-    def doubts(self, cam_T_grip: Array, prior: Array, anchored: Anchored | None = None) -> Doubts:
+    def doubts(
+        self,
+        cam_T_grip: Array,
+        prior: Array,
+        anchored: Anchored | None = None,
+        lasting: NDArray[np.intp] | None = None,
+    ) -> TwoDoubts:
         """What may be wrong with a published pose (4, 4) under hypotheses of probability ``prior`` (h,), by the frame
-        alone or by the anchor too.
+        alone or by the anchor too; ``lasting`` (h,) as for :meth:`ModelError.doubts`.
         """
         fits = self._free if anchored is None else anchored.fits
         away = fits.shift - perturbation_between(self._fit_T, cam_T_grip)
         fits = Separation(away, fits.covariance + self._floor, fits.of_model)
-        return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip)
+        return self.model.doubts(self.hypotheses.name, prior, fits, cam_T_grip, self.opened, lasting)
+
+    def with_first(
+        self, doubts: TwoDoubts, lasting: Lasting, cam_T_grip: Array, anchored: Anchored | None
+    ) -> TwoDoubts:
+        """The doubts with those about the motion since the reference that a lasting hypothesis held in the reference's
+        frames, and no longer does.  ``anchored``: None where the pose (4, 4) rests on the frame alone.
+        """
+        first, reference_T = self.model.first
+        if first is None:
+            return doubts
+        fits = self._free if anchored is None else anchored.fits
+        now = Separation(fits.shift[:1], fits.covariance[:1] + self._floor, fits.of_model[:1])
+        wrong = first.wrong_at_first(now, cam_T_grip, reference_T)
+        name = tuple(f"{each}, in the frames of the reference" for each in lasting.name[1:])
+        return replace(doubts, since=doubts.since + Doubts.of(name, lasting.prior[1:], wrong, SIGMA_INFLATION))
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
@@ -213,6 +290,13 @@ class Lasting(NamedTuple):
         doubted = _doubted(every, np.arange(every.keep.shape[1]))
         return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
 
+    def numbers(self, rows: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+        """(count,) which lasting hypothesis each one about the seen edges is, from their :meth:`rows`; 0 for others."""
+        out = np.zeros(count, dtype=np.intp)
+        out[rows[rows != NO_FIT]] = np.flatnonzero(rows != NO_FIT)
+        out[0] = 0  # those that leave no seen edge are this one, too
+        return out
+
     def rows(self, hypotheses: Hypotheses, edges: NDArray[np.intp]) -> NDArray[np.intp]:
         """(g,) which of the ``hypotheses`` about the seen ``edges`` (v,) each lasting one is; -1 where it leaves no
         seen edge.
@@ -236,7 +320,7 @@ class Anchor:
         self, lasting: Lasting, base_T: Array, fits: Refits, rows: NDArray[np.intp], now_s: float, knocked: bool = False
     ):
         """``knocked``: the first pose differs from the one expected before."""
-        self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
+        self._lasting, self._base_T, self.now_s, self.frames = lasting, base_T, now_s, 1
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
@@ -254,6 +338,7 @@ class Anchor:
         since the last one.
         """
         self.now_s = now_s
+        self.frames += 1
         self._to_confirm -= 1
         frame = _chosen(fits, rows, self._base_T)
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
@@ -281,7 +366,12 @@ class Anchor:
         self.covariance: Array = self._claimed[0]
         self.of_model: Array = self._filters.of_model[0]
 
-    def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
+    def fits(self) -> Separation:
+        """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
+        shift = self._filters.shift - perturbation_between(self._base_T, self.cam_T_grip)
+        return Separation(shift, self._claimed, self._filters.of_model)
+
+    def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> TwoDoubts:
         """The lasting hypotheses about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of them; ``wander`` (6,):
         variance of the motion since the anchor.
 
@@ -291,7 +381,8 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
-        return fits.model.doubts(self._lasting.name, self._lasting.prior, told, cam_T_grip)
+        every = np.arange(len(self._lasting.name))
+        return fits.model.doubts(self._lasting.name, self._lasting.prior, told, cam_T_grip, fits.opened, every)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

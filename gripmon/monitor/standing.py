@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from gripmon.model.records import Array, Protection, ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.monitor.refits import Anchored, Refits
+from gripmon.monitor.since import Bounds
 from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.look import Fused
 
 
 @dataclass(frozen=True, slots=True)
 class Trust:
     """How far one measurement can be trusted.
 
-    ``protection``: of the pose in question.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
+    ``bounds``: of the pose in question.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
     ``displaced``: the pose is not where the anchor has it.  ``ambiguous``: something other than a knock of the mount
     may explain that; ``grasped``: an object between the fingers may.  ``may_have_slid``: a lone finger may have moved
     along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
@@ -23,7 +23,7 @@ class Trust:
     the ends where they aren't needed; None where no edge is seen.
     """
 
-    protection: Protection
+    bounds: Bounds
     proven: bool
     displaced: bool = False
     ambiguous: bool = False
@@ -46,25 +46,23 @@ class Trust:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
+    """What is known by a ``measurement``: the measured pose (4, 4), its covariance (6, 6) and ``bounds``.
 
     ``believed``: averages, the drift test and learning use the pose.
     ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
     edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
-    nothing in the frame proves the pose, though an earlier frame proved one.  ``finer``: the fusion of edges and look
-    behind the pose; None: it is from the edges alone.
+    nothing in the frame proves the pose, though an earlier frame proved one.
     """
 
     measurement: Measurement
     cam_T_grip: Array
     covariance: Array
-    protection: Protection
+    bounds: Bounds
     believed: bool
     where_it_was: bool
     grasped: bool = False
     knocked: bool = False
     unproven: bool = False
-    finer: Fused | None = None
 
 
 class Question(NamedTuple):

@@ -17,10 +17,10 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
-from gripmon.monitor.finer import FinerLook
-from gripmon.monitor.refits import reaching
+from gripmon.model.records import Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, reaching
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
@@ -55,18 +55,20 @@ class Integrity:
         reference: ReferenceRecord,
     ):
         self._tracker, self._policy = tracker, settings.policy
-        self._weigher = Weigher(tracker, gripper, settings, reference)
+        measured_as = tracker.taught_digest, settings.corners, settings.measurement, settings.jaw_sigma_m
+        self.since = AtReferences(reference, settings.policy.valid_by, measured_as)
+        """What was measured at the reference in force."""
+        self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
         # Fingers without a direction of their own are slid out of the gripper.
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
-        self._finer = None
-        if settings.look.enabled:
-            self._finer = FinerLook(camera, gripper, self._look, tracker.floor, reference, tracker.taught_digest)
-        self._finer_swing: Array | None = None
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
+        self.since_refused: str | None = None
+        """Why what a state has about the reference's frames isn't used; None where it is, or there is nothing."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
+        self._jaw_opening_m = 0.0  # in the newest frame that proved a pose
         self._frames = 0
         self._elsewhere = 0
         self._slid_until_s = -math.inf
@@ -78,8 +80,7 @@ class Integrity:
         record = self._look.state(reference.reference_id)
         if record is None:
             return None
-        strips, finer = self._strips.state(), None if self._finer is None else self._finer.state()
-        return msgspec.structs.replace(record, strips=strips or msgspec.UNSET, finer=finer or msgspec.UNSET)
+        return msgspec.structs.replace(record, strips=self._strips.state() or msgspec.UNSET)
 
     @property
     def unexplained(self) -> Array | None:
@@ -95,13 +96,17 @@ class Integrity:
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the vibration between proven poses, m² and rad²; of refined poses if the newest is one."""
-        return self._weigher.swing if self._finer_swing is None else self._finer_swing
+        """(6,) variance of the vibration between proven poses, m² and rad²."""
+        return self._weigher.swing
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """Pass the reference in force to the look."""
-        if self._finer is not None:
-            self._finer.refer(reference)
+        """Begin the motion since the reference in force."""
+        self.since.refer(reference)
+
+    def measured_again(self, reference: ReferenceRecord) -> None:
+        """A new reference, in force or proposed, was measured from the newest frames."""
+        if self._weigher.anchor is not None:
+            self.since.measured(reference, self._weigher.anchor, self._jaw_opening_m)
 
     def rebase(self, reference: ReferenceRecord) -> None:
         """Expect the gripper at a new reference."""
@@ -120,10 +125,10 @@ class Integrity:
                 self._look.restore(state.look, reference.reference_id)
                 if state.look.strips is not msgspec.UNSET:
                     self._strips.restore(state.look.strips)
-                if self._finer is not None and state.look.finer is not msgspec.UNSET:
-                    self._finer.restore(state.look.finer)
             except LookRefused as refused:
                 self.look_refused = str(refused)
+        if state is not None and state.at_reference is not msgspec.UNSET:
+            self.since_refused = self._weigher.restore(state.at_reference)
 
     def learn(self) -> None:
         """Learn the look from the newest frame that proved the pose, once."""
@@ -131,12 +136,6 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
-        if self._finer is not None:
-            self._finer.learn()
-
-    def take_alerts(self) -> list[Alert]:
-        """Alerts about the gripper's look since the last call."""
-        return [] if self._finer is None else self._finer.take_alerts()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
@@ -149,11 +148,11 @@ class Integrity:
         anchor = self._weigher.anchor
         return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
 
-    def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The bounds of a pose published ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
+    def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
+        """The bounds of a pose measured ``unseen_s`` ago, with the covariance (6, 6) of the possible motion since;
         ``hidden``: the image is good, but the gripper isn't seen.
         """
-        return self._weigher.held(standing.protection, growth, unseen_s, hidden)
+        return self._weigher.held(standing.bounds, growth, unseen_s, hidden)
 
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
         """What to publish of a measurement, and how far it is trusted; None where the gripper isn't seen."""
@@ -163,17 +162,15 @@ class Integrity:
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
-        if self._finer is not None and standing is not None:
-            standing = self._refined(self._finer, frame, standing, now_s)
+        if standing is not None and self.since.current is None:
+            why = "the gripper is elsewhere, since no frame has proved yet where it is"
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, self._policy.integrity_risk, why)
+            standing = replace(standing, bounds=standing.bounds._replace(since_reference=unbounded))
         return standing
 
-    def _refined(self, look: FinerLook, frame: Frame, standing: Standing, now_s: float) -> Standing:
-        """The pose refined by the look, unless that puts a protection level past its alert limit."""
-        finer = look.refine(frame, standing, now_s, self._weigher.swing)
-        if past_alert_limit(finer.protection, self._policy) and not past_alert_limit(standing.protection, self._policy):
-            finer = standing
-        self._finer_swing = None if finer.finer is None else look.swing
-        return finer
+    def _past_limit(self, both: Bounds) -> bool:
+        """Whether the bound that makes a transform valid is past an alert limit."""
+        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is not None
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
         weigh = self._weigher.weigh
@@ -182,7 +179,7 @@ class Integrity:
         trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
         self._frames += 1
-        if due or past_alert_limit(trust.protection, self._policy) or trust.displaced or self._weigher.anchor is None:
+        if due or self._past_limit(trust.bounds) or trust.displaced or self._weigher.anchor is None:
             ends = self._tracker.ends(frame, measurement)
             trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
             self._ends_seen = trust.proven
@@ -247,7 +244,7 @@ class Integrity:
         if there is None:
             return None
         standing = self._conclude(frame, there, now_s)
-        return None if past_alert_limit(standing.protection, self._policy) else standing
+        return None if self._past_limit(standing.bounds) else standing
 
     def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
         """The measurement at the expected place, if the gripper may still be there: marks on the fingers and borders
@@ -277,7 +274,7 @@ class Integrity:
         """What to publish of a place, and whether it becomes the anchor."""
         measurement, cam_T_grip, covariance, along, trust = candidate
         left_open = trust.most_probable is not None and not trust.proven
-        if left_open and (trust.displaced or past_alert_limit(trust.protection, self._policy)):
+        if left_open and (trust.displaced or self._past_limit(trust.bounds)):
             return self._by_anchor(frame, candidate, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
@@ -287,13 +284,16 @@ class Integrity:
         unproven = self._weigher.anchor is not None and not settles
         if settles:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
+            assert self._weigher.anchor is not None
+            self._jaw_opening_m = measurement.jaw_opening_m
+            self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
             if knocked:
                 self._slid_until_s = -math.inf
             if frame.image is not None and not (moved or trust.may_have_slid):
                 # A copy: learning can wait, and the caller may read the next image into the same memory.
                 self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        at = measurement, cam_T_grip, covariance, trust.protection
+        at = measurement, cam_T_grip, covariance, trust.bounds
         standing = Standing(*at, believed, where_it_was, trust.grasped, knocked=knocked, unproven=unproven)
         if moved or trust.ambiguous or not trust.displaced:
             return standing
@@ -326,7 +326,7 @@ class Integrity:
         slid = along.undecided or now_s < self._slid_until_s
         seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
-        at = measurement, cam_T_grip, covariance, trust.protection
+        at = measurement, cam_T_grip, covariance, trust.bounds
         return Standing(*at, believed=False, where_it_was=True, unproven=True)
 
     def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
@@ -352,4 +352,5 @@ class Integrity:
 def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
     """The same, not believed, with a bound that includes another possible pose (4, 4)."""
     away = perturbation_between(standing.cam_T_grip, other_T)
-    return replace(standing, protection=reaching(standing.protection, away, why), believed=False)
+    both = Bounds(*(reaching(each, away, why) for each in standing.bounds))
+    return replace(standing, bounds=both, believed=False)

@@ -16,7 +16,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import NOTHING_WRONG, Array, Protection, ReferenceRecord
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
 from gripmon.monitor.refits import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -27,15 +27,17 @@ from gripmon.monitor.refits import (
     Lasting,
     ModelError,
     Refits,
+    TwoDoubts,
+    bounds_of,
     larger,
-    protection_of,
     reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, has_lone_end, inner_edges, sides
-from gripmon.track.integrity import Doubts, Hypotheses, bounds, hypotheses_of
+from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 from gripmon.track.look import ONE_EDGE_PX
 
 VIBRATION_FRAMES = 20.0
@@ -78,7 +80,15 @@ def swinging(swing: Array, way: Array, noise: Array) -> Array:
 class Weigher:
     """Protection levels of one monitor's measurements, and the anchor that they rest on."""
 
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+    def __init__(
+        self,
+        tracker: Tracker,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+        since: AtReferences,
+    ):
+        """``since``: what was measured at the reference in force."""
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._along = tracker.along  # (e,) which edges run along the fingers
         self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
@@ -86,7 +96,7 @@ class Weigher:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / (30.0 * 86_400.0)
-        self._model = _model_error(tracker, gripper)
+        self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
@@ -113,6 +123,10 @@ class Weigher:
             self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
         self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
         self._slid: bool | None = None  # not known before something is proven
+
+    def restore(self, records: tuple[AtReferenceRecord, ...]) -> str | None:
+        """See :meth:`AtReferences.restore`."""
+        return self._since.restore(records, len(self._lasting.name), self._model.fingers)
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -143,7 +157,8 @@ class Weigher:
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
-            return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG), False)
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG)
+            return Trust(Bounds(unbounded, unbounded), False)
         wander = self._wander(now_s)
         fits, anchored = self._refitted(measurement, now_s, wander)
         hypotheses, anchor = fits.hypotheses, self.anchor
@@ -172,22 +187,20 @@ class Weigher:
                 proven, made_of = True, without
         else:
             all_along = anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        all_along = fits.with_first(all_along, self._lasting, cam_T_grip, None if displaced else anchored)
         if anchor is None:
-            protection = protection_of(all_along, risk)
+            both = bounds_of(all_along, risk)
             if displaced:
                 away = perturbation_between(self._expected[0], cam_T_grip)
-                protection = larger(protection, self._not_as_expected(away))
-            if self.unexplained is not None:
-                protection = larger(protection, self._not_as_expected(self.unexplained))
-            return Trust(protection, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
+                both = both._replace(absolute=larger(both.absolute, self._not_as_expected(away)))
+            both = self._with_question(both)
+            return Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of)
         # Hypotheses since the anchor, and the most probable one.
         possible = holds * prior
         number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
         most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
-        protection = protection_of(all_along + since, risk)
-        if self.unexplained is not None:
-            protection = larger(protection, self._not_as_expected(self.unexplained))
+        both = self._with_question(bounds_of(all_along + since, risk))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
@@ -195,12 +208,19 @@ class Weigher:
             # A knock doesn't move the jaw: flexing fingers and shadows beside them look like both at once.
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
-            protection = reaching(protection, perturbation_between(self.expected[0], cam_T_grip), why)
-        return Trust(protection, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
+            away = perturbation_between(self.expected[0], cam_T_grip)
+            both = Bounds(*(reaching(each, away, why) for each in both))
+        return Trust(both, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of)
+
+    def _with_question(self, both: Bounds) -> Bounds:
+        """The bounds while it is open why the first frames differed from the reference: that is no motion since them."""
+        if self.unexplained is None:
+            return both
+        return both._replace(absolute=larger(both.absolute, self._not_as_expected(self.unexplained)))
 
     def _doubts_of_frame(
         self, measurement: Measurement, fits: Refits, prior: Array, cam_T_grip: Array, alone: float | None
-    ) -> tuple[Doubts, Refits | None]:
+    ) -> tuple[TwoDoubts, Refits | None]:
         """The lasting hypotheses from this frame's ``fits`` alone, with probabilities ``prior`` (h,).
 
         ``alone``: the probability that only this frame shows where the fingers' ends are, if they may be something
@@ -209,13 +229,14 @@ class Weigher:
         hypotheses = fits.hypotheses
         # A knock of the mount may bend a finger, too; but fingers are assumed straight at first.
         counts = ~hypotheses.sudden if self.anchor is None else np.ones_like(hypotheses.sudden)
+        lasting = self._lasting.numbers(self._about(fits.edges)[1], len(hypotheses.name))
         rows = counts.copy()
         rows[hypotheses.ends] = True
-        doubts = fits.doubts(cam_T_grip, prior).among(rows)
+        doubts = fits.doubts(cam_T_grip, prior, lasting=lasting).among(rows)
         if alone is None:
             return doubts, None
         endless, more = hypotheses.without_ends()
-        without = Refits(measurement, endless, self._tracker.floor, self._model)
+        without = Refits(measurement, endless, self._tracker.floor, fits.model)
         besides = alone * prior[hypotheses.ends] * hypotheses.prior
         return doubts + without.doubts(cam_T_grip, besides).among(counts & more), without
 
@@ -252,17 +273,18 @@ class Weigher:
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
         return bool(self._slid) or (displaced and measurement.prediction.moved_px(way) >= ONE_EDGE_PX)
 
-    def held(self, protection: Protection, growth: Array, unseen_s: float, hidden: bool) -> Protection:
-        """The protection level of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
+    def held(self, both: Bounds, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
+        """The protection levels of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
         ``growth``.  ``hidden``: the image is good, but the gripper isn't seen in it.
         """
-        risk = protection.risk
+        risk = self._policy.integrity_risk
         if self._knocked(unseen_s, hidden) > risk:
             why = "the mount was knocked while nothing is seen of the gripper"
-            return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
+            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
+            return Bounds(unbounded, unbounded)
         position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
-        return Protection(
-            protection.position_m + position_m, protection.rotation_rad + rotation_rad, risk, protection.hypothesis
+        return Bounds(
+            *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
 
     def _knocked(self, unseen_s: float, hidden: bool) -> float:
@@ -313,8 +335,8 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        bound = protection_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
-        return past_alert_limit(bound, self._policy) is None
+        both = bounds_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
+        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
@@ -340,7 +362,8 @@ class Weigher:
             covariance = covariance.copy()
             covariance.flat[::7] += wander
             known = Known(expected_T, covariance, of_model)
-            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, self._model, known)
+            model = self._model._replace(first=self._since.published_by)
+            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, model, known)
             self._newest = measurement, now_s, fits
         fits = self._newest[2]
         assert fits.anchored is not None
@@ -389,15 +412,16 @@ def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
     return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids), common)
 
 
-def foresee_protection(
-    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
-) -> Protection:
-    """The protection level of a single frame with the given measurement and proven fingers' ends."""
+def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement) -> Bounds:
+    """The protection levels of a single frame with the given measurement and proven fingers' ends, where the frames of
+    the reference show no more.
+    """
     if not len(measurement.normal.edge):
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
+        unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
+        return Bounds(unbounded, unbounded)
     hypotheses = _hypotheses_about(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
     model = _model_error(tracker, gripper)
     doubts = Refits(measurement, hypotheses, tracker.floor, model).doubts(measurement.cam_T_grip, hypotheses.prior)
-    return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
+    return bounds_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)

@@ -19,7 +19,7 @@ from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.model.units import in_degrees, in_mm
-from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
+from gripmon.monitor import Bounds, MonitorSettings, Tracker, foresee_bounds
 from gripmon.teach.visibility import Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.track.edges.kernel import FEWEST_EDGES
@@ -63,8 +63,8 @@ class AccuracyForecast:
 
     ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
     ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
-    distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``protection``: the
-    protection level in front of clutter.  ``jaw``: the effect of an unknown opening; None for a gripper without jaw, or
+    distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``bounds``: both
+    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect of an unknown opening; None for a gripper without jaw, or
     where not asked for.
     """
 
@@ -72,6 +72,7 @@ class AccuracyForecast:
     edges: int
     corners: NDArray[np.bool_]
     lever_m: float
+    bounds: Bounds
     protection: Protection
     jaw: UnknownOpening | None
 
@@ -128,8 +129,9 @@ def forecast_frame(
         free = meter.forecast(cam_T_grip, opening_m, jaw_reported=False)
         jaw = _unknown_opening(tracker.update(free)[1], free.covariance, lever_m)
     seen = np.bincount(given.prediction.layout.edge[given.candidates.sample], minlength=1) >= FEWEST_SAMPLES
-    protection = foresee_protection(tracker, gripper, settings, given)
-    return AccuracyForecast(covariance, int(np.count_nonzero(seen)), given.corners.usable, lever_m, protection, jaw)
+    both = foresee_bounds(tracker, gripper, settings, given)
+    protection, edges = both.by(settings.policy.valid_by), int(np.count_nonzero(seen))
+    return AccuracyForecast(covariance, edges, given.corners.usable, lever_m, both, protection, jaw)
 
 
 def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tuple[float, AccuracyForecast | None]]:

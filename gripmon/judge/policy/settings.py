@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records import Array
+from gripmon.model.records import Array, ValidBy
 
 
 class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,6 +82,14 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     image_alert_after_s: Annotated[
         float, Meta(ge=0.0, le=3600.0, description="time of refused frames after which there is an alert (s)")
     ] = 1.0
+    valid_by: Annotated[
+        ValidBy,
+        Meta(
+            description="which error has to be within the alert limits: absolute, of the transform as measured, in "
+            "which the gripper file's errors are; reference, of the motion since the reference, which cam_T_grip is "
+            "the reference after then"
+        ),
+    ] = ValidBy.ABSOLUTE
     alert_limit_m: Annotated[
         float,
         Meta(

@@ -31,6 +31,7 @@ from gripmon.model.records.frames import (
     CornerRecord,
     Frame,
     FrameRecord,
+    FrameRecord1,
     MeasurementTrace,
     Origin,
     Refusal,
@@ -41,41 +42,39 @@ from gripmon.model.records.frames import (
 )
 from gripmon.model.records.json_schema import json_schema, summary
 from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
-from gripmon.model.records.looks import (
-    FinerLookRecord,
-    LookBias,
-    LookNote,
-    LookPixels,
-    LookRecord,
-    LookVersion,
-    StripsRecord,
-)
+from gripmon.model.records.looks import LookRecord, StripsRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
 from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
-from gripmon.model.records.references import MonitorState, ReferenceInputs, ReferenceRecord
+from gripmon.model.records.references import AtReferenceRecord, MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.model.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.model.records.values import (
     NOTHING_WRONG,
+    Absolute,
     Array,
     Drift,
     Image,
     Protection,
+    Since,
+    SinceReference,
     Smoothed,
     Transform,
+    ValidBy,
     to_json,
 )
 
 __all__ = [
     "MESSAGES",
     "NOTHING_WRONG",
+    "Absolute",
     "Alert",
     "AlertEvent",
     "AlertKind",
     "AlertRecord",
     "ArmPose",
     "Array",
+    "AtReferenceRecord",
     "CameraShift",
     "Cause",
     "CauseWeight",
@@ -93,19 +92,15 @@ __all__ = [
     "EdgeEvidence",
     "EdgeSums",
     "Explanation",
-    "FinerLookRecord",
     "Frame",
     "FrameNote",
     "FrameRecord",
+    "FrameRecord1",
     "Image",
     "JawReading",
     "LaserPulse",
     "Limits",
-    "LookBias",
-    "LookNote",
-    "LookPixels",
     "LookRecord",
-    "LookVersion",
     "MeasurementTrace",
     "MessageRefused",
     "Meta",
@@ -124,6 +119,8 @@ __all__ = [
     "ReferenceRecord",
     "Refusal",
     "Severity",
+    "Since",
+    "SinceReference",
     "Smoothed",
     "Snapshot",
     "SnapshotImage",
@@ -134,6 +131,7 @@ __all__ = [
     "StateRecord",
     "StripsRecord",
     "Transform",
+    "ValidBy",
     "Verdict",
     "Vibration",
     "accepting",

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records.frames import FrameRecord
+from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.references import MonitorState
 from gripmon.model.records.values import OpenEnum
 
@@ -95,7 +95,7 @@ Outlines = tuple[tuple[tuple[float, float], ...], ...]
 class Snapshot(msgspec.Struct, frozen=True):
     """The newest frame: the monitor's record of it, and its image."""
 
-    record: Annotated[FrameRecord, Meta(description="the transform message of that frame")]
+    record: Annotated[FrameRecord | FrameRecord1, Meta(description="the transform message of that frame")]
     age_s: Annotated[float, Meta(description="from when it was judged to when it was asked for, s")]
     jaw_reported_m: Annotated[
         float | None, Meta(description="the opening that the robot had reported, m; null if none")

@@ -11,7 +11,19 @@ from msgspec import Meta
 
 from gripmon.model.records.alerts import Alert
 from gripmon.model.records.references import ReferenceRecord
-from gripmon.model.records.values import Array, Covariance, Drift, Image, OpenEnum, Protection, Smoothed, Transform
+from gripmon.model.records.values import (
+    Absolute,
+    Array,
+    Covariance,
+    Drift,
+    Image,
+    OpenEnum,
+    Protection,
+    SinceReference,
+    Smoothed,
+    Transform,
+    ValidBy,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,7 +120,7 @@ class CornerRecord(msgspec.Struct, frozen=True):
     reason: Annotated[CornerFault | None, Meta(description="why it was not measured or used; null if it was")] = None
 
 
-class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.transform/1"):
+class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.transform/2"):
     """What the monitor decided about one frame: also one line of ``replay``."""
 
     seq: Annotated[int, Meta(description="number of the frame; one that is missing was dropped")]
@@ -116,7 +128,9 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     verdict: Verdict
     state: State
     source: Origin
-    cam_T_grip: Annotated[Transform | None, Meta(description="null where there is nothing to stand by")]
+    cam_T_grip: Annotated[
+        Transform | None, Meta(description="what valid_by names; null where there is nothing to stand by")
+    ]
     covariance: Annotated[Covariance | None, Meta(description="of cam_T_grip, null with it; a held one grows")]
     smoothed: Annotated[Smoothed | None, Meta(description="averaged over time; null where nothing is averaged")]
     drift: Annotated[Drift | None, Meta(description="of cam_T_grip against the reference; null with it")]
@@ -144,11 +158,39 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     monitor_id: Annotated[
         str, Meta(description="of this start of the monitor; empty in a replay, and from a monitor before ids")
     ] = ""
+    valid_by: Annotated[
+        ValidBy,
+        Meta(
+            description="which error protection bounds and the verdict is about: reference, of the motion since the "
+            "reference, which cam_T_grip is the reference after; absolute, of the transform as measured"
+        ),
+    ] = ValidBy.ABSOLUTE
+    since_reference: Annotated[
+        SinceReference | None, Meta(description="null with cam_T_grip, and until a frame proves where the gripper is")
+    ] = None
+    absolute: Annotated[Absolute | None, Meta(description="null with cam_T_grip")] = None
 
     @property
     def measured(self) -> bool:
         """Whether it has a transform measured in this frame, not a held one."""
         return self.source is not Origin.HELD and self.cam_T_grip is not None
+
+    @property
+    def measured_T(self) -> Transform | None:
+        """The transform as measured, with which the gripper's model lies on the image; None where there is none."""
+        if self.absolute is None:
+            return self.cam_T_grip
+        return Transform(self.absolute.translation_m, self.absolute.rotation_xyzw)
+
+
+class FrameRecord1(FrameRecord, frozen=True, tag_field="schema", tag="gripmon.transform/1"):
+    """A record of an earlier version, whose transform and bounds are absolute."""
+
+    def __post_init__(self) -> None:
+        at, bound = self.cam_T_grip, self.protection
+        if at is not None and bound is not None:
+            of = Absolute(bound.position_m, bound.rotation_rad, at.translation_m, at.rotation_xyzw)
+            msgspec.structs.force_setattr(self, "absolute", of)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +221,8 @@ def withheld(record: FrameRecord, reason: str) -> FrameRecord:
         smoothed=None,
         drift=None,
         protection=None,
+        since_reference=None,
+        absolute=None,
         reason=reason,
     )
 
@@ -192,6 +236,7 @@ def unmeasured_record(
     state: State = State.LOST,
     corners: tuple[CornerRecord, ...] = (),
     alerts: tuple[Alert, ...] = (),
+    valid_by: ValidBy = ValidBy.ABSOLUTE,
 ) -> FrameRecord:
     """The record of a frame that gave no measurement: without a transform and, by default, with verdict ``unknown``."""
     return FrameRecord(
@@ -212,4 +257,5 @@ def unmeasured_record(
         alerts=alerts,
         reason=reason,
         name=frame.name,
+        valid_by=valid_by,
     )

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from gripmon.model.records.alerts import Cause, OpenAlert
 from gripmon.model.records.looks import LookRecord
-from gripmon.model.records.values import Covariance, Transform
+from gripmon.model.records.values import Covariance, Since, Transform
 
 
 class ReferenceInputs(msgspec.Struct, frozen=True):
@@ -47,6 +47,23 @@ class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="grip
     ] = None
 
 
+class AtReferenceRecord(msgspec.Struct, frozen=True):
+    """What was measured at a reference; bytes are little-endian float64, base64 in JSON."""
+
+    reference_id: str
+    measured_as: Annotated[str, Meta(description="digest of the taught edges and settings that it was measured with")]
+    cam_T_grip: Annotated[Transform, Meta(description="the average over its frames")]
+    shift: Annotated[bytes, Meta(description="(g, 6): the same under each lasting hypothesis, from there, m and rad")]
+    covariance: Annotated[bytes, Meta(description="(g, 6, 6) of these, m², m rad, rad²")]
+    of_model: Annotated[bytes, Meta(description="(g, f, 6): how far they are off where a finger is longer")]
+    jaw_opening_m: Annotated[float, Meta(description="opening in its frames; 0 without a jaw")]
+    frames: Annotated[int, Meta(description="how many of them were averaged")]
+    since: Since
+    since_ns: Annotated[
+        int, Meta(description="stamp of the newest of its own frames, or of the first proved one, Unix ns")
+    ]
+
+
 class MonitorState(msgspec.Struct, frozen=True):
     """The state that survives a restart."""
 
@@ -82,3 +99,7 @@ class MonitorState(msgspec.Struct, frozen=True):
     look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
         None
     )
+    at_reference: Annotated[
+        tuple[AtReferenceRecord, ...] | msgspec.UnsetType,
+        Meta(description="what was measured at the references, from which motion counts; absent before that is known"),
+    ] = msgspec.UNSET

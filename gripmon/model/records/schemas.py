@@ -6,13 +6,13 @@ and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reade
 
 from __future__ import annotations
 
-import functools
 from typing import TypeVar
 
 import msgspec
 
+from gripmon.model.decoding import decoder_of
 from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
-from gripmon.model.records.frames import FrameRecord
+from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.laser import LaserPulse, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
 from gripmon.model.records.references import ReferenceRecord
@@ -35,6 +35,9 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 }
 """All messages that go over the wire."""
 
+OLDER: dict[type[msgspec.Struct], type[msgspec.Struct]] = {FrameRecord: FrameRecord1}
+"""The previous major version of a message, which is read as well."""
+
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
     JawReading: 4096,
@@ -54,6 +57,11 @@ class _Tag(msgspec.Struct, frozen=True):
     schema: str = ""
 
 
+decoder_of(_Tag)
+for _message in MESSAGES.values():
+    decoder_of(_message)  # before threads of Zenoh's decode their first messages, however they do it
+
+
 def from_json(payload: bytes, message: type[_T]) -> _T:
     """Decode a payload from the network as the type that is expected there.
 
@@ -63,8 +71,11 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     if len(payload) > largest_bytes(message):
         raise MessageRefused(f"{len(payload)} bytes; at most {largest_bytes(message)}")
     try:
-        return _decoder(message).decode(payload)
+        return decoder_of(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        older = OLDER.get(message)
+        if older is not None and _schema_of(payload) == schema_name(older):
+            return from_json(payload, older)  # type: ignore[return-value]  # a kind of the same message
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
@@ -78,16 +89,16 @@ def schema_name(message: type[msgspec.Struct]) -> str:
     return str(message.__struct_config__.tag)
 
 
-@functools.cache
-def _decoder(message: type[_T]) -> msgspec.json.Decoder[_T]:
-    return msgspec.json.Decoder(message)
-
-
 def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Exception) -> str:
-    try:
-        schema = msgspec.json.decode(payload, type=_Tag).schema
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        schema = ""
+    schema = _schema_of(payload)
     if schema and schema != (known := schema_name(message)):
         return f"its schema is {schema[:80]!r}, and this version of gripmon reads {known!r}; update the older one"
     return f"no message {schema_name(message)}: {str(error) or type(error).__name__}"
+
+
+def _schema_of(payload: bytes) -> str:
+    """The schema that a payload names; empty where it names none."""
+    try:
+        return decoder_of(_Tag).decode(payload).schema
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return ""

@@ -84,6 +84,50 @@ class Protection(msgspec.Struct, frozen=True, gc=False):
     hypothesis: Annotated[str, Meta(description="what could be wrong that makes the position's bound as large")] = ""
 
 
+class ValidBy(enum.StrEnum):
+    """Which error has to be within the alert limits for a transform to be valid, and which transform that is: of the
+    motion since the reference, applied to the reference, or of the pose as measured.
+    """
+
+    REFERENCE = "reference"
+    ABSOLUTE = "absolute"
+
+
+class Since(OpenEnum):
+    """What the motion since the reference counts from."""
+
+    REFERENCE = "reference"
+    FIRST_PROVED = "first_proved"
+
+
+class SinceReference(msgspec.Struct, frozen=True, gc=False):
+    """Bounds on the error of the motion since the reference: what is the same then and now, as the reference's own
+    error and the gripper file's, isn't in them.
+    """
+
+    position_m: Annotated[float, Meta(description="bound on the TCP's position error, m")]
+    rotation_rad: Annotated[float, Meta(description="bound on the angle of the rotation error, rad")]
+    since: Annotated[
+        Since,
+        Meta(
+            description="reference: the frames that the reference was measured from; first_proved: the first frames "
+            "that proved where the gripper is, so that a motion before them isn't in it"
+        ),
+    ]
+    since_ns: Annotated[
+        int, Meta(description="stamp of the newest of those frames, or of the first proved one, Unix ns")
+    ]
+
+
+class Absolute(msgspec.Struct, frozen=True, gc=False):
+    """The transform as measured, and bounds on its error, in which the gripper file's errors are."""
+
+    position_m: Annotated[float, Meta(description="bound on the TCP's position error, m")]
+    rotation_rad: Annotated[float, Meta(description="bound on the angle of the rotation error, rad")]
+    translation_m: Translation
+    rotation_xyzw: Rotation
+
+
 _encoder = msgspec.json.Encoder()
 
 

@@ -1,0 +1,281 @@
+"""The motion d since the reference: what is the same in the reference's frames and now cancels (``docs/integrity.md``).
+
+A measured pose is ``x = exp(d) exp(b) reference``, with left perturbations as in equation (11): d is the camera's motion
+since the reference, b how far off the reference the measurements had the gripper then, an average over the first proved
+frames or a recalibration's own.  With their pose ``x_b = exp(b) reference``, ``exp(d) = x x_b^-1``.  An error E that is
+constant in gripper axes (another TCP, bevels, worn or rounded tips, edges taught at a wrong reference) is in both poses:
+``x E (x_b E)^-1 = x x_b^-1``, whatever the motion.
+
+What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is, too;
+as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into a motion;
+edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of the motion;
+a longer finger moves a fit by its visible edges, which may be others than then.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.geometry import from_record, invert, skew
+from gripmon.model.poses import to_record
+from gripmon.model.records import (
+    Absolute,
+    Array,
+    AtReferenceRecord,
+    Protection,
+    ReferenceRecord,
+    Since,
+    SinceReference,
+    ValidBy,
+)
+from gripmon.track.integrity import Separation
+
+if TYPE_CHECKING:
+    from gripmon.monitor.refits import Anchor, CommonError
+
+FIRST_FRAMES = 30
+"""Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
+less than such an average claims.
+"""
+
+KEPT_REFERENCES = 8
+"""References of which b is kept: the configured one's and the newest, 20 kB each.  An undo beyond them begins anew."""
+
+
+class Bounds(NamedTuple):
+    """Protection levels of a measured pose, and of the motion since the reference that it shows."""
+
+    absolute: Protection
+    since_reference: Protection
+
+    def by(self, valid_by: ValidBy) -> Protection:
+        """The one that a setting names."""
+        return self.since_reference if valid_by is ValidBy.REFERENCE else self.absolute
+
+
+class Named(NamedTuple):
+    """What is published of a measured pose: what ``valid_by`` names, pose (4, 4), covariance (6, 6) and protection
+    level, and both bounds.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    protection: Protection
+    since_reference: SinceReference | None
+    absolute: Absolute
+
+
+class Opened(NamedTuple):
+    """A fit's jaw opening, m, and how the fitted pose changes with it (6,), per metre."""
+
+    jaw_opening_m: float
+    pose_rate: Array
+
+
+class AtReference(NamedTuple):
+    """What the monitor measured at the reference: ``fits`` under each of g lasting hypotheses as shifts from
+    ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
+    """
+
+    cam_T_grip: Array
+    fits: Separation
+    jaw_opening_m: float
+    frames: int
+    since: Since
+    since_ns: int
+
+    def motion(self, cam_T_grip: Array) -> Array:
+        """exp(d) (4, 4) of a measured pose (4, 4)."""
+        return np.asarray(cam_T_grip @ invert(self.cam_T_grip))
+
+    def covariance_of(self, covariance: Array, cam_T_grip: Array, reference_T: Array) -> Array:
+        """(6, 6) of exp(d) reference, of a measured pose (4, 4) with a ``covariance`` (6, 6)."""
+        turn, lever = self._jacobians(cam_T_grip, reference_T)
+        return np.asarray(lever @ (covariance + turn @ self.fits.covariance[0] @ turn.T) @ lever.T)
+
+    def of_motion(
+        self,
+        fits: Separation,
+        cam_T_grip: Array,
+        reference_T: Array,
+        lasting: NDArray[np.intp],
+        opened: Opened,
+        common: CommonError | None,
+    ) -> Separation:
+        """Fits of h hypotheses, as differences from a published pose (4, 4), made differences of exp(d) reference.
+
+        ``lasting`` (h,): under which of the lasting hypotheses b is taken; 0: nothing was wrong then.
+        """
+        turn, lever = self._jacobians(cam_T_grip, reference_T)
+        first = self.fits
+        shift = fits.shift - first.shift[lasting] @ turn.T
+        covariance = fits.covariance + (turn @ first.covariance @ turn.T)[lasting]
+        of_model = fits.of_model - (first.of_model @ turn.T)[lasting]
+        if common is not None:
+            motion = self.motion(cam_T_grip)
+            covariance = covariance + common.of_motion(motion, self.cam_T_grip)
+            travel_m = opened.jaw_opening_m - self.jaw_opening_m
+            longer = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
+            row = np.broadcast_to(common.scale_sigma * longer, (len(of_model), 1, 6))
+            of_model = np.concatenate([of_model, row], axis=1)
+        return Separation(shift @ lever.T, lever @ covariance @ lever.T, of_model @ lever.T)
+
+    def wrong_at_first(self, now: Separation, cam_T_grip: Array, reference_T: Array) -> Separation:
+        """(g - 1) differences of exp(d) reference if a lasting hypothesis held in the reference's frames, and no longer
+        does; ``now``: the fit of one hypothesis, that nothing is wrong.
+        """
+        turn, lever = self._jacobians(cam_T_grip, reference_T)
+        first = self.fits
+        shift = -first.shift[1:] @ turn.T
+        covariance = now.covariance + turn @ first.covariance[1:] @ turn.T
+        of_model = now.of_model - first.of_model[1:] @ turn.T
+        return Separation(shift @ lever.T, lever @ covariance @ lever.T, of_model @ lever.T)
+
+    def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
+        """(6, 6) each: ``turn`` of an error of b to camera axes as they are after d, and ``lever`` from the difference
+        of the errors of x and of b to that of exp(d) reference, which is as far from x_b as the reference is wrong.
+        """
+        rotation = cam_T_grip[:3, :3] @ self.cam_T_grip[:3, :3].T
+        turn, lever = np.zeros((6, 6)), np.eye(6)
+        turn[:3, :3] = turn[3:, 3:] = rotation
+        lever[:3, 3:] = -skew(rotation @ (reference_T[:3, 3] - self.cam_T_grip[:3, 3]))
+        return turn, lever
+
+
+class AtReferences:
+    """What was measured at each reference, of one monitor, and at the one in force."""
+
+    def __init__(self, reference: ReferenceRecord, valid_by: ValidBy, measured_as: tuple[object, ...]):
+        """``valid_by``: what is published; ``measured_as``: what a measured pose depends on but gripper and camera."""
+        self._valid_by = valid_by
+        self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
+        self._known: dict[str, AtReference] = {}
+        self._growing: Anchor | None = None  # the average that b follows until there are enough frames
+        self.changes = 0
+        """Grows with each change that a restart should know."""
+        self.refer(reference)
+
+    @property
+    def current(self) -> AtReference | None:
+        """At the reference in force; None until a frame proves a pose."""
+        return self._known.get(self._id)
+
+    @property
+    def published_by(self) -> tuple[AtReference | None, Array]:
+        """The same with the reference (4, 4) itself."""
+        return self.current, self.reference_T
+
+    def quantity(self, cam_T_grip: Array, covariance: Array) -> tuple[Array, Array]:
+        """What is published of a measured pose (4, 4) and its covariance (6, 6): these, or those of exp(d) reference.
+        Before a frame has proved a pose every frame is the first one, with d = 0.
+        """
+        if self._valid_by is ValidBy.ABSOLUTE:
+            return cam_T_grip, covariance
+        first = self.current
+        if first is None:
+            return self.reference_T, 2.0 * covariance
+        of_motion = first.covariance_of(covariance, cam_T_grip, self.reference_T)
+        return first.motion(cam_T_grip) @ self.reference_T, of_motion
+
+    def named(self, cam_T_grip: Array, covariance: Array, both: Bounds) -> Named:
+        """What is published of a measured pose (4, 4), its covariance (6, 6) and bounds."""
+        (absolute, since), first, at = both, self.current, to_record(cam_T_grip)
+        return Named(
+            *self.quantity(cam_T_grip, covariance),
+            both.by(self._valid_by),
+            None
+            if first is None
+            else SinceReference(since.position_m, since.rotation_rad, first.since, first.since_ns),
+            Absolute(absolute.position_m, absolute.rotation_rad, at.translation_m, at.rotation_xyzw),
+        )
+
+    def refer(self, reference: ReferenceRecord) -> None:
+        """Another reference is in force; one that is restored is still known."""
+        self._id = reference.restores or reference.reference_id
+        self.reference_T = from_record(reference.cam_T_grip)
+        self._growing = None
+
+    def measured(self, reference: ReferenceRecord, anchor: Anchor, jaw_opening_m: float) -> None:
+        """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""
+        at = anchor.cam_T_grip, anchor.fits(), jaw_opening_m, anchor.frames, Since.REFERENCE, reference.stamp_ns
+        self._keep(reference.reference_id, AtReference(*at))
+
+    def add(self, anchor: Anchor, jaw_opening_m: float, stamp_ns: int) -> None:
+        """A frame has proved a pose, which ``anchor`` includes."""
+        known = self.current
+        if known is None:
+            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
+        elif self._growing is None:
+            return
+        elif self._growing is not anchor:
+            self._end()  # the mount was knocked
+            return
+        self._openings_m.append(jaw_opening_m)
+        at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
+        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns)
+        if len(self._openings_m) >= FIRST_FRAMES:
+            self._end()
+
+    def _end(self) -> None:
+        self._growing = None
+        self._keep(self._id, self._known[self._id])
+
+    def _keep(self, reference_id: str, at: AtReference) -> None:
+        self._known[reference_id] = at
+        self.changes += 1
+        while len(self._known) > KEPT_REFERENCES:  # the configured one is the first
+            oldest = [each for each in self._known if each != self._id][1]
+            del self._known[oldest]
+
+    def state(self) -> tuple[AtReferenceRecord, ...]:
+        """What survives a restart: without an average that is still growing, which begins anew."""
+        growing = self._id if self._growing is not None else None
+        return tuple(self._record(name, at) for name, at in self._known.items() if name != growing)
+
+    def _record(self, reference_id: str, at: AtReference) -> AtReferenceRecord:
+        shift, covariance, of_model = (np.ascontiguousarray(each, dtype="<f8").tobytes() for each in at.fits)
+        return AtReferenceRecord(
+            reference_id,
+            self._digest,
+            to_record(at.cam_T_grip),
+            shift,
+            covariance,
+            of_model,
+            at.jaw_opening_m,
+            at.frames,
+            at.since,
+            at.since_ns,
+        )
+
+    def restore(self, records: Iterable[AtReferenceRecord], lasting: int, fingers: int) -> str | None:
+        """Go on with what an earlier run measured, with these numbers of lasting hypotheses and fingers.  Returns why
+        some of it isn't used: settings or taught edges have changed since; None if all of it is.
+        """
+        refused = None
+        for each in records:
+            fits = _fits(each, lasting, fingers) if each.measured_as == self._digest else None
+            if fits is None:
+                refused = (
+                    "where the reference's frames had the gripper isn't used: the edges were taught again, or measured "
+                    "with other settings, since; the bound since the reference counts from the first frames"
+                )
+            else:
+                at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns
+                self._known[each.reference_id] = AtReference(*at)
+        return refused
+
+
+def _fits(record: AtReferenceRecord, lasting: int, fingers: int) -> Separation | None:
+    """The kept fits; None if they are of another number of hypotheses or fingers, or no numbers."""
+    shapes = (lasting, 6), (lasting, 6, 6), (lasting, fingers, 6)
+    kept = record.shift, record.covariance, record.of_model
+    if any(len(each) != 8 * np.prod(shape) for each, shape in zip(kept, shapes, strict=True)):
+        return None
+    arrays = [np.frombuffer(each, "<f8").reshape(shape).copy() for each, shape in zip(kept, shapes, strict=True)]
+    return Separation(*arrays) if all(np.isfinite(each).all() for each in arrays) else None
