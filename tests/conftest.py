@@ -19,6 +19,7 @@ import hypothesis
 import pytest
 import zenoh
 from support.commanded import Loop, reply_to
+from support.kept import forget_the_oldest
 from support.long_files import LONGEST
 from support.loopback import free_endpoint, give_default_port_back, plain_session
 from support.published import Published
@@ -40,6 +41,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Machine code is made once, before workers and the processes of tests would make it, each for itself."""
     if not hasattr(config, "workerinput"):
         warm_up()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if not hasattr(session.config, "workerinput"):
+        forget_the_oldest()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

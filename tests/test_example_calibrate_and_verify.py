@@ -10,15 +10,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
-
-from gripmon.cli import main
+from support import new_user
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "docs" / "examples" / "calibrate_and_verify.py"
 
 
 def test_it_finds_camera_and_gripper(tmp_path: Path):
     for kind in ("plate", "standing"):
-        assert main(["simulate", kind, "--out", str(tmp_path / kind)]) == 0
+        new_user.simulate(tmp_path, kind)
     shutil.copy(tmp_path / "standing" / "rough.yaml", tmp_path)
     true = json.loads((tmp_path / "standing" / "truth.json").read_text())
     done = subprocess.run([sys.executable, EXAMPLE, tmp_path], capture_output=True, text=True, check=False)

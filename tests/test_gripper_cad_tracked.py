@@ -32,7 +32,8 @@ from tools.benchmarks.meshes import (
 )
 
 FRAMES, FEW = 45, 24
-ROUNDED_M = (0.002, 0.004, 0.008)
+BETWEEN = pytest.mark.slow("5 s each: other radii and shades; the smallest is in the default run, as are all ends")
+ROUNDED_M = (0.002, pytest.param(0.004, marks=BETWEEN), 0.008)
 
 SHAPES = {
     "box": (box_fingers, (15e-6, 60e-6)),
@@ -71,7 +72,7 @@ def seen(
     return record, error
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", [pytest.param(s, marks=BETWEEN) if s in ("4 mm", "8 mm") else s for s in SHAPES])
 def test_what_was_made_from_a_mesh_tracks_it(shape: str, tmp_path: Path):
     """The camera wanders by 0.2 mm and 1 mrad, the jaws by 1 mm, and each frame has another background."""
     meshes, (across_m, along_m) = SHAPES[shape][0](), SHAPES[shape][1]
@@ -129,8 +130,14 @@ def test_rounded_ends_are_seen_where_they_are_and_nowhere_else(radius_m: float, 
     assert sure > 15
 
 
-@pytest.mark.parametrize("level_dn", [30.0, 120.0, 230.0])
-@pytest.mark.parametrize("radius_m", ROUNDED_M)
+@pytest.mark.parametrize(
+    ("radius_m", "level_dn"),
+    [
+        pytest.param(radius_m, level_dn, marks=() if k == m else BETWEEN)
+        for k, radius_m in enumerate((0.002, 0.004, 0.008))
+        for m, level_dn in enumerate((30.0, 120.0, 230.0))
+    ],
+)
 def test_a_bar_before_or_behind_rounded_tips_is_not_taken_for_them(radius_m: float, level_dn: float, tmp_path: Path):
     gripper, pictures = rounded(radius_m, tmp_path)
     using = meter(gripper)

@@ -128,6 +128,7 @@ def test_the_simulators_parked_gripper():
         assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all(), (index, 1e6 * error[:3])
 
 
+@pytest.mark.slow("6 s: sampled; errors of the TCP are held against their covariance in the default run")
 def test_corners_have_the_spread_that_their_covariance_states():
     """Snapped corners over images with noise of their own; correlations between corners count."""
     camera, outline = make_camera(PAPER_LENS), outlines_of(rough(outline_pixels(TRUE), 3))

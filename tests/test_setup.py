@@ -50,7 +50,7 @@ TARGET = parse_target(new_user.TARGET)
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("setup")
     for kind in ("plate", "standing"):
-        assert main(["simulate", kind, "--out", str(folder / kind)]) == 0
+        new_user.simulate(folder, kind)
     return folder
 
 

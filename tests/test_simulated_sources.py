@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import psutil
 import pytest
+from support.counting_maker import SHAPE, CountingMaker
 
 from gripmon.daemon.config import read_gripper
 from gripmon.io.sources import (
@@ -35,20 +36,6 @@ from gripmon.model.records import Frame
 from gripmon.simulate import make_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
-SHAPE = (6, 8)
-
-
-class CountingMaker:
-    """Images filled with their number; it can fail, or be slow, from a frame on."""
-
-    def __init__(self, fails_at: int | None = None, pause_s: float = 0.0) -> None:
-        self.fails_at, self.pause_s = fails_at, pause_s
-
-    def frame(self, index: int) -> Frame:
-        if index == self.fails_at:
-            raise ArithmeticError(f"no picture {index}")
-        time.sleep(self.pause_s)
-        return Frame(index, 0, np.full(SHAPE, index % 251, np.uint8), 1e-3 * index)
 
 
 def counting_camera(fps: float = 50.0, processes: int = 1, frame_count: int | None = None, **maker) -> SimulatedCamera:

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
-from gripmon.model.gripper import Gripper
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Light, Sensor
 from gripmon.teach.straight_pieces import Chain
+from support.kept import kept
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 CAMERA = make_camera(PAPER_LENS)
@@ -46,6 +47,15 @@ def moving_robot(
 
 
 def images_of(simulator: Simulator, count: int = 30) -> list[NDArray[np.uint8]]:
+    nominal_T = simulator.nominal_cam_T_grip
+    return _rendered(simulator.gripper.model, nominal_T, simulator.scenario, simulator.seed, count)
+
+
+@kept
+def _rendered(
+    model: GripperModel, nominal_cam_T_grip: Array, scenario: Scenario, seed: int, count: int
+) -> list[NDArray[np.uint8]]:
+    simulator = Simulator(CAMERA, Gripper(model), nominal_cam_T_grip, scenario, seed)
     return [simulator.render(k) for k in range(count)]
 
 

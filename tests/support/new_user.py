@@ -12,6 +12,7 @@ import numpy as np
 
 from gripmon.cli import main
 from gripmon.model.records import Array
+from support.kept import copied
 
 TARGET = "circles:12x10:0.008:0.004"
 OPENING_M = 0.05
@@ -36,10 +37,19 @@ class NewUser:
         return {name: at + rng.uniform(-off_px, off_px, 2) for name, at in self.corners_px.items()}
 
 
+def simulate(folder: Path, kind: str) -> None:
+    """``folder/kind`` as ``gripmon simulate`` makes it."""
+    copied(_simulated, folder / kind, kind)
+
+
+def _simulated(folder: Path, kind: str) -> None:
+    assert main(["simulate", kind, "--out", str(folder)]) == 0
+
+
 def make(folder: Path) -> NewUser:
     """Render everything."""
     for kind in ("plate", "standing", "work"):
-        assert main(["simulate", kind, "--out", str(folder / kind)]) == 0
+        simulate(folder, kind)
     standing = json.loads((folder / "standing" / "truth.json").read_text())
     work = [json.loads(line) for line in (folder / "work" / "truth.jsonl").read_text().splitlines()]
     assert standing["jaw_opening_m"] == OPENING_M == work[0]["jaw_opening_m"]

@@ -10,6 +10,7 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
+from support.kept import kept
 from support.plates import Look, render
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
@@ -31,21 +32,30 @@ class Faces:
 
     def __call__(self, xy: np.ndarray, grey: np.ndarray) -> np.ndarray:
         points = self.gripper.points_grip_m(self.jaw_opening_m) @ self.cam_T_grip[:3, :3].T + self.cam_T_grip[:3, 3]
-        out = grey.copy()
+        out, at = grey.copy(), np.flatnonzero(_about(xy, points[:, :2] / points[:, 2:]))
+        rays = xy[at]
         for number, face in enumerate(self.gripper.faces):
             corners = points[face.points]
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
             if normal @ corners[0] >= 0.0:
                 continue  # it looks away
             # In front of the camera's plane a ray meets a convex face if it is on the same side of all its edges.
-            inside = np.ones(len(xy), dtype=bool)
+            inside = np.ones(len(rays), dtype=bool)
             for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
                 across = np.cross(a, b)
-                inside &= xy @ across[:2] + across[2] < 0.0
-            out[inside] = FACE_GREYS[number % len(FACE_GREYS)] + (15.0 if number >= 6 else 0.0)
+                inside &= rays @ across[:2] + across[2] < 0.0
+            out[at[inside]] = FACE_GREYS[number % len(FACE_GREYS)] + (15.0 if number >= 6 else 0.0)
         return out
 
 
+def _about(xy: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which rays lie in the rectangle about these points, all in front of the camera."""
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    x, y = xy[:, 0], xy[:, 1]
+    return (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+
+
+@kept
 def standing(
     target: Target,
     *,

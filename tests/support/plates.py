@@ -13,6 +13,7 @@ from gripmon.model.records import Array, Image
 from gripmon.model.targets import Target
 from gripmon.simulate.plates import Plate, Print, develop, points_of, sample_rays
 from gripmon.simulate.plates import facing as pose
+from support.kept import kept
 
 __all__ = ["Cover", "Look", "fingers", "points_of", "pose", "render", "true_uv"]
 
@@ -58,6 +59,20 @@ def render(
     """An image (H, W) of 8 bit.  ``solid`` takes ideal coordinates (n, 2) and what is seen there, (n,) grey values, and
     gives what is seen with something in front.
     """
+    draw = _drawn if solid is None else _drawn.__wrapped__  # what it draws may not be told from something else
+    return draw(settings, cam_T_plate, target, look, tuple(covers), solid, seed)
+
+
+@kept
+def _drawn(
+    settings: LensSettings,
+    cam_T_plate: Array,
+    target: Target,
+    look: Look,
+    covers: Sequence[Cover],
+    solid: Callable[[Array, Array], Array] | None,
+    seed: int,
+) -> Image:
     rng, ss = np.random.default_rng(seed), look.supersampling
     xy = sample_rays(settings, ss)
     grey = Plate(target, cam_T_plate, look).grey(xy)

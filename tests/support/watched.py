@@ -24,6 +24,7 @@ from gripmon.model.records import (
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, Cover, Creep
+from support.kept import kept
 from support.meters import box_gripper, difference
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
@@ -80,11 +81,17 @@ def frames_of(scene: str) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
 
 
 def rendered(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
-    simulator = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
-    frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
+    frames, truths = _rendered(scenario)
     for frame in frames:
         assert frame.image is not None
         frame.image.flags.writeable = False
+    return frames, truths
+
+
+@kept
+def _rendered(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
+    simulator = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
+    frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     return frames, tuple(simulator.truth(i) for i in range(len(frames)))
 
 
