@@ -165,6 +165,29 @@ def test_each_target_that_is_missed_is_named():
     assert missed([(xarm, replace(good, valid=11)), (xarm, good)]) == []  # one way of two is enough
 
 
+def test_rows_of_two_commits_stand_beside_each_other_however_many_bounds_they_have():
+    from benchmarks.real import report
+    from benchmarks.real_figures import figures_of
+
+    def rows(*bounds):
+        runs = [
+            msgspec.structs.replace(run_of(*[still(np.zeros(6))] * 3), name=name, taught=taught, bound=bound)
+            for name in ("one", "other")
+            for bound in bounds
+            for taught in (False, True)
+        ]
+        return [(run, figures_of(run)) for run in runs]
+
+    text = report({"before": rows("absolute"), "now": rows("reference", "absolute")}, [])
+    cells = [line.strip("| ").split(" | ")[:3] for line in text.splitlines()[2:] if line.startswith("| ")]
+    assert cells == [
+        [f"{name}, {way}", *of]
+        for name in ("one", "other")
+        for way in ("untaught", "taught")
+        for of in (("before", "absolute"), ("now", "reference"), ("now", "absolute"))
+    ]
+
+
 @pytest.fixture(scope="module")
 def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten stills of a gripper that stands still in a camera that moves over a table."""

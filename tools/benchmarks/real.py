@@ -176,12 +176,12 @@ _HEAD = (
 
 def report(found: dict[str, list[tuple[Run, Figures]]], faults: list[str]) -> str:
     """The table, a row for each set, way, bound and commit; what makes the bounds as large; what is missed."""
-    revisions = list(found)
     lines, why = [_HEAD], []
-    for index in range(max(map(len, found.values()))):
-        for revision in revisions:
-            if index < len(found[revision]):
-                run, figures = found[revision][index]
+    every = [(revision, run, figures) for revision, own in found.items() for run, figures in own]
+    ways = dict.fromkeys((run.name, run.taught) for _, run, _ in every)
+    for way in ways:  # a commit's rows of one set beside the other's
+        for revision, run, figures in every:
+            if (run.name, run.taught) == way:
                 lines.append(_row(run, figures, revision))
                 why += _why(run, figures, revision)
     targets = [f"MISSED: {fault}" for fault in faults] or ["every target is reached"]
@@ -216,7 +216,9 @@ def _row(run: Run, figures: Figures, revision: str) -> str:
 
 def _why(run: Run, figures: Figures, revision: str) -> list[str]:
     what = f"{run.name}, {_way(run)}, {run.bound}, {revision}"
-    out = [f"{what}: the bound is as large since it can't be excluded: {_counts(figures.hypotheses)}"]
+    out = []
+    if figures.hypotheses:
+        out.append(f"{what}: the bound is as large since it can't be excluded: {_counts(figures.hypotheses)}")
     if figures.reasons:
         out.append(f"{what}: not measured: {_counts(figures.reasons)}")
     return out + [f"{what}: {each}" for each in figures.teaching]
