@@ -136,6 +136,7 @@ class MeshCamera:
             for cell, weight in ((80, 30.0), (20, 15.0), (6, 6.0))
         )
         self._table = 70.0 + table
+        self._newest: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None  # often nothing but the table moves
 
     def picture(
         self,
@@ -162,6 +163,12 @@ class MeshCamera:
 
     def _fingers(self, cam_T_grip: np.ndarray, offsets_m: Sequence[np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
         """Part of the background that passes by them, and their light."""
+        at = b"".join(np.asarray(given, float).tobytes() for given in (cam_T_grip, *(offsets_m or ())))
+        if self._newest is None or self._newest[0] != at:
+            self._newest = at, self._drawn(cam_T_grip, offsets_m)
+        return self._newest[1]
+
+    def _drawn(self, cam_T_grip: np.ndarray, offsets_m: Sequence[np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
         shape = self._camera.height_px, self._camera.width_px
         passes, light = np.ones(shape), np.zeros(shape)
         for k, vertices, faces, normals, gain in self._meshes:
