@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+# As the command line does it, before NumPy is imported: with a thread for each core, linear algebra takes up to three
+# times the processor time beside other tests, and rounds otherwise from machine to machine.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
+
+import cv2
 import hypothesis
 import pytest
 import zenoh
@@ -22,6 +29,8 @@ from gripmon.monitor import warm_up
 # No test fails because a machine is slow.
 hypothesis.settings.register_profile("unhurried", deadline=None)
 hypothesis.settings.load_profile("unhurried")
+
+cv2.setNumThreads(1)
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

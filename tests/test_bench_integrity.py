@@ -123,7 +123,7 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
 
 @pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
-    from benchmarks.integrity_misleading import CONDITIONS
+    from benchmarks.integrity_practice import CONDITIONS
     from benchmarks.integrity_scenes import make_integrity_scene
     from benchmarks.outline_seen import outline_seen
 
@@ -145,7 +145,7 @@ def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
 
 @pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_conditions_hide_what_they_say():
-    from benchmarks.integrity_misleading import CONDITIONS
+    from benchmarks.integrity_practice import CONDITIONS
     from benchmarks.integrity_runs import View, _view
     from benchmarks.integrity_scenes import make_integrity_scene
 

@@ -344,6 +344,19 @@ def test_a_state_belongs_to_camera_gripper_and_reference_whatever_else_changes(f
 # --- what earlier versions had ---
 
 
+@pytest.mark.parametrize(("enabled", "effect"), [("true", "; transforms come from the edges alone"), ("false", "")])
+def test_the_look_as_a_measurement_is_gone_with_a_line(
+    folder: Path, caplog: pytest.LogCaptureFixture, enabled: str, effect: str
+):
+    path = edited(folder, r"^source:", f"monitor: {{floor_m: 3e-6, look: {{enabled: {enabled}}}}}\nsource:")
+    assert load_config(path).settings.monitor.floor_m == 3e-6
+    what = f"monitor.look: the look as a measurement is gone{effect}; remove the section"
+    assert caplog.messages == [f"{path}: {what}"]
+    caplog.clear()
+    load_config(path, say_deprecated=False)  # of a recording: only where it decided something
+    assert len(caplog.messages) == (enabled == "true")
+
+
 def test_a_largest_sigma_is_read_as_the_alert_limit_that_it_stands_for(folder: Path, caplog: pytest.LogCaptureFixture):
     path = edited(folder, r"^source:", "monitor: {policy: {suspect_sigma_m: 0.003}}\nsource:")
     policy = load_config(path).settings.monitor.policy

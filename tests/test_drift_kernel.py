@@ -69,7 +69,6 @@ def test_each_frame_is_found_alike(noise: Callable[..., np.ndarray]):
                 expected.restart(np.array([True, False, True]), np.array([0, 0, 5]))
             for test in (found, expected):
                 test.set_reference_covariance(0.1 * COVARIANCE)
-                test.set_bias(0.2 * COVARIANCE, 0.05)
     assert 100 < moved < STREAMS * (FRAMES - STILL), "of both kinds"
     assert_alike(found, expected)
 

@@ -77,7 +77,9 @@ def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
     if bevel_m:
         assert len(errors) > 0.5 * simulator.frame_count
         return
-    assert len(errors) >= 0.98 * simulator.frame_count
+    # One jaw shows four edges, and three have to be told from what is behind them.  Where its tip isn't, nothing says
+    # how far it has slid along itself: the transform is held.  With two fingers there is always another edge.
+    assert len(errors) >= (0.98 if gripper.has_jaw else 0.9) * simulator.frame_count
     across, along = np.linalg.norm(np.array(errors)[:, :2], axis=1), np.abs(np.array(errors)[:, 2])
     assert np.quantile(across, 0.95) < 1e-4
     # One jaw of 8 mm by itself hardly tells its distance, and is never valid: its file says so.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.drift_noise import COVARIANCE, SIGMA, autocorrelated, white
 
-from gripmon.judge.drift import DriftSettings, Lasting, MotionWatch
+from gripmon.judge.drift import DriftSettings, MotionWatch
 from gripmon.model.records import AlertKind, Motion
 
 FPS = 60.0
@@ -179,56 +179,3 @@ def test_an_unmoved_camera_is_quiet_for_minutes(noise: object):
     motions = [watch.add(shift, COVARIANCE, index / FPS) for index, shift in enumerate(shifts)]
     assert not any(m.present or m.begun or m.stepped or m.vibration or m.creep for m in motions)
     assert sum(not m.quiet for m in motions) < 120, "seldom does anything speak for a motion"
-
-
-FINE = COVARIANCE / 100.0
-LASTS = Lasting(COVARIANCE / 25.0, 1.0 / 64.0)
-
-
-def wandering(rng: np.random.Generator, frames: int) -> np.ndarray:
-    """A bias (n, 6) of which each frame changes as much as is claimed."""
-    root, keep = np.linalg.cholesky(LASTS.covariance), 1.0 - LASTS.share
-    out = np.empty((frames, 6))
-    at = root @ rng.normal(size=6)
-    for row in out:
-        at = keep * at + np.sqrt(1.0 - keep**2) * (root @ rng.normal(size=6))
-        row[:] = at
-    return out
-
-
-def feed_finer(stream: Stream, shifts: np.ndarray) -> list[Motion]:
-    """Frames that a finer measurement refines: a tenth of the noise, and a fifth of it as a bias that wanders."""
-    noise = 0.1 * white(stream.rng, len(shifts), 1)[:, 0] + wandering(stream.rng, len(shifts))
-    out = []
-    for shift in shifts + noise:
-        out.append(stream.watch.add(shift, FINE, stream.frames / FPS, LASTS))
-        stream.frames += 1
-    return out
-
-
-def test_finer_frames_show_finer_steps_whatever_was_learnt_of_the_others():
-    """Of three standard deviations of the others, which do not show it."""
-    step = np.tile(3.0 * np.linalg.cholesky(COVARIANCE)[:, 0], (10, 1))
-    by_edges = quiet_stream(5)
-    assert not any(m.present for m in by_edges.feed(step))
-    stream = quiet_stream(5)
-    assert not any(m.present for m in feed_finer(stream, np.zeros((300, 6))))
-    after = feed_finer(stream, step)
-    assert next(n for n, motion in enumerate(after, 1) if motion.present) <= 3
-
-
-def test_a_bias_that_wanders_as_claimed_is_no_motion():
-    stream = Stream(MotionWatch(DriftSettings()), np.random.default_rng(9))
-    stream.watch.reset(COVARIANCE)
-    assert not any(m.present for m in feed_finer(stream, np.zeros((20_000, 6))))
-
-
-def test_frames_of_either_kind_by_turns_are_no_motion_and_show_one():
-    stream = quiet_stream(7)
-    stream.watch.reset(COVARIANCE)
-    for turn in range(40):
-        frames = np.zeros((1 + 7 * turn, 6))
-        told = feed_finer(stream, frames) if turn % 2 else stream.feed(frames)
-        assert not any(m.present for m in told)
-    moved = [m for turn in range(4) for m in (feed_finer if turn % 2 else Stream.feed)(stream, along_x(1e-4, 3))]
-    assert any(m.present for m in moved)

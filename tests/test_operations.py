@@ -20,6 +20,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 import yaml
 from support import sample_messages
@@ -290,6 +291,17 @@ def test_a_state_file_of_an_earlier_version_is_read():
     ]
     assert state.cam_T_grip is not None
     assert state.cam_T_grip.translation_m == (0.000597295714525558, 0.005899351611529782, 0.11938553681998723)
+
+
+def test_a_state_that_still_holds_a_learnt_look_loses_nothing_else():
+    """Of a monitor whose look was a measurement."""
+    data = lzma.decompress((KEPT / "state_look.json.xz").read_bytes())
+    written = json.loads(data)["content"]["state"]
+    assert {"finer", "strips"} <= written["look"].keys()
+    again = json.loads(msgspec.json.encode(unpack(data).state))
+    assert {key: value for key, value in again.items() if key != "look"} == {
+        key: value for key, value in written.items() if key != "look"
+    }
 
 
 def test_a_recording_of_an_earlier_version_is_read(tmp_path: Path):

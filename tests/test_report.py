@@ -22,8 +22,6 @@ from gripmon.model.records import (
     AlertKind,
     Cause,
     FrameRecord,
-    LookNote,
-    LookVersion,
     RecordedConfiguration,
     Severity,
     Verdict,
@@ -460,44 +458,3 @@ def test_what_is_not_used_is_not_shown_in_green():
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))
     assert green[0] > 200 and green[1] == 0
-
-
-def look_note(different: tuple[int, ...]) -> LookNote:
-    version = LookVersion(2, "finger left looked different", "factory", 3, START_NS, START_NS + SECOND_NS)
-    return LookNote(version, 14, 8, ((60, 40), (90, 40), (60, 70)), different)
-
-
-def test_a_finger_that_looks_different_is_an_event_since_it_did_with_version_and_share():
-    run = records(np.zeros((300, 3)))
-    since_ns = START_NS + 100 * PERIOD_NS
-    told = {"kind": AlertKind.LOOK, "cause": Cause.UNKNOWN, "causes": (), "alert_id": "", "event": AlertEvent.NOTED}
-    text = "the gripper looks different: finger left, since 12:00:00 UTC"
-    said(run, 200, **told, severity=Severity.WARNING, text=text, since_ns=since_ns, look=look_note((1,)))
-    report, analysed = build([Run(run)])
-    ((event,),) = (one.events for one in report.recordings)
-    assert event.onset.stamp_ns == since_ns and event.noticed_ns == START_NS + 200 * PERIOD_NS
-    shown = text_of(page(report, analysed))
-    assert "The gripper looks different: finger left" in shown
-    assert "Look 2 (finger left looked different), learnt before 14 backgrounds" in shown
-    assert "reference factory, revision 3, was in force: 1 of 3 blocks of pixels look different" in shown
-
-
-def test_the_picture_of_a_look_marks_each_block_where_it_is():
-    """Red where the block differs, green where it looks as learnt, nothing in between."""
-    nothing = np.empty((0, 2), np.float32)
-    grey = np.full((120, 160), 128, np.uint8)
-    picture = Picture(7, START_NS, grey, "image/png", nothing, nothing, (), nothing, ())
-    (shown,) = cut_alike([JudgedPicture(picture, True)], look_note((1,)))
-    assert shown is not None
-    data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
-    image, scale = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int), shown.width_px / 160.0
-
-    def coloured(u: int, v: int) -> tuple[float, float]:
-        low, high = (np.floor((np.array([u, v]) + d) * scale).astype(int) for d in (-5.5, 6.5))
-        part = image[low[1] : high[1], low[0] : high[0]]
-        return float((part[..., 2] - part[..., 1]).max()), float((part[..., 1] - part[..., 2]).max())
-
-    for number, (u, v) in enumerate(look_note(()).places_px):
-        red, green = coloured(u, v)
-        assert (red > 90 and green < 40) if number == 1 else (green > 60 and red < 40)
-    assert max(coloured(120, 100)) < 15

@@ -37,8 +37,8 @@ from gripmon.record.table import FrameTable
 _END_FRAMES = 15
 _OVERLAY_FRAMES = 6
 _SEEN = (
-    *MOTIONS, AlertKind.VIBRATION, AlertKind.GRIPPER, AlertKind.LOOK, AlertKind.LENS, AlertKind.LOST,
-    AlertKind.OCCLUDED, AlertKind.IMAGE, AlertKind.STREAM,
+    *MOTIONS, AlertKind.VIBRATION, AlertKind.GRIPPER, AlertKind.LENS, AlertKind.LOST, AlertKind.OCCLUDED,
+    AlertKind.IMAGE, AlertKind.STREAM,
 )  # fmt: skip
 """Kinds of events for which pictures may be instructive."""
 

@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records import CauseWeight, LookNote
+from gripmon.model.records import CauseWeight
 
 Vector = tuple[float, float, float]
 
@@ -73,10 +73,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     after_seq: Annotated[int | None, _is("frame of the picture after: the first valid one, if there is one")] = None
     story: Annotated[tuple[Moment, ...], _is("its alerts, in order")] = ()
-    look: Annotated[
-        LookNote | msgspec.UnsetType,
-        _is("of the gripper's learnt look which one, and where; left out for all else"),
-    ] = msgspec.UNSET
 
 
 class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):

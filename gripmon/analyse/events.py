@@ -15,7 +15,6 @@ from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Ref
 TITLES = {
     AlertKind.VIBRATION: "The camera vibrated",
     AlertKind.GRIPPER: "The gripper is not as it should be",
-    AlertKind.LOOK: "The gripper's look",
     AlertKind.LENS: "Focus or zoom changed",
     AlertKind.RECALIBRATED: "Recalibrated: a new reference",
     AlertKind.PROPOSED: "A new reference waits for an operator",
@@ -58,7 +57,6 @@ def _event(history: AlertHistory) -> Event:
         part=alert.part,
         causes=alert.causes,
         alert_id=alert.alert_id,
-        look=alert.look,
         story=tuple(
             Moment(a.stamp_ns, a.alert.text if noted else f"{a.alert.event}: {a.alert.text}") for a in history.all
         ),

@@ -10,7 +10,6 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +32,7 @@ from gripmon.analyse.content import (
 )
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.summary import CAUSES, cause_words
-from gripmon.model.records import AlertKind, CauseWeight, LookNote, Origin
+from gripmon.model.records import AlertKind, CauseWeight, Origin
 from gripmon.record.recorder import to_8_bit
 from gripmon.record.recordings import Picture
 
@@ -104,7 +103,7 @@ def _title(report: Report) -> str:
 
 def _cards(events: Sequence[Event]) -> list[Event]:
     """Motions, new references and warnings; if there are many, the most severe and largest of them."""
-    always = (*MOTIONS, AlertKind.RECALIBRATED, AlertKind.LOOK)
+    always = (*MOTIONS, AlertKind.RECALIBRATED)
     worthy = [e for e in events if e.kind in always or (e.severity != "info" and e.kind != "gap")]
     worthy.sort(key=lambda e: (_RANK.get(e.severity, 0), 0.0 if e.moved is None else e.moved.size_m), reverse=True)
     return worthy[:_MOST_CARDS]
@@ -112,7 +111,7 @@ def _cards(events: Sequence[Event]) -> list[Event]:
 
 def _pictures(analysed: AnalysedRecording, event: Event) -> tuple[ShownPicture | None, ...]:
     seqs = event.before_seq, event.at_seq, event.after_seq
-    return cut_alike([_judged(analysed, seq) for seq in seqs], event.look)
+    return cut_alike([_judged(analysed, seq) for seq in seqs])
 
 
 def _judged(analysed: AnalysedRecording, seq: int | None) -> JudgedPicture | None:
@@ -180,8 +179,6 @@ def _sentences(event: Event) -> str:
     if event.moved is None and event.story:
         text = event.story[0].text.removeprefix("raised: ")
         parts.insert(0, f"{text[:1].upper()}{text[1:]}.".replace("..", "."))
-    if event.look is not msgspec.UNSET:
-        parts.append(_look_words(event.look))
     if event.end_text:
         parts.append(
             f"It was over at {clock_time(event.end_ns, 1)}: {event.end_text}."
@@ -189,17 +186,6 @@ def _sentences(event: Event) -> str:
             else f"In the end: {event.end_text}."
         )
     return " ".join(parts)
-
-
-def _look_words(look: LookNote) -> str:
-    version = look.version
-    blocks = count(len(look.places_px), "block") + " of pixels"
-    alike = f"{len(look.different)} of {blocks} look different (red)" if look.different else f"{blocks} are learnt"
-    return (
-        f"Look {version.number} ({version.origin}), learnt before {count(look.views, 'background')} from "
-        f"{clock_time(version.first_stamp_ns, 0)} on, when reference {version.reference_id}, revision "
-        f"{version.revision}, was in force: {alike}."
-    )
 
 
 def _around(event: Event) -> tuple[float, float]:
@@ -246,11 +232,9 @@ class ShownPicture:
     height_px: int
 
 
-def cut_alike(
-    pictures: Sequence[JudgedPicture | None], look: LookNote | msgspec.UnsetType = msgspec.UNSET
-) -> tuple[ShownPicture | None, ...]:
+def cut_alike(pictures: Sequence[JudgedPicture | None]) -> tuple[ShownPicture | None, ...]:
     """Pictures in order of time (any may be None), cropped to the same part of the image; the gripper's outline in the
-    first one is also drawn into the later ones, in white.  A ``look`` is drawn over all of them instead of edge points.
+    first one is also drawn into the later ones, in white.
     """
     there = [each.picture for each in pictures if each is not None]
     if not there:
@@ -260,9 +244,7 @@ def cut_alike(
     box = _box(list(shown), width, height)
     first = pictures[0]
     outline = () if first is None else tuple(first.picture.predicted_edges)
-    return tuple(
-        None if each is None else _shown(each, box, () if each is first else outline, look) for each in pictures
-    )
+    return tuple(None if each is None else _shown(each, box, () if each is first else outline) for each in pictures)
 
 
 def _corners(picture: Picture) -> Points:
@@ -287,12 +269,7 @@ def _box(points: Sequence[Points], width: int, height: int) -> tuple[int, int, i
     return int(corner[0]), int(corner[1]), int(corner[0] + size[0]), int(corner[1] + size[1])
 
 
-def _shown(
-    judged: JudgedPicture,
-    box: tuple[int, int, int, int],
-    outline: Sequence[Points],
-    look: LookNote | msgspec.UnsetType,
-) -> ShownPicture | None:
+def _shown(judged: JudgedPicture, box: tuple[int, int, int, int], outline: Sequence[Points]) -> ShownPicture | None:
     left, top, right, bottom = box
     picture, used = judged
     image = to_8_bit(picture.image)
@@ -314,16 +291,10 @@ def _shown(
         cv2.polylines(
             canvas, [p for p in polylines if len(p) > 1], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
         )
-    if look is not msgspec.UNSET:
-        _draw_look(canvas, place, look, scale)
     for points, colour, radius in (
-        ()
-        if look is not msgspec.UNSET
-        else (
-            (picture.edges_used, USED if used else REFUSED, 2),
-            (picture.edges_refused, REFUSED, 2),
-            (_corners(picture)[: None if used else 0], CORNER, 5),
-        )
+        (picture.edges_used, USED if used else REFUSED, 2),
+        (picture.edges_refused, REFUSED, 2),
+        (_corners(picture)[: None if used else 0], CORNER, 5),
     ):
         for x, y in place(points).tolist():
             filled = -1 if radius < 5 else 2
@@ -333,15 +304,3 @@ def _shown(
         return None
     text = base64.b64encode(encoded.tobytes()).decode("ascii")
     return ShownPicture(int(picture.seq), f"data:image/jpeg;base64,{text}", *size)
-
-
-def _draw_look(
-    canvas: NDArray[Any], place: Callable[[Points], NDArray[np.int32]], look: LookNote, scale: float
-) -> None:
-    """The learned blocks of pixels: green where they look as learned, red where they differ."""
-    half = round(0.5 * scale * look.block_px * 2**_SUBPIXEL_BITS)
-    for number, place_px in enumerate(look.places_px):
-        for x, y in place(np.array(place_px, np.float32)).tolist():
-            colour = REFUSED if number in look.different else USED
-            corners = (x - half, y - half), (x + half, y + half)
-            cv2.rectangle(canvas, *corners, colour, 2 if number in look.different else 1, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -21,6 +21,7 @@ from gripmon.analyse.content import (
     span,
 )
 from gripmon.analyse.events import MOTIONS
+from gripmon.model.coverage import too_few
 from gripmon.model.records import AlertKind, Cause
 
 CAUSES: dict[str, str] = {
@@ -59,8 +60,16 @@ def paragraph(report: RecordingReport) -> str:
     if not report.running.frames:
         return f"{who}: no frame could be read, so nothing is known about its camera."
     motions = [event for event in report.events if event.kind in MOTIONS]
-    parts = [_motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
+    parts = [_too_few(report), _motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
     return " ".join(part for part in parts if part)
+
+
+def _too_few(report: RecordingReport) -> str:
+    """What the reader must know before anything else."""
+    running = report.running
+    measured = running.frames - running.frames_refused
+    text = too_few(measured, dropped=running.frames_dropped, unmeasured=running.frames_refused)
+    return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 def headline(report: RecordingReport) -> str:

@@ -32,7 +32,7 @@ _SHORTEST_S = 4.0
 _OPTIONS = f"""
 --seconds S  length, over which the events are spread (s; default 20, at least {_SHORTEST_S:g})
 --out DIR    folder for the results (default: gripmon-demo-DATE-TIME here)
---fps HZ     frame rate of the camera (1/s; default 60)
+--fps HZ     frame rate of the camera (1/s; default: 60, 30 or 15, whatever this machine can keep)
 --seed N     random seed of the simulation (default 1)
 {VIEW_OPTION.strip()}
 """
@@ -40,7 +40,7 @@ _OPTIONS = f"""
 _EXAMPLES = """\
   gripmon demo
   gripmon demo --seconds 60 --out demo/
-  gripmon demo --fps 25                  on a slow machine
+  gripmon demo --fps 25
 
 exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
@@ -52,7 +52,8 @@ exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 )  # fmt: skip
 def demo(arguments: Arguments) -> int:
     """Run the whole daemon on a simulated wrist camera: a cable pulls the camera aside (creep), a collision
-    knocks it by 4.5 mm (bump), a hand covers the view (occlusion).  Transforms are published over Zenoh
+    knocks it by 4.5 mm (bump), a hand covers the view (occlusion).  Before it begins, it measures what
+    this machine can render and process, and chooses the camera's frame rate.  Transforms are published over Zenoh
     within this process and received back, everything is recorded, and at the end the corrected
     position of the tool centre point (TCP) is compared with the truth (mm).
 
@@ -60,17 +61,27 @@ def demo(arguments: Arguments) -> int:
     """
     if arguments.seconds < _SHORTEST_S:
         raise InputError(f"demo: --seconds {arguments.seconds:g} is too short for its events; at least {_SHORTEST_S:g}")
-    from gripmon.daemon.simulated import Demo, demo_config
+    from gripmon.daemon.service import log_to_stderr
+    from gripmon.daemon.simulated import Demo, at_own_pace, demo_config
+    from gripmon.monitor import warm_up
 
     config = demo_config(arguments.seconds, fps=arguments.fps, seed=arguments.seed, viewed=arguments.view is not None)
-    demo = Demo(config)
+    Demo(config)  # refuses impossible scenarios before anything takes time
     out = make_directory(arguments.out or Path(f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
     check_file(out / "estimates.jsonl")
     settings = config.settings
     where = f"{settings.publish.listen[0]}, key gripmon/{settings.robot}/{settings.camera_name}/transform"
     length = f"{arguments.seconds:g} s of a simulated wrist camera"
     print(f"{length}; transforms on {where}; results in {out}", file=sys.stderr)
-    with signals_exit() as stop, progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
+    with signals_exit() as stop, ExitStack() as messages:
+        log_to_stderr()
+        if compiled := warm_up():
+            print(compiled, file=sys.stderr)
+        if arguments.fps is None:
+            config, pace = at_own_pace(config)
+            print(pace.text(), file=sys.stderr)
+        demo = Demo(config)
+        step = messages.enter_context(progress_bar(demo.frame_count, "frame"))
         code, summary = demo.run(
             out, step=step, on_network=lambda: messages.enter_context(messages_above_bar("gripmon")),
             view=arguments.view, stop=stop,
@@ -89,11 +100,13 @@ def _as_text(summary: DemoSummary, out: Path) -> str:
     return "\n".join(
         [
             "",
+            *([f"{summary.caution}", ""] if summary.caution else []),
             *comparison.table(),
             "",
             *(event.text() for event in comparison.events),
             "",
             f"frames     {summary.frames} ({verdicts}), {summary.frames_dropped} dropped",
+            f"camera     {summary.camera_fps:g} frames/s",
             f"Zenoh      {summary.transforms_received} transforms received",
             f"latency    {_latency_line(summary.latency_ms)}, from frame to published transform",
             f"           {_latency_line(summary.latency_while_tracking_ms)} while tracking (not searching)",

@@ -17,6 +17,7 @@ from gripmon.daemon.neighbours import JawFeed
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
 from gripmon.model.errors import in_short
+from gripmon.model.priority import give_way
 from gripmon.model.records import (
     Command,
     CommandReply,
@@ -56,7 +57,7 @@ class Daemon(Loop):
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
         self._kept_revision: int | None = None
-        self._beside = ThreadPoolExecutor(1, "analysis")
+        self._beside = ThreadPoolExecutor(1, "analysis", give_way)
         self._working: Future[None] | None = None
         self._reference, self._reference_due = monitor.reference, True
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S

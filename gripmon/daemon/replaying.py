@@ -19,8 +19,10 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import NEGLIGIBLE_PX, compare_cameras
 from gripmon.daemon.api import Monitor, open_source
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_pulses, load_second
+from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.recorded_run import RecordedRun, one_recording
+from gripmon.daemon.watch import is_refused
 from gripmon.io.sources import (
     BagSettings,
     EpisodeSettings,
@@ -33,6 +35,7 @@ from gripmon.io.sources import (
 from gripmon.io.sources import open_source as start
 from gripmon.io.sources.files import TIMESTAMPS_NAME
 from gripmon.model.camera import LensSettings
+from gripmon.model.coverage import too_few
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.records import (
@@ -45,6 +48,7 @@ from gripmon.model.records import (
     SpotRecord,
     unmeasured_record,
 )
+from gripmon.monitor import warm_up
 from gripmon.record.read import recordings_below
 from gripmon.record.recorder import Recorder
 
@@ -125,6 +129,7 @@ class Counts:
     def __init__(self) -> None:
         self.frames = 0
         self.usable = 0
+        self._refused = 0
         self._verdicts: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()  # why nothing was measured, by the text before the colon
         self._examples: dict[str, str] = {}  # the first reason of each kind, whole
@@ -134,12 +139,18 @@ class Counts:
         """Count one frame."""
         self.frames += 1
         self.usable += record.source is not Origin.HELD
+        self._refused += is_refused(record)
         self._verdicts[record.verdict] += 1
         if record.reason and not record.measured:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
             self._examples.setdefault(kind, record.reason)
         self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
+
+    def caution(self) -> list[str]:
+        """A line that comes first, if too little was measured."""
+        text = too_few(self.usable, dropped=0, refused=self._refused, unseen=self.frames - self.usable - self._refused)
+        return [text] if text and self.usable else []
 
     def summary(self) -> str:
         """One line."""
@@ -195,7 +206,8 @@ class FrameReplay:
 
     def summary(self) -> list[str]:
         """A summary of the frames, and of the differences from the recorded run."""
-        return [self._counts.summary(), *([] if self._recorded is None else [self._recorded.summary()])]
+        compared = [] if self._recorded is None else [self._recorded.summary()]
+        return [*self._counts.caution(), self._counts.summary(), *compared]
 
     @property
     def usable(self) -> bool:
@@ -287,6 +299,9 @@ def open_replay(
             warn(note)
         if (text := limits_warning(config)) is not None:
             warn(text)
+        if given is not None and (text := reference_doubt(given.settings)) is not None:
+            warn(f"{given.path}: {text}")
+        warm_up()
         yield FrameReplay(source, config, run, warn)
 
 

@@ -20,8 +20,10 @@ from gripmon import __version__
 from gripmon.analyse.comparison import Comparison, compare
 from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
 from gripmon.daemon.config.yaml_file import lines_of, yaml_value
+from gripmon.daemon.watch import is_refused
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
+from gripmon.model.coverage import too_few
 from gripmon.model.errors import InputError, input_errors
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
@@ -43,6 +45,7 @@ from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
 
 if TYPE_CHECKING:
     from gripmon.client import Client
+    from gripmon.daemon.pace import Pace
 
 _ZENOH_PORT = 7447
 _CONNECT_S = 5.0
@@ -180,8 +183,12 @@ class Latency(msgspec.Struct, frozen=True):
 
 
 class DemoSummary(msgspec.Struct, frozen=True):
-    """The result of the demo, as in ``summary.json``."""
+    """The result of the demo, as in ``summary.json``.  ``caution``: what to read first, empty if nearly all frames were
+    measured; ``camera_fps``: of the simulated camera.
+    """
 
+    caution: str
+    camera_fps: float
     frames: int
     frames_dropped: int
     frames_per_s: float | None
@@ -190,6 +197,24 @@ class DemoSummary(msgspec.Struct, frozen=True):
     latency_while_tracking_ms: Latency
     recordings: tuple[str, ...]
     comparison: Comparison
+
+
+def at_own_pace(config: Config) -> tuple[Config, Pace]:
+    """The demo's configuration with the frame rate that this machine can keep, which is measured.
+
+    Raises :class:`InputError` if nothing can be rendered.
+    """
+    from gripmon.daemon.pace import measure_pace
+
+    source = config.settings.source
+    assert isinstance(source, SimulatedSettings), "the shipped demo.yaml has a simulated camera"
+    try:
+        simulator = make_simulator(source, config.scene, config.directory)
+        pace = measure_pace(config, simulator, source.processes)
+    except SourceError as error:
+        raise InputError(f"demo: {error}") from None
+    settings = msgspec.structs.replace(config.settings, source=msgspec.structs.replace(source, fps=pace.fps))
+    return dataclasses.replace(config, settings=settings), pace
 
 
 def demo_config(duration_s: float, *, fps: float | None = None, seed: int = 1, viewed: bool = False) -> Config:
@@ -302,9 +327,13 @@ def _summarise(out: Path, simulator: Simulator, received: int) -> DemoSummary | 
         return None
     latencies_ms = 1e-6 * np.array([record.latency_ns for record in records])
     span_s = 1e-9 * (records[-1].stamp_ns - records[0].stamp_ns)
+    dropped = records[-1].seq + 1 - len(records)
+    measured, refused = sum(r.measured for r in records), sum(is_refused(r) for r in records)
     summary = DemoSummary(
+        caution=too_few(measured, dropped=dropped, refused=refused, unseen=len(records) - measured - refused),
+        camera_fps=simulator.scenario.fps,
         frames=len(records),
-        frames_dropped=records[-1].seq + 1 - len(records),
+        frames_dropped=dropped,
         frames_per_s=(len(records) - 1) / span_s if span_s > 0.0 else None,
         transforms_received=received,
         latency_ms=_latency(latencies_ms),

@@ -21,6 +21,7 @@ from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import PendingCommand, ZenohCommands
 from gripmon.io.publish.presence import in_words
 from gripmon.io.sources import Source, Waiting
+from gripmon.model.coverage import too_few
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Alert,
@@ -150,6 +151,10 @@ class Loop(ABC):
         self._service.stopping()
         self._finish()
         self._publish_state(time.monotonic())
+        unseen = watch.frames - watch.frames_usable - watch.frames_refused
+        few = too_few(watch.frames_usable, dropped=self._source.dropped, refused=watch.frames_refused, unseen=unseen)
+        if few:
+            _log.warning("%s", few)
         _log.info(
             "stopped after %d frames, %d refused, %d dropped", watch.frames, watch.frames_refused, self._source.dropped
         )

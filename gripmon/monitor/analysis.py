@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.judge.causes import CauseJudge, Watches
-from gripmon.judge.drift import Baseline, Lasting, MotionWatch
+from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.judge.policy import Evidence
 from gripmon.judge.stream import CALM_FRAMES, StreamFault, StreamWatch
 from gripmon.model.camera import Camera
@@ -246,10 +246,7 @@ class FrameAnalysis:
         if 0 < self._astray < DOUBTED_FRAMES or not standing.believed:
             motion = self.watch.skip()
         else:
-            since_start, changes, bias, finer = self._since_start(shift, covariance), covariance, None, standing.finer
-            if finer is not None:
-                changes, bias = finer.of_change, Lasting(finer.of_bias, finer.renewed)
-            motion = self.watch.add(since_start, changes, now_s, bias)
+            motion = self.watch.add(self._since_start(shift, covariance), covariance, now_s)
         if motion.stepped:
             self.causes.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None

@@ -170,7 +170,6 @@ class Monitor:
         isn't used afterwards.
         """
         self.learn()
-        self._due += self._trust.take_alerts()
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         opening: object = frame.jaw_opening_m
@@ -251,7 +250,8 @@ class Monitor:
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The measured pose is believed: update the averages and what is learnt."""
-        self._tracker.learn(standing.measurement, opening=not standing.grasped)
+        proven = standing.where_it_was and not standing.unproven
+        self._tracker.learn(standing.measurement, opening=not standing.grasped, proven=proven)
         jumped, self._jumped = self._jumped, False
         if jumped:
             self._average.forget()

@@ -16,18 +16,6 @@ from gripmon.judge.stream import StreamSettings
 from gripmon.track.edges import MeasurementSettings
 
 
-class LookSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The gripper's own look as a measurement."""
-
-    enabled: Annotated[
-        bool,
-        Meta(
-            description="true: pixels inside the fingers, learned while the monitor runs, refine the "
-            "transform that the edges give; the protection level still rests on the edges"
-        ),
-    ] = False
-
-
 class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The whole method, a section for each step."""
 
@@ -89,7 +77,6 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         ),
     ] = 1e-4
     corners: MeasurementSettings = MeasurementSettings()
-    look: LookSettings = LookSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
     drift: DriftSettings = DriftSettings()
     policy: PolicySettings = PolicySettings()

@@ -9,7 +9,6 @@ from gripmon.model.records import Array, ReferenceRecord
 from gripmon.monitor.refits import Anchored, Refits
 from gripmon.monitor.since import Bounds
 from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.look import Fused
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +51,7 @@ class Standing:
     ``believed``: averages, the drift test and learning use the pose.
     ``where_it_was``: the anchor has it there.  ``grasped``: an object between the fingers may have shifted their inner
     edges, and with them the opening.  ``knocked``: from this frame on the mount counts as knocked.  ``unproven``:
-    nothing in the frame proves the pose, though an earlier frame proved one.  ``finer``: the fusion of edges and look
-    behind the pose; None: it is from the edges alone.
+    nothing in the frame proves the pose, though an earlier frame proved one.
     """
 
     measurement: Measurement
@@ -65,7 +63,6 @@ class Standing:
     grasped: bool = False
     knocked: bool = False
     unproven: bool = False
-    finer: Fused | None = None
 
 
 class Question(NamedTuple):

@@ -25,6 +25,7 @@ from gripmon.track.edges import (
     SearchSettings,
     Sought,
     TaughtEdges,
+    edges_at_ends,
 )
 from gripmon.track.jaw import JawKnowledge
 
@@ -33,6 +34,11 @@ USUAL_SHARE = 0.6
 
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual inlier ratio follows a smaller and a larger one, per frame: a few bad frames hardly lower it."""
+
+SHOWN_FRAMES = 50
+"""Frames over which it is learnt how often each edge shows, as the usual inlier ratio follows a smaller one: one that
+was hidden once isn't given up.  That all show, which is assumed before, counts as one of them.
+"""
 
 CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
 """Largest number of corners of each variant, named as in the paper."""
@@ -131,6 +137,8 @@ class Tracker:
         """Digest of the taught edges; empty without any."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # as measured last
         self._usual_share = USUAL_SHARE
+        self._shown_frames = np.ones(len(gripper.edge_ids))
+        self._at_ends = edges_at_ends(gripper)
         # Separate meters, since they may run in parallel with a measurement.
         searcher = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         self.searching = GripperSearch(searcher, settings.corners.search, settings.policy.hold_s)
@@ -169,12 +177,19 @@ class Tracker:
         )
         return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
-    def learn(self, measurement: Measurement, opening: bool) -> None:
-        """Learn from a frame whose pose is believed: the usual inlier ratio, and, if the measured ``opening`` is
-        believed as well, the error of the reported one.
+    def learn(self, measurement: Measurement, opening: bool, proven: bool) -> None:
+        """Learn from a frame whose pose is believed: the usual inlier ratio, how often each edge shows, and, if the
+        measured ``opening`` is believed as well, the error of the reported one.  ``proven``: the fingers' ends are seen
+        in the gripper's place; else something may be in front of them, which is not to change how often they show.
         """
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
+        edges = measurement.prediction.layout.edges
+        edges = edges[~self._at_ends[edges] | proven]
+        self._shown_frames[edges] = np.minimum(self._shown_frames[edges] + 1.0, SHOWN_FRAMES)
+        shown = self._meter.shown.copy()  # a new array: a search may be using the old one
+        shown[edges] += (measurement.consensus.edge_seen[edges] - shown[edges]) / self._shown_frames[edges]
+        self._meter.shown = shown
         if opening and measurement.jaw_seen is not None:
             self._jaw.learn(measurement.jaw_seen)
 

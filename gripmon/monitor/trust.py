@@ -17,8 +17,7 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Alert, Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
-from gripmon.monitor.finer import FinerLook
+from gripmon.model.records import Array, Frame, Image, LookRecord, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, reaching
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
@@ -64,10 +63,6 @@ class Integrity:
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
-        self._finer = None
-        if settings.look.enabled:
-            self._finer = FinerLook(camera, gripper, self._look, tracker.floor, reference, tracker.taught_digest)
-        self._finer_swing: Array | None = None
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self.since_refused: str | None = None
@@ -85,8 +80,7 @@ class Integrity:
         record = self._look.state(reference.reference_id)
         if record is None:
             return None
-        strips, finer = self._strips.state(), None if self._finer is None else self._finer.state()
-        return msgspec.structs.replace(record, strips=strips or msgspec.UNSET, finer=finer or msgspec.UNSET)
+        return msgspec.structs.replace(record, strips=self._strips.state() or msgspec.UNSET)
 
     @property
     def unexplained(self) -> Array | None:
@@ -102,14 +96,12 @@ class Integrity:
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the vibration between proven poses, m² and rad²; of refined poses if the newest is one."""
-        return self._weigher.swing if self._finer_swing is None else self._finer_swing
+        """(6,) variance of the vibration between proven poses, m² and rad²."""
+        return self._weigher.swing
 
     def refer(self, reference: ReferenceRecord) -> None:
-        """Pass the reference in force to the look, and begin the motion since it."""
+        """Begin the motion since the reference in force."""
         self.since.refer(reference)
-        if self._finer is not None:
-            self._finer.refer(reference)
 
     def measured_again(self, reference: ReferenceRecord) -> None:
         """A new reference, in force or proposed, was measured from the newest frames."""
@@ -133,8 +125,6 @@ class Integrity:
                 self._look.restore(state.look, reference.reference_id)
                 if state.look.strips is not msgspec.UNSET:
                     self._strips.restore(state.look.strips)
-                if self._finer is not None and state.look.finer is not msgspec.UNSET:
-                    self._finer.restore(state.look.finer)
             except LookRefused as refused:
                 self.look_refused = str(refused)
         if state is not None:
@@ -147,12 +137,6 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
-        if self._finer is not None:
-            self._finer.learn()
-
-    def take_alerts(self) -> list[Alert]:
-        """Alerts about the gripper's look since the last call."""
-        return [] if self._finer is None else self._finer.take_alerts()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
@@ -183,17 +167,7 @@ class Integrity:
             why = "the gripper is elsewhere, since no frame has proved yet where it is"
             unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, self._policy.integrity_risk, why)
             standing = replace(standing, bounds=standing.bounds._replace(since_reference=unbounded))
-        if self._finer is not None and standing is not None:
-            standing = self._refined(self._finer, frame, standing, now_s)
         return standing
-
-    def _refined(self, look: FinerLook, frame: Frame, standing: Standing, now_s: float) -> Standing:
-        """The pose refined by the look, unless that puts a protection level past its alert limit."""
-        finer = look.refine(frame, standing, now_s, self._weigher.swing)
-        if self._past_limit(finer.bounds) and not self._past_limit(standing.bounds):
-            finer = standing
-        self._finer_swing = None if finer.finer is None else look.swing
-        return finer
 
     def _past_limit(self, both: Bounds) -> bool:
         """Whether the bound that makes a transform valid is past an alert limit."""

@@ -2,54 +2,224 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import logging
+import os
+import subprocess
+import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 from gripmon.judge import drift, smoothing, stream
 from gripmon.model import poses
-from gripmon.track import edges, integrity, look
+from gripmon.model.compiled import FUNCTIONS, Kept, Watched, locked
+from gripmon.track import edges, integrity
 
 _log = logging.getLogger(__name__)
 
-LOADED_WITHIN_S = 2.0
-"""A longer warm-up has compiled something, not only loaded it."""
+PARTS: dict[str, tuple[Callable[[], object], ...]] = {
+    "protection level": (integrity.warm_up,),
+    "joint fit": (edges.warm_up_fit,),
+    "drift": (drift.warm_up,),
+    "edge points": (edges.warm_up_profiles,),
+    "geometry": (edges.warm_up_geometry,),
+    "averages": (smoothing.warm_up, stream.warm_up, poses.warm_up),
+}
+"""What frames need, in parts that can be compiled at once, the longest first."""
 
 MOST_UNKEPT = 1000
 """Bound on retries for functions that can't be kept on the disk: more than there are functions."""
 
+MOST_HELPERS = 3
+"""Processes beside this one: with more there is nothing left to share."""
+
+SAID_EVERY_S = 10.0
+"""How often the log says how far the compiler is, where there is no terminal for a bar (s)."""
+
+ANOTHER_TAKES_S = 600.0
+"""How long another process that compiles the same is waited for (s): longer than the slowest known, which took 451."""
+
+_HOME = str(Path(__file__).resolve().parents[2])
+_BOOTSTRAP = (
+    "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
+    "from gripmon.monitor.warming import help_compiling; help_compiling()"
+)
+_DONE = "done"
+
 
 def warm_up() -> str:
-    """Load the machine code that frames need, or compile it, which takes a minute, once on a machine; return a message
-    for the user, or an empty string.
+    """Load the machine code that frames need, or compile it in all cores, once on a machine, with a bar on a terminal
+    and lines in the log elsewhere; return a message for the user, or an empty string.
     """
-    begin_s = time.perf_counter()
-    unkept = ""
-    patience = threading.Timer(LOADED_WITHIN_S, _log.info, ["compiling what every frame needs: about a minute, once"])
-    patience.daemon = True
-    patience.start()
-    for part in (edges, integrity, look, drift, smoothing, stream, poses):
-        unkept = _warm(part.warm_up) or unkept
-    patience.cancel()
+    begin_s, unkept = time.perf_counter(), ""
+    with contextlib.ExitStack() as closing:
+        work = _Work(closing)
+        Watched.watcher = work
+        closing.callback(setattr, Watched, "watcher", None)
+        while (part := work.next_part()) is not None:
+            unkept = _warm(part) or unkept
+        if work.shared():  # load what others compiled, and compile what they couldn't keep
+            for part in PARTS:
+                unkept = _warm(part) or unkept
     took_s = time.perf_counter() - begin_s
     _log.debug("the arithmetic of frames was ready after %.1f s", took_s)
-    if took_s < LOADED_WITHIN_S:
+    if not work.compiles:
         return ""
     text = f"what every frame needs was compiled, in {took_s:.0f} s"
-    if unkept:
+    if unkept := unkept or work.unkept:
         return f"{text}; it can't be kept ({unkept}), so that every start takes as long: set NUMBA_CACHE_DIR"
     return f"{text}; the next start loads it"
 
 
-def _warm(part: Callable[[], object]) -> str:
+def help_compiling() -> None:
+    """Entry point of a helping process: names of parts on standard input; on standard output what becomes of which
+    function, and "done" after each part.
+    """
+    Watched.watcher = _Told()
+    for line in sys.stdin:
+        _warm(line.strip())
+        _say(_DONE)
+
+
+def _warm(part: str) -> str:
     """Run one part's warm-up; return why its code could not be kept on the disk, or an empty string."""
     unkept = ""
-    for _ in range(MOST_UNKEPT):
-        try:
-            part()
-        except OSError as error:  # raised after a function was compiled: it works from then on
-            unkept = error.strerror or str(error)
-        else:
-            break
+    for warm in PARTS[part]:
+        for _ in range(MOST_UNKEPT):
+            try:
+                warm()
+            except OSError as error:  # raised after a function was compiled: it works from then on
+                unkept = error.strerror or str(error)
+            else:
+                break
     return unkept
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+class _Told:
+    """Tells the process that is helped."""
+
+    def missing(self, name: str) -> bool:
+        _say(f"missing {name}")
+        return False
+
+    def ready(self, name: str) -> None:
+        _say(f"ready {name}")
+
+
+class _Work:
+    """The parts that are left, who compiles them, and how far all are."""
+
+    def __init__(self, closing: contextlib.ExitStack) -> None:
+        """``closing`` ends, with the warm-up, everything that is begun with the first function that is missing."""
+        self.compiles = False
+        self.unkept = ""
+        self._parts = deque(PARTS)
+        self._closing = closing
+        self._helpers: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._ready: set[str] = set()
+        self._show: Callable[[int, int, str], None] = lambda _ready, _total, _what: None
+
+    def next_part(self) -> str | None:
+        """A part that nobody has taken, None if there is none left."""
+        with contextlib.suppress(IndexError):
+            return self._parts.popleft()
+        return None
+
+    def shared(self) -> bool:
+        """Whether anyone helped; waits for them."""
+        for helper in self._helpers:
+            helper.join()
+        return bool(self._helpers)
+
+    def missing(self, name: str) -> bool:
+        """A function must be compiled; at the first one, unless another process is just doing that, help is called."""
+        look_again = not self.compiles
+        if look_again:
+            self._begin()
+        self._tell(name)
+        return look_again
+
+    def ready(self, name: str) -> None:
+        self._tell(name, ready=True)
+
+    def _tell(self, name: str, *, ready: bool = False) -> None:
+        with self._lock:
+            if ready:
+                self._ready.add(name)
+            self._show(len(self._ready), max(len(FUNCTIONS), len(self._ready)), name)
+
+    def _begin(self) -> None:
+        self.compiles = True
+        self._show = _shown(self._closing)
+        kept = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
+        if len(kept) < len(FUNCTIONS):
+            self.unkept = "no folder for it may be written"
+            return
+        wait = locked(
+            Path(kept[0]) / "gripmon-compiling.lock", fcntl.LOCK_EX, ANOTHER_TAKES_S,
+            lambda: self._tell("another process compiles the same"),
+        )  # fmt: skip
+        self._closing.enter_context(wait)
+        for number in range(min(_cores() - 1, MOST_HELPERS)):
+            helper = threading.Thread(target=self._be_helped, name=f"compiling-{number}", daemon=True)
+            helper.start()
+            self._helpers.append(helper)
+
+    def _be_helped(self) -> None:
+        """Let a process of its own take parts; one that fails leaves them to :func:`warm_up`'s second round."""
+        with contextlib.suppress(OSError, ValueError):
+            process: Any = subprocess.Popen(
+                [sys.executable, "-P", "-c", _BOOTSTRAP, _HOME], text=True, bufsize=1, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            self._closing.callback(process.kill)
+            with process:
+                while (part := self.next_part()) is not None:
+                    process.stdin.write(f"{part}\n")
+                    for line in process.stdout:
+                        what, _, name = line.strip().partition(" ")
+                        if what == _DONE:
+                            break
+                        self._tell(name, ready=what == "ready")
+                    else:
+                        return
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _shown(closing: contextlib.ExitStack) -> Callable[[int, int, str], None]:
+    """A function of how many functions are ready, of how many, and which one is being compiled."""
+    what = "compiling what every frame needs, once per installation"
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        bar = closing.enter_context(tqdm(file=sys.stderr, dynamic_ncols=True, leave=False, desc="compiling", unit=""))
+
+        def draw(ready: int, total: int, name: str) -> None:
+            bar.total, bar.n = total, ready
+            bar.set_postfix_str(name)
+
+        _log.info("%s", what)
+        return draw
+    said_s = -SAID_EVERY_S
+
+    def say(ready: int, total: int, name: str) -> None:
+        nonlocal said_s
+        if time.monotonic() - said_s >= SAID_EVERY_S:
+            said_s = time.monotonic()
+            _log.info("%s: %d of %d, now %s", what, ready, total, name)
+
+    return say

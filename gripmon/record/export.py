@@ -121,7 +121,7 @@ _ALERTS: list[_Column] = [
     ("rotation_rad", _DOUBLE, "rad", "turn against the reference"),
     ("rate_m_per_min", _DOUBLE, "m/min", "speed of a creep"),
     ("time_left_s", _DOUBLE, "s", "until a creep reaches the limit"),
-    ("since_ns", _INTEGER, "ns", "when it was raised, or the gripper began to look different: Unix"),
+    ("since_ns", _INTEGER, "ns", "when it was raised: Unix"),
     ("acknowledged", _TRUTH, "", "an operator has taken note of it"),
     ("state", _TEXT, "", "what the monitor was doing"),
     *_REFERENCE,

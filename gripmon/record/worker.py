@@ -22,6 +22,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from gripmon.model.errors import in_short, one_line
+from gripmon.model.priority import give_way
 from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
 from gripmon.record.columns import APPLICATION_ID, AnyRow, Picture, Row, SpotRow, Writer
 from gripmon.record.files import FileSeries, make_writer
@@ -40,7 +41,6 @@ from gripmon.record.recorder import (
 )
 from gripmon.record.scene import make_blueprint
 
-_NICENESS = 5  # the loop has priority on a shared core; at 10 this process waited for seconds on a busy machine
 _STDIN = 0
 _READ_BYTES = 1 << 20
 _FRAMES_A_WRITE = 128
@@ -60,7 +60,7 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
     # Only the end of the input ends this process: Ctrl-C is meant for the daemon, which then closes the pipe.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    os.nice(_NICENESS)
+    give_way()
     cv2.setNumThreads(1)
     unframer, payloads, code = Unframer(), list[bytes](), 0
     while not payloads:

@@ -20,6 +20,7 @@ from gripmon.simulate.scenario import (
     Cover,
     Creep,
     Defocus,
+    FingerLook,
     GraspedObject,
     JawScript,
     Light,
@@ -179,6 +180,20 @@ def exposure(light: Light, t_s: float) -> float:
     return product
 
 
+def lamp_direction(look: FingerLook, t_s: float) -> Array:
+    """Unit vector (3,) to the lamp, camera axes; between two of its places it passes along the arc between them."""
+    here = _unit(look.lamp_cam)
+    for change in look.lamp_changes:
+        share = smooth_step(t_s, change.at_s, change.time_s)
+        if share > 0.0:
+            here = _unit((1.0 - share) * here + share * _unit(change.lamp_cam))
+    return here
+
+
+def _unit(direction: Array | tuple[float, float, float]) -> Array:
+    return np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+
+
 Light32 = NDArray[np.float32]
 _BANK_MARGIN_PX = 96
 _SAMPLED_FROM_PX = 0.8
@@ -206,6 +221,8 @@ class SensorModel:
                 cv2.multiply(light, self._shadow(shadow, time_s), light)
         light = blur(light, defocus_sigma_px(scenario.defocus, time_s))
         self._add_noise(light, index)
+        if scenario.sensor.response == "srgb":
+            light = srgb_dn(light)
         image = np.asarray(cv2.convertScaleAbs(light), dtype=np.uint8)
         return image if scenario.sensor.jpeg_quality == 0 else _jpeg(image, scenario.sensor.jpeg_quality)
 
@@ -262,6 +279,13 @@ def blur(light: Light32, sigma_px: float) -> Light32:
     side = 0.5 * sigma_px**2
     taps = np.array([side, 1.0 - 2.0 * side, side], np.float32)
     return np.asarray(cv2.sepFilter2D(light, -1, taps, taps), dtype=np.float32)
+
+
+def srgb_dn(light_dn: Light32) -> Light32:
+    """Grey values of light by IEC 61966-2-1, both in DN from 0 to 255; more than 255 saturates."""
+    share = np.minimum(light_dn * np.float32(1.0 / 255.0), np.float32(1.0))
+    curved = 1.055 * cv2.pow(share, 1.0 / 2.4) - 0.055
+    return np.asarray(255.0 * np.where(share <= 0.0031308, 12.92 * share, curved), dtype=np.float32)
 
 
 def _jpeg(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:

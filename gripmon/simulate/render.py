@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.simulate import textures
+from gripmon.simulate import disturbance, textures
 from gripmon.simulate.background import TableView
 from gripmon.simulate.bodies import Bodies
 from gripmon.simulate.coverage import Coverage, CoverageRaster, RayGrid, enlarge_cells
@@ -74,7 +74,7 @@ class Renderer:
             camera, self.rays, scenario.background, nominal_cam_T_grip, seed, psf_px
         )
         rng = np.random.default_rng([seed, 5])
-        painter = Painter(rng, scenario.fingers, nominal_cam_T_grip, camera.fx_px)
+        painter = self._painter = Painter(rng, scenario.fingers, nominal_cam_T_grip, camera.fx_px)
         self._surfaces = {solid.name: painter.metal(solid, 1.0, marked=True) for solid in bodies.fingers}
         self._surfaces |= {solid.name: painter.metal(solid, _CARRIER_GAIN) for solid in bodies.carriers}
         if bodies.grasped is not None and scenario.grasped is not None:
@@ -130,13 +130,15 @@ class Renderer:
         for (index, outline), (_, cam_T_cover) in zip(self._bodies.placed_covers(state), state.covers, strict=True):
             mask = self._cover_raster.masks([outline])[0]
             if mask is not None:
-                layer = self._layer([(mask, self._cover_surfaces[index])], cam_T_cover)
+                layer = self._layer([(mask, self._cover_surfaces[index])], cam_T_cover, None)
                 canvas[layer.window] = canvas[layer.window] * layer.passes + layer.light
         return canvas
 
     def _body_layers(self, state: SceneState) -> list[_Layer]:
         poses = [state.cam_T_grip, state.grip_T_finger] + ([] if state.cam_T_object is None else [state.cam_T_object])
         poses += [pose for _, pose in state.props]
+        lamp_cam = disturbance.lamp_direction(self._scenario.fingers, state.time_s)
+        poses.append(lamp_cam)
         key = b"".join(pose.tobytes() for pose in poses)
         cached_key, layers = self._cache
         if cached_key == key:
@@ -152,12 +154,14 @@ class Renderer:
                 if owner is body and mask is not None
             ]
             if parts:
-                layers.append(self._layer(parts, body.cam_T_body))
+                layers.append(self._layer(parts, body.cam_T_body, lamp_cam))
         self._cache = (key, layers)
         return layers
 
-    def _layer(self, parts: list[tuple[Coverage, Surface]], cam_T_body: Array) -> _Layer:
-        """Sum of a body's faces: inner borders are shared, so the faces' masks add up to the body's."""
+    def _layer(self, parts: list[tuple[Coverage, Surface]], cam_T_body: Array, lamp_cam: Array | None) -> _Layer:
+        """Sum of a body's faces: inner borders are shared, so the faces' masks add up to the body's.  What is nearer
+        than the lamp (None) is lit evenly.
+        """
         left, top = min(m.left for m, _ in parts), min(m.top for m, _ in parts)
         right = max(m.left + m.mask.shape[1] for m, _ in parts)
         bottom = max(m.top + m.mask.shape[0] for m, _ in parts)
@@ -168,10 +172,12 @@ class Renderer:
             u, v = cover.left - left, cover.top - top
             part = slice(v, v + height), slice(u, u + width)
             passes[part] -= cover.mask
+            gain = 1.0 if lamp_cam is None else self._painter.relit(surface, lamp_cam)
             if surface.texture is None:
-                cv2.scaleAdd(cover.mask, surface.level_dn, light[part], light[part])
+                cv2.scaleAdd(cover.mask, gain * surface.level_dn, light[part], light[part])
             else:
-                cv2.accumulateProduct(self._shade(cover, surface, cam_T_body), cover.mask, light[part])
+                shade = self._shade(cover, surface, cam_T_body)
+                cv2.accumulateProduct(shade if gain == 1.0 else shade * np.float32(gain), cover.mask, light[part])
         return _Layer((slice(top, bottom), slice(left, right)), passes, light)
 
     def _shade(self, cover: Coverage, surface: Surface, cam_T_body: Array) -> NDArray[np.float32]:
@@ -193,12 +199,14 @@ _MOST_COMPRESSED = 12.0
 
 @dataclass(frozen=True)
 class Surface:
-    """A face's brightness, texture (DN; None: uniform), and the frame of its plane in the body's frame."""
+    """A face's brightness with the first lamp, texture (DN; None: uniform), and its plane's frame in the body's."""
 
     level_dn: float
     texture: NDArray[np.float32] | None
     px_per_m: float
     body_T_plane: Array
+    normal_cam: Array | None = None
+    """Outwards (3,), at the nominal pose; None: lit the same wherever the lamp is."""
 
 
 class Painter:
@@ -207,11 +215,15 @@ class Painter:
     def __init__(self, rng: np.random.Generator, look: FingerLook, cam_T_grip: Array, focal_px: float) -> None:
         self._rng, self._look, self._cam_T_grip, self._focal_px = rng, look, cam_T_grip, focal_px
         self._px_per_m = focal_px / float(cam_T_grip[2, 3])
-        self._lamp_cam = np.array(look.lamp_cam) / np.linalg.norm(look.lamp_cam)
+        if look.lamp_changes and not look.ambient > 0.0:
+            raise ValueError("fingers.lamp_changes: a lamp alone leaves faces black for good; ambient above 0")
+        self._lamp_cam = disturbance.lamp_direction(look, 0.0)
 
     def metal(self, solid: Solid, gain: float, *, marked: bool = False) -> tuple[Surface, ...]:
         """Surfaces of a metal body, one per face; ``marked``: a finger, with the look's marks."""
         look, surfaces = self._look, []
+        own = [mark for mark in look.marks if marked and mark.finger in ("", solid.name)]
+        gain *= math.prod(mark.gain for mark in own if mark.shape == "whole")
         for face, bevel in enumerate(solid.bevel):
             level = gain * look.level_dn * self._shade(solid, face) * (look.bevel_gain if bevel else 1.0)
             body_T_plane, rows, columns, px_per_m = self._sheet(solid, face)
@@ -222,12 +234,12 @@ class Painter:
             if look.highlights > 0.0:
                 matt = np.full((rows, columns), level, np.float32) if texture is None else texture
                 texture = matt * textures.streak(self._rng, columns, look.highlights)
-            marks = [] if bevel or not marked else [m for m in look.marks if m.finger in ("", solid.name)]
+            marks = [] if bevel else [mark for mark in own if mark.shape != "whole"]
             if marks:
                 plain = np.full((rows, columns), level, np.float32) if texture is None else texture
                 grid = textures.grid_m(rows, columns, px_per_m, body_T_plane)
                 texture = plain * textures.marks(marks, solid, face, grid, px_per_m)
-            surfaces.append(Surface(level, texture, px_per_m, body_T_plane))
+            surfaces.append(Surface(level, texture, px_per_m, body_T_plane, self._normal_cam(solid, face)))
         return tuple(surfaces)
 
     def object(self, solid: Solid, look: ObjectLook) -> tuple[Surface, ...]:
@@ -242,7 +254,7 @@ class Painter:
                 grid = textures.grid_m(rows, columns, px_per_m, body_T_plane)
                 texture = textures.lines(self._rng, look, solid, grid, px_per_m)
             texture = level * self._foreshortened(texture, body_T_plane, px_per_m)
-            surfaces.append(Surface(level, texture, px_per_m, body_T_plane))
+            surfaces.append(Surface(level, texture, px_per_m, body_T_plane, self._normal_cam(solid, face)))
         return tuple(surfaces)
 
     def copy(self, surfaces: tuple[Surface, ...], mirrored: bool) -> tuple[Surface, ...]:
@@ -264,9 +276,20 @@ class Painter:
         body_T_plane[:3, 3] = low
         return Surface(0.0, np.ascontiguousarray(texture, dtype=np.float32), px_per_m, body_T_plane)
 
+    def relit(self, surface: Surface, lamp_cam: Array) -> float:
+        """A face's brightness with a lamp in a direction (3,), over that with the first lamp."""
+        if surface.normal_cam is None or not self._look.lamp_changes:
+            return 1.0
+        return self._lambert(surface.normal_cam, lamp_cam) / self._lambert(surface.normal_cam, self._lamp_cam)
+
     def _shade(self, solid: Solid, face: int) -> float:
-        towards = float(self._cam_T_grip[:3, :3] @ solid.normals[face] @ self._lamp_cam)
-        return self._look.ambient + (1.0 - self._look.ambient) * max(towards, 0.0)
+        return self._lambert(self._normal_cam(solid, face), self._lamp_cam)
+
+    def _normal_cam(self, solid: Solid, face: int) -> Array:
+        return np.asarray(self._cam_T_grip[:3, :3] @ solid.normals[face])
+
+    def _lambert(self, normal_cam: Array, lamp_cam: Array) -> float:
+        return self._look.ambient + (1.0 - self._look.ambient) * max(float(normal_cam @ lamp_cam), 0.0)
 
     def _sheet(self, solid: Solid, face: int) -> tuple[Array, int, int, float]:
         """Frame of a face, and rows, columns and pixels per metre of its texture."""

@@ -196,10 +196,10 @@ class Background(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class FingerMark(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A lighter or darker area on the long faces of the fingers: pad, step, slot, screw, another tone.
 
-    Its borders are parallel to the fingers' edges.
+    Its borders are parallel to the fingers' edges.  ``whole``: all faces of a finger, bevels too; only ``gain`` counts.
     """
 
-    shape: Literal["rectangle", "disc"] = "rectangle"
+    shape: Literal["rectangle", "disc", "whole"] = "rectangle"
     from_tip_m: Annotated[
         tuple[Length, Length], Meta(description="where it begins and ends, from the tip backwards (m)")
     ] = (0.003, 0.012)
@@ -219,6 +219,16 @@ class FingerShape(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     worn_finger: Annotated[str, Meta(description="name in the gripper file; empty: all fingers")] = ""
 
 
+class LampChange(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The lamp moves: from ``at_s`` on, within ``time_s``, the light comes from another side."""
+
+    at_s: Time
+    lamp_cam: Annotated[
+        tuple[float, float, float], Meta(description="direction to the lamp then, camera axes (no unit)")
+    ]
+    time_s: Annotated[float, Meta(ge=0.0, le=1e7, description="how long it takes; 0: at once (s)")] = 0.0
+
+
 class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Metal fingers: one shade per face from the lamp's direction, times a brushed texture fixed to the face."""
 
@@ -229,6 +239,9 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     lamp_cam: Annotated[
         tuple[float, float, float], Meta(description="direction to the lamp, camera axes (no unit)")
     ] = _LAMP
+    lamp_changes: Annotated[
+        tuple[LampChange, ...], Meta(description="of all bodies, in the order of their times; with ambient light only")
+    ] = ()
     texture: Annotated[
         Fraction, Meta(description="strength of the brushed texture and scratches (0 to 1; 0: even faces)")
     ] = 0.12
@@ -299,6 +312,10 @@ class Sensor(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     shot_noise_dn: Annotated[float, Meta(ge=0.0, le=5.0, description="variance per grey value (DN²/DN)")] = 0.012
     vignetting: Annotated[Fraction, Meta(description="loss of light in the image's corner (0 to 1)")] = 0.12
     exposure_time_s: Annotated[float, Meta(ge=0.0, le=1.0, description="what moves within it is smeared (s)")] = 0.004
+    response: Annotated[
+        Literal["linear", "srgb"],
+        Meta(description="grey levels over light; srgb: of colour cameras (IEC 61966-2-1)"),
+    ] = "linear"
     jpeg_quality: Annotated[int, Meta(ge=0, le=100, description="0: no compression")] = 0
 
 

@@ -31,6 +31,7 @@ import msgspec
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
+from gripmon.model.decoding import decoder_of
 from gripmon.model.errors import InputError, in_short
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import (
@@ -274,7 +275,7 @@ class _Handler(BaseHTTPRequestHandler):
         if len(length) > 9 or int(length) > LONGEST_REQUEST:
             raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {LONGEST_REQUEST} bytes")
         try:
-            return msgspec.json.decode(self.rfile.read(int(length)), type=kind)
+            return decoder_of(kind).decode(self.rfile.read(int(length)))
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise _Refused(HTTPStatus.BAD_REQUEST, f"not understood: {error}") from None
 

@@ -22,8 +22,22 @@ Runs the monitor over random scenes of every condition (free view, clutter, ligh
 run like the fingers', jumps, wrong models ...) and over the rendered sequences beside the checkout, if they are there.
 Counts misleading frames (valid and the error exceeds the alert limit, or the frame's own protection level), and how
 often the transform is valid where the gripper shows enough. The worst frames are named so that exactly their scenes
-can be run again: --only NAME --seed S --scene N prints each frame of one scene."""
-SCENES, FRAMES, QUICK_SCENES = 30, 96, 2
+can be run again: --only NAME --seed S --scene N prints each frame of one scene.  The alert limits are data,
+fixed beforehand.
+A page to compare two revisions: each run with --resume FILE and the same --seed, the second with --against FIRST.
+Daily: some scenes of each condition; to judge: --scenes 27 --resume FILE, which may be interrupted."""
+SCENES, FRAMES, QUICK_SCENES = 4, 96, 1
+JUDGED_SCENES = 27
+"""Scenes of each condition from which an integrity is judged: some 2,000 in all."""
+_CODE = (
+    "gripmon/**/*.py",
+    "configs/grippers/*.yaml",
+    "tools/benchmarks/data/integrity_limits.json",
+    *(f"tools/benchmarks/integrity_{part}.py" for part in ("conditions", "draft", "limits", "misleading", "practice")),
+    *(f"tools/benchmarks/{name}.py" for name in ("integrity_runs", "integrity_scenes", "outline_seen", "rendered")),
+    *(f"tools/benchmarks/{name}.py" for name in ("padded", "rounded", "scenes")),
+)
+"""What decides a scene's result."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +51,7 @@ class Plan:
     jobs: int = 1
     scene: int | None = None
     state: Path | None = None
+    code: str = ""
 
 
 def add_parser(commands: Any) -> None:
@@ -55,7 +70,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="conditions with these names")
     parser.add_argument("--list", action="store_true", help="print the names of all conditions and end")
     parser.add_argument(
-        "--scenes", type=options.positive, metavar="N", help=f"scenes of each condition (default {SCENES})"
+        "--scenes",
+        type=options.positive,
+        metavar="N",
+        help=f"scenes of each condition (default {SCENES}; {JUDGED_SCENES} to judge by)",
     )
     parser.add_argument(
         "--frames", type=options.positive, default=FRAMES, metavar="N", help=f"frames of each scene (default {FRAMES})"
@@ -74,7 +92,14 @@ def add_parser(commands: Any) -> None:
         "--resume",
         type=Path,
         metavar="FILE",
-        help="each finished scene is appended there as a line of JSON; those that are there are not run again",
+        help="each finished scene is appended there as a line of JSON; those of the same code that are there are not "
+        "run again",
+    )
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help="the same scenes as another revision left them with --resume: a short table of both",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write integrity.md, integrity.json and integrity/*.png there"
@@ -83,8 +108,9 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``tools/bench integrity``."""
-    from benchmarks import integrity_report, integrity_table
+    from benchmarks import integrity_compare, integrity_report, integrity_table
     from benchmarks.integrity_runs import names
+    from benchmarks.machine import digest_of
 
     if arguments.list:
         print("\n".join(names()))
@@ -105,8 +131,13 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.jobs,
         arguments.scene,
         arguments.resume,
+        digest_of(*_CODE),
     )
     try:
+        other = read_lines(arguments.against)
+        if arguments.against is not None and not other:
+            print(f"integrity: --against {arguments.against}: no finished scenes there", file=sys.stderr)
+            return 2
         if arguments.out is not None:
             (arguments.out / integrity_report.PICTURES).mkdir(parents=True, exist_ok=True)
         lines = measure(plan)
@@ -116,7 +147,9 @@ def run(arguments: argparse.Namespace) -> int:
     results = integrity_report.summarize(lines, plan.seed, plan.scenes, plan.frames)
     if plan.scene is not None:
         print("\n".join(text for line in lines for text in integrity_table.frame_lines(line)))
-    print(integrity_table.as_text(results))
+    if arguments.against is None:
+        print(integrity_table.as_text(results))
+    print(integrity_compare.as_text(lines, list(other.values())))
     if arguments.out is not None:
         integrity_report.write(results, lines, arguments.out)
     return 0
@@ -128,7 +161,7 @@ def measure(plan: Plan) -> list[dict[str, Any]]:
 
     wanted = [name for name in names() if not plan.only or name in plan.only]
     tasks = list(_tasks(plan, wanted))
-    done = read_lines(plan.state)
+    done = read_lines(plan.state, plan.code)
     lines = {task: done[_key(task, plan)] for task in tasks if _key(task, plan) in done}
     missing = [task for task in tasks if task not in lines]
     print(
@@ -136,6 +169,7 @@ def measure(plan: Plan) -> list[dict[str, Any]]:
         file=sys.stderr,
     )
     for task, line in _in_processes(missing, plan):
+        line["code"] = plan.code
         lines[task] = line
         if plan.state is not None:
             append_line(plan.state, line)
@@ -157,9 +191,9 @@ def _key(task: tuple[str, int], plan: Plan) -> tuple[Any, ...]:
     return (*task, plan.seed, plan.frames)
 
 
-def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Finished scenes by condition, number, seed and frames.  A last line that was cut off doesn't count, nor one of an
-    earlier version that didn't count false alerts.
+def read_lines(file: Path | None, code: str | None = None) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Finished scenes by condition, number, seed and frames, of some ``code`` or of any; the last of each counts.  A
+    last line that was cut off doesn't count.
     """
     if file is None or not file.exists():
         return {}
@@ -169,7 +203,7 @@ def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue
-        if "false_alerts" in line:
+        if "code" in line and code in (None, line["code"]):
             out[line["condition"], line["scene"], line["seed"], line["asked"]] = line
     return out
 

@@ -78,11 +78,15 @@ class Draft:
 
 
 class Fingers(Enum):
-    """Which grippers: the usual ones, two fingers with rounded tips, or one finger of the usual that stands still."""
+    """Which grippers: the usual ones; two fingers with rounded tips; one finger of the usual that stands still; the
+    usual, of which the image's border leaves 25 px; tapered fingers with pads before a colour camera.
+    """
 
     USUAL = ""
     ROUND_TIPS = "round tips"
     ONE = "one finger"
+    SHORT = "25 px"
+    PADDED = "pads"
 
 
 @dataclass(frozen=True)

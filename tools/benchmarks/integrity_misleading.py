@@ -259,4 +259,3 @@ OTHER_FINGERS = tuple(
     for condition in (*ORDINARY, *MISLEADING)
     if condition.name in names
 )
-CONDITIONS = (*ORDINARY, *MISLEADING, *OTHER_FINGERS)

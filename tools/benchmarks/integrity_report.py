@@ -24,14 +24,19 @@ def summarize(lines: list[dict[str, Any]], seed: int, scenes: int, frames: int) 
         "machine": machine.description(),
         "commits": sorted({line["commit"] for line in lines}),
         "plan": {"seed": seed, "scenes": scenes, "frames": frames},
-        "limit_m": lines[0]["limit_m"],
-        "limit_rad": lines[0]["limit_rad"],
+        "valid_by": sorted({line["valid_by"] for line in lines}),
+        "limits_m": _range([line["limit_m"] for line in lines]),
+        "limits_rad": _range([line["limit_rad"] for line in lines]),
         "rows": {name: {"what": about(name), **figures(own)} for name, own in by_name.items()},
         "total": total,
         "scales": by_scale(lines),
         "targets": [{"target": what, "reached": reached, "met": met} for what, reached, met in targets(total)],
         "worst": worst(lines),
     }
+
+
+def _range(values: list[float]) -> list[float]:
+    return [min(values), max(values)]
 
 
 def write(results: dict[str, Any], lines: list[dict[str, Any]], folder: Path) -> None:

@@ -5,18 +5,21 @@ The result of a scene is a dictionary of plain values, one line of JSON: lists h
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from scipy import stats
 
 from benchmarks import rendered
-from benchmarks.integrity_misleading import CONDITIONS
+from benchmarks.integrity_draft import Fingers
+from benchmarks.integrity_limits import AlertLimits, frozen_limits
+from benchmarks.integrity_practice import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.outline_seen import outline_seen
@@ -24,7 +27,7 @@ from benchmarks.rendered import Rendered
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy.judging import NO_REFERENCE
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, perturbation_between, rotation_angle, to_record
+from gripmon.model.geometry import from_record, perturb, perturbation_between, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     Alert,
@@ -41,8 +44,6 @@ from gripmon.model.records import (
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.teach.accuracy import forecast_frame
-from gripmon.teach.visibility import Rig
 
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""
@@ -79,12 +80,17 @@ class Watched:
     camera: Camera
     gripper: Gripper
     start_cam_T_grip: Array
+    true_start_cam_T_grip: Array
     start_covariance: Array
     jaw_sigma_m: float | None
     fps: float
     wrong: tuple[Cause, ...]
     inside: bool
     looks: Iterable[Look]
+    limits: AlertLimits
+    response: Literal["linear", "srgb"] = "linear"
+    knock: tuple[int, float] | None = None
+    """The first frame after the mount's jump, and its size at the TCP (m)."""
 
 
 def names() -> list[str]:
@@ -108,19 +114,24 @@ def scene_numbers(name: str, scenes: int) -> range:
 
 def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
     """One scene, judged."""
-    start_s = time.perf_counter()
+    start_s, start_cpu_s = time.perf_counter(), time.process_time()
     if is_rendered(name):
         watched = _rendered(rendered.sequences(name)[number])
     else:
         watched = _simulated(make_integrity_scene(_BY_NAME[name], seed, number, frames))
     settings = _settings(watched)
     monitor = Monitor(watched.camera, watched.gripper, settings, _reference(watched), None)
+    truth = Truth(watched.start_cam_T_grip, watched.true_start_cam_T_grip)
     rows: list[dict[str, Any]] = []
     alerts: list[list[Any]] = []
+    moved: list[int] = []
+    grey_dn = None
     for index, look in enumerate(watched.looks):
         record = monitor.process(look.frame)
-        rows.append(_judged(record, look, settings.policy.integrity_risk))
+        rows.append(_judged(record, look, truth, settings.policy.integrity_risk))
         alerts += [[index, alert.text] for alert in record.alerts if is_false(alert, watched.wrong)]
+        moved += [index for alert in record.alerts if names_a_move(alert)]
+        grey_dn = _grey_dn(look.frame) if grey_dn is None else grey_dn
     policy = settings.policy
     return {
         "condition": name,
@@ -128,18 +139,34 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
         "scene": number,
         "asked": frames,
         "commit": commit(),
+        "grey_dn": grey_dn,
         "gripper": watched.gripper.name,
         "fps": watched.fps,
         "depth_m": _short(watched.start_cam_T_grip[2, 3]),
         "focal_px": _short(watched.camera.fx_px),
         "jaw_exact": watched.jaw_sigma_m == 0.0,
         "inside": watched.inside,
+        "valid_by": str(getattr(record, "valid_by", "absolute")),
         "limit_m": policy.alert_limit_m,
         "limit_rad": policy.alert_limit_rad,
         "false_alerts": alerts,
+        "knock": None if watched.knock is None else list(watched.knock),
+        "moved_alerts": moved,
         "seconds": round(time.perf_counter() - start_s, 2),
+        "cpu_s": round(time.process_time() - start_cpu_s, 2),
         **{key: [row[key] for row in rows] for key in rows[0]},
     }
+
+
+def _grey_dn(frame: Frame) -> float:
+    """Mean grey of an image: whether two runs saw the same scene."""
+    assert isinstance(frame.image, np.ndarray)
+    return round(float(frame.image.mean()), 2)
+
+
+def names_a_move(alert: Alert) -> bool:
+    """Whether an alert newly says that the camera moved."""
+    return alert.event is AlertEvent.RAISED and alert.kind in (AlertKind.STEP, AlertKind.CREEP, AlertKind.DRIFT)
 
 
 def is_false(alert: Alert, wrong: tuple[Cause, ...]) -> bool:
@@ -155,7 +182,37 @@ def normal_level_m(covariance: Array, risk: float) -> float:
     return float(stats.norm.isf(0.5 * risk)) * largest**0.5
 
 
-def _judged(record: FrameRecord, look: Look, risk: float) -> dict[str, Any]:
+@dataclass
+class Truth:
+    """What a transform has to be: the true pose, or the reference moved as the gripper has truly moved.
+
+    ``since_cam_T_grip``: the true pose from which motions count, at first that of the reference.
+    """
+
+    reference_cam_T_grip: Array
+    since_cam_T_grip: Array
+    proved: bool = False
+
+    def of(self, record: FrameRecord, true_cam_T_grip: Array) -> Array:
+        """What a record's ``cam_T_grip`` bounds: by the reference, where that is what is promised."""
+        since = getattr(record, "since_reference", None)
+        if since is not None and str(since.since) == "first_proved" and not self.proved:
+            self.proved, self.since_cam_T_grip = True, true_cam_T_grip
+        if str(getattr(record, "valid_by", "absolute")) != "reference":
+            return true_cam_T_grip
+        return perturb(self.reference_cam_T_grip, perturbation_between(self.since_cam_T_grip, true_cam_T_grip))
+
+
+def bounds_of(record: FrameRecord) -> dict[str, tuple[float, float] | None]:
+    """Both bounds on position (m) and rotation (rad).  Records of schema 1 have one, which is absolute."""
+    since, absolute = getattr(record, "since_reference", None), getattr(record, "absolute", None)
+    if not hasattr(record, "absolute"):
+        absolute = record.protection
+    named = {"reference": since, "absolute": absolute}
+    return {name: None if b is None else (b.position_m, b.rotation_rad) for name, b in named.items()}
+
+
+def _judged(record: FrameRecord, look: Look, truth: Truth, risk: float) -> dict[str, Any]:
     """A record against the truth: errors and bounds in m and rad, None where nothing was published."""
     out: dict[str, Any] = {
         "view": int(look.view),
@@ -170,12 +227,14 @@ def _judged(record: FrameRecord, look: Look, risk: float) -> dict[str, Any]:
         "why": "",
         "reason": record.reason or "",
     }
+    for name, bound in bounds_of(record).items():
+        out[f"{name}_m"], out[f"{name}_rad"] = (None, None) if bound is None else (_short(b) for b in bound)
     if record.cam_T_grip is None or record.covariance is None:
         return out
-    cam_T_grip = from_record(record.cam_T_grip)
-    error = perturbation_between(cam_T_grip, look.cam_T_grip)
+    cam_T_grip, true_T = from_record(record.cam_T_grip), truth.of(record, look.cam_T_grip)
+    error = perturbation_between(cam_T_grip, true_T)
     out["error_m"] = _short(np.linalg.norm(error[:3]))
-    out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ look.cam_T_grip[:3, :3]))
+    out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ true_T[:3, :3]))
     if record.source is not Origin.HELD:
         covariance = np.reshape(record.covariance, (6, 6))
         out["nees"] = _short(error @ np.linalg.solve(covariance, error))
@@ -193,17 +252,15 @@ def _short(value: float) -> float:
 
 
 def _settings(watched: Watched) -> MonitorSettings:
-    """As an integrator sets them up: an alert limit that the view can't keep in most frames is raised to three
-    times what ``check`` predicts.
-    """
-    known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
-    settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
-    rig = Rig(watched.camera, watched.gripper, settings, None)
-    foretold = forecast_frame(rig, watched.start_cam_T_grip, None).protection
+    """As an integrator sets them up: the alert limits were fixed beforehand."""
+    settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps))
+    if watched.jaw_sigma_m is not None:
+        settings = msgspec.structs.replace(settings, jaw_sigma_m=watched.jaw_sigma_m)
+    edges = msgspec.structs.replace(settings.corners.edges, response=watched.response)
+    settings = msgspec.structs.replace(settings, corners=msgspec.structs.replace(settings.corners, edges=edges))
+    limits = watched.limits
     policy = msgspec.structs.replace(
-        settings.policy,
-        alert_limit_m=max(settings.policy.alert_limit_m, 3.0 * foretold.position_m),
-        alert_limit_rad=max(settings.policy.alert_limit_rad, 3.0 * foretold.rotation_rad),
+        settings.policy, alert_limit_m=limits.position_m, alert_limit_rad=limits.rotation_rad
     )
     return msgspec.structs.replace(settings, policy=policy)
 
@@ -228,13 +285,38 @@ def _simulated(scene: IntegrityScene) -> Watched:
         simulator.camera,
         scene.gripper,
         scene.start_cam_T_grip,
+        simulator.truth(scene.first).cam_T_grip,
         scene.start_covariance,
         scene.jaw_sigma_m,
         simulator.scenario.fps,
         condition.wrong,
         scene.first > 0,
         looks(),
+        frozen_limits(
+            scene.gripper.name, scene.jaw_sigma_m == 0.0, _px_per_mm(simulator.camera, scene.start_cam_T_grip)
+        ),
+        _knock(scene),
     )
+
+
+def _limits_of(scene: IntegrityScene) -> str:
+    """Whose alert limits: of a gripper, or of what the border leaves of any."""
+    return Fingers.SHORT.value if scene.condition.fingers is Fingers.SHORT else scene.gripper.name
+
+
+def _px_per_mm(camera: Camera, cam_T_grip: Array) -> float:
+    return 1e-3 * camera.fx_px / float(cam_T_grip[2, 3])
+
+
+def _knock(scene: IntegrityScene) -> tuple[int, float] | None:
+    """The first frame after the mount's jump, counted from the sequence's first, and its size at the TCP (m)."""
+    bumps = [bump for bump in scene.simulator.scenario.mount if isinstance(bump, Bump)]
+    if not bumps:
+        return None
+    last = scene.first + scene.frames - 1
+    before, after = (scene.simulator.truth(index).cam_T_grip[:3, 3] for index in (scene.first, last))
+    at = math.ceil(bumps[0].at_s * scene.simulator.scenario.fps) - scene.first
+    return at, _short(np.linalg.norm(after - before))
 
 
 def _just_bumped(scenario: Scenario, time_s: float) -> bool:
@@ -251,7 +333,11 @@ def _view(scene: IntegrityScene, index: int) -> View:
     seen = outline_seen(scene.simulator, index)
     if (seen.tips > _WHOLE).all() and (seen.edges > _WHOLE).all():
         return View.FREE
-    return _by_tips(int((seen.tips >= TIP_SEEN).sum()))
+    # A pad is a body of its own, named after its finger.
+    tips: dict[str, list[float]] = {}
+    for name, share in zip(scene.simulator.gripper.finger_ids, seen.tips.tolist(), strict=True):
+        tips.setdefault(name.removesuffix(" pad"), []).append(share)
+    return _by_tips(sum(np.mean(shares) >= TIP_SEEN for shares in tips.values()))
 
 
 def _by_tips(tips: int) -> View:
@@ -278,10 +364,16 @@ def _rendered(sequence: Rendered) -> Watched:
         sequence.camera,
         sequence.gripper,
         sequence.start_cam_T_grip,
+        first,
         sequence.start_covariance,
         sequence.jaw_sigma_m,
         sequence.fps,
         (Cause.CAMERA_MOUNT,) * moves + (Cause.FINGER_BENT,) * bent,
         False,
         looks(),
+        frozen_limits(
+            f"rendered {sequence.gripper.name}",
+            sequence.jaw_sigma_m == 0.0,
+            _px_per_mm(sequence.camera, sequence.start_cam_T_grip),
+        ),
     )

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from benchmarks import padded
 from benchmarks.integrity_draft import Condition, Draft, Fingers
 from benchmarks.rounded import rounded_model, rounded_solids
 from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
@@ -29,6 +30,8 @@ INSIDE_SHARE = 0.1
 """Share of scenes that start in the midst of what their condition does."""
 MARKED_SHARE = 0.35
 """Share of scenes in which the fingers carry marks that the model doesn't know."""
+SHORT_PX = (20.0, 30.0)
+"""Of fingers that the image's border cuts off."""
 _INSIDE_AT = (0.3, 0.6)
 _BORDER_PX = 14.0
 _KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
@@ -60,9 +63,9 @@ class IntegrityScene:
 def make_integrity_scene(condition: Condition, seed: int, number: int, frames: int) -> IntegrityScene:
     """Scene ``number`` of a condition."""
     rng = np.random.default_rng([seed, zlib.crc32(b"integrity " + condition.name.encode()), number])
-    camera = _camera(rng)
+    camera = make_camera(padded.LENS) if condition.fingers is Fingers.PADDED else _camera(rng)
     gripper, shown = _grippers(condition.fingers, number, rng)
-    cam_T_grip, opening_m = _placed(rng, camera, shown)
+    cam_T_grip, opening_m = _PLACED.get(condition.fingers, _placed)(rng, camera, shown)
     draft = _draft(rng, frames, shown, cam_T_grip, opening_m)
     if condition.truth is not None:
         shown = Gripper(msgspec.convert(condition.truth(rng, msgspec.to_builtins(gripper.model)), GripperModel))
@@ -89,6 +92,8 @@ def _grippers(fingers: Fingers, number: int, rng: np.random.Generator) -> tuple[
     """What the monitor knows, and what is shown."""
     if fingers is Fingers.ROUND_TIPS:
         return _round_tipped(rng)
+    if fingers is Fingers.PADDED:
+        return padded.padded_model(), padded.padded_solids()
     models = gripper_models()
     model = models[number % len(models)]
     gripper = Gripper(msgspec.convert(_first_finger(model) if fingers is Fingers.ONE else model, GripperModel))
@@ -228,3 +233,31 @@ def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple
         if (uv > _BORDER_PX).all() and (uv < limit).all():
             return make_transform(turn, tcp_m), opening_m
     raise ValueError(f"gripper {gripper.name} does not fit into the image")
+
+
+def _placed_short(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
+    """As usual, then shifted until only ``SHORT_PX`` of the fingers are seen between their tips and the border."""
+    for _ in range(1000):
+        cam_T_grip, opening_m = _placed(rng, camera, gripper)
+        short_px = float(rng.uniform(*SHORT_PX))
+        points = gripper.points_grip_m(opening_m)
+        tips = np.isin(np.arange(len(points)), gripper.corner_points)
+        for _ in range(5):  # Newton's: the lens is nearly linear there
+            v_px = camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])[:, 1]
+            down = bool(np.nanmean(v_px[~tips]) > np.nanmean(v_px[tips]))
+            tip_px = float(v_px[tips].min() if down else v_px[tips].max())
+            off_px = tip_px - (camera.height_px - 1.0 - short_px if down else short_px)
+            cam_T_grip[1, 3] -= off_px * cam_T_grip[2, 3] / camera.fy_px
+        if abs(off_px) < 1.0:
+            return cam_T_grip, opening_m
+    raise ValueError(f"gripper {gripper.name} has no tips at the image's border")
+
+
+def _placed_padded(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
+    """10 px/mm at the TCP, tilted by some 38 degrees; the fingers leave the image."""
+    turn = exp_rotation(np.deg2rad([rng.uniform(34.0, 42.0), *rng.uniform(-3.0, 3.0, 2)]))
+    tcp_m = np.array([*rng.uniform(-4e-3, 4e-3, 2), rng.uniform(0.086, 0.094)])
+    return make_transform(turn, tcp_m), gripper.jaw_nominal_m + float(rng.uniform(-2e-3, 2e-3))
+
+
+_PLACED = {Fingers.SHORT: _placed_short, Fingers.PADDED: _placed_padded}

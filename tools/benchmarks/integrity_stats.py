@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from benchmarks.integrity_limits import POSITIONS_M
+
 BACK_FRAMES = 3
 """Within this many frames after the view is free the transform must be valid."""
 LEVEL_OVER_ERROR = 12.0
@@ -22,6 +24,12 @@ WORST = 10
 SCALES = (0.0, 4.0, 6.0, 8.0, np.inf)
 """Limits between classes of scenes by their image scale at the TCP, px/mm."""
 _CONFIDENCE = 0.95
+NEVER_PROMISED = ("crash",)
+NOT_PROMISED_ABSOLUTE = ("model off", "tips worn", "tips rounded")
+"""Conditions that no bound promises to survive, and those of which the absolute one says nothing: a closed list."""
+MOST_UNBOUNDED_SHARE, MOST_EXCESS = 2.0 / 2000.0, 1.3
+"""Scenes with valid frames beyond their bound, and by how much the worst may be."""
+_FOUND_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,10 @@ class Frames:
     asked: NDArray[np.bool_]
     error_m: NDArray[np.float64]
     level_m: NDArray[np.float64]
+    within: NDArray[np.bool_]
+    """(n, len(POSITIONS_M)): the frame would be valid with this alert limit of the position, by its bound."""
+    both_m: NDArray[np.float64]
+    """(n, 2): position's bound since the reference, and the absolute one."""
     possible: NDArray[np.bool_]
     """The published covariance alone would allow a protection level within the alert limit."""
     excess: NDArray[np.float64]
@@ -86,12 +98,24 @@ def _columns(number: int, line: dict[str, Any]) -> dict[str, NDArray[Any]]:
         "asked": np.array(line["enough"], dtype=bool) & ~_just_freed(view),
         "error_m": values["error_m"],
         "level_m": values["level_m"],
+        "within": _within(line, values["level_m"], values["level_rad"]),
+        "both_m": np.array([line["reference_m"], line["absolute_m"]], dtype=float).T,
         "possible": np.array(line["floor_m"], dtype=float) <= line["limit_m"],
         "excess": excess,
         "over_limit": over_limit,
         "nees": values["nees"],
     }
     return {key: column[1:] for key, column in columns.items()}
+
+
+def _within(line: dict[str, Any], level_m: NDArray[Any], level_rad: NDArray[Any]) -> NDArray[np.bool_]:
+    """(n, limits) whether a frame's bounds are within other limits of the position.  A frame within its scene's own
+    limits that isn't valid is doubted for another reason; of one beyond them that isn't known.
+    """
+    with np.errstate(invalid="ignore"):
+        turned = level_rad <= line["limit_rad"]
+        doubted = turned & (level_m <= line["limit_m"]) & ~np.array(line["valid"], dtype=bool)
+        return (level_m[:, None] <= np.array(POSITIONS_M)) & (turned & ~doubted)[:, None]
 
 
 def _freed(view: NDArray[np.intp]) -> list[int]:
@@ -125,6 +149,43 @@ def _back(line: dict[str, Any]) -> list[float]:
     return out
 
 
+def first_valid(line: dict[str, Any]) -> float:
+    """Frames from a scene's first to the first valid one, both counted; inf: never."""
+    return float(line["valid"].index(True) + 1) if True in line["valid"] else np.inf
+
+
+@dataclass(frozen=True)
+class Knock:
+    """Frames from the first that shows the mount's jump, counted as 1: until an alert says so, until the gripper is
+    measured within a quarter of the jump of where it is, and from then until it is valid; inf: not before the end.
+    """
+
+    said: float
+    found: float
+    valid: float
+
+
+def knock_of(line: dict[str, Any]) -> Knock | None:
+    """None for a scene without a jump, or of which the jump lies before its first frame or beyond its last."""
+    if line["knock"] is None or not 0 < line["knock"][0] < len(line["valid"]):
+        return None
+    at, size_m = line["knock"]
+    said = next((index - at + 1.0 for index in line["moved_alerts"] if index >= at), np.inf)
+    errors = zip(line["error_m"][at:], line["nees"][at:], strict=True)
+    there = [nees is not None and error_m <= _FOUND_SHARE * size_m for error_m, nees in errors]
+    if True not in there:
+        return Knock(said, np.inf, np.inf)
+    found = there.index(True)
+    valid = line["valid"][at + found :]
+    return Knock(said, found + 1.0, valid.index(True) + 1.0 if True in valid else np.inf)
+
+
+def promised(line: dict[str, Any]) -> bool:
+    """Whether a scene's condition is in the promise of the bound that its frames are valid by."""
+    name = line["condition"].rpartition(": ")[2]
+    return name not in NEVER_PROMISED and not (line["valid_by"] == "absolute" and name in NOT_PROMISED_ABSOLUTE)
+
+
 def upper_bound(events: int, trials: int) -> float:
     """Exact upper bound (Clopper and Pearson 1934) on a probability, one-sided, for independent trials."""
     return 1.0 if events >= trials else float(stats.beta.ppf(_CONFIDENCE, events + 1, trials - events))
@@ -136,6 +197,12 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
     count, lies, unbounded = len(frames.view), int(frames.lies.sum()), int(frames.unbounded.sum())
     good = frames.valid & np.isfinite(frames.level_m)
     error, level = (float(np.median(x[good])) if good.any() else None for x in (frames.error_m, frames.level_m))
+    firsts = np.array([first_valid(line) for line in lines])
+    own = [line for line in lines if promised(line)]
+    kept = np.array([promised(line) for line in lines])[frames.line]
+    excess = frames.excess[frames.valid & np.isfinite(frames.excess)]
+    kept_excess = frames.excess[frames.valid & kept & np.isfinite(frames.excess)]
+    knocks = [knock for line in lines if (knock := knock_of(line)) is not None]
     nees = frames.nees[frames.valid & np.isfinite(frames.nees)]
     return {
         "scenes": len(lines),
@@ -145,6 +212,28 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "unbounded": unbounded,
         "unbounded_at_most": upper_bound(unbounded, count),
         "suspect_unbounded": int(frames.suspect_unbounded.sum()),
+        "lies_scenes": _scenes(frames, frames.lies),
+        "unbounded_scenes": _scenes(frames, frames.unbounded),
+        "worst_excess": float(excess.max()) if len(excess) else None,
+        "promised": {
+            "scenes": len(own),
+            "frames": int(kept.sum()),
+            "lies": int((frames.lies & kept).sum()),
+            "unbounded": int((frames.unbounded & kept).sum()),
+            "unbounded_scenes": _scenes(frames, frames.unbounded & kept),
+            "unbounded_scenes_at_most": upper_bound(_scenes(frames, frames.unbounded & kept), len(own)),
+            "worst_excess": float(kept_excess.max()) if len(kept_excess) else None,
+        },
+        "valid_share": float(frames.valid.mean()),
+        "asked_share": _share(frames.valid[frames.asked]),
+        "within": [_share(frames.within[frames.asked, k]) for k in range(len(POSITIONS_M))],
+        "median_both_m": [_median(frames.both_m[frames.valid, k]) for k in range(2)],
+        "first_valid": float(np.median(firsts)),
+        "never_valid": int(np.isinf(firsts).sum()),
+        "knocks": len(knocks),
+        "knock_said": _median(np.array([knock.said for knock in knocks])),
+        "knock_found": _median(np.array([knock.found for knock in knocks])),
+        "knock_valid": _median(np.array([knock.valid for knock in knocks])),
         "misleading_scenes": len(set(frames.line[frames.lies | frames.unbounded].tolist())),
         "available": [_share(frames.valid[frames.asked & (frames.view == view)]) for view in range(4)],
         "possible": [_share(frames.possible[frames.asked & (frames.view == view)]) for view in range(4)],
@@ -161,6 +250,17 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "alert_scenes": sum(bool(line["false_alerts"]) for line in lines),
         "seconds": float(sum(line["seconds"] for line in lines)),
     }
+
+
+def _scenes(frames: Frames, which: NDArray[np.bool_]) -> int:
+    """In how many scenes there are such frames."""
+    return len(set(frames.line[which].tolist()))
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    """Without NaN; None of nothing."""
+    there = values[~np.isnan(values)]
+    return float(np.median(there)) if len(there) else None
 
 
 def by_scale(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -218,9 +318,19 @@ def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:
     def share(value: float | None) -> str:
         return "–" if value is None else f"{100.0 * value:.2f} %"
 
+    kept = total["promised"]
     out: list[tuple[str, str, bool | None]] = [
-        ("no valid frame beyond the alert limit", str(total["lies"]), total["lies"] == 0),
-        ("no valid frame beyond its protection level", str(total["unbounded"]), total["unbounded"] == 0),
+        ("no valid frame beyond the alert limit", str(kept["lies"]), kept["lies"] == 0),
+        (
+            f"valid beyond its protection level in at most {1e3 * MOST_UNBOUNDED_SHARE:g} of 1000 scenes",
+            f"{kept['unbounded_scenes']} of {kept['scenes']}, {kept['unbounded']} frames",
+            kept["unbounded_scenes"] <= MOST_UNBOUNDED_SHARE * kept["scenes"],
+        ),
+        (
+            f"no valid frame beyond {MOST_EXCESS:g} times its protection level",
+            "–" if kept["worst_excess"] is None else f"{kept['worst_excess']:.2f}",
+            None if kept["worst_excess"] is None else kept["worst_excess"] <= MOST_EXCESS,
+        ),
     ]
     for view, least in enumerate(AVAILABLE):
         reached = total["available"][view]

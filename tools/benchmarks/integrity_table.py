@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from benchmarks.integrity_limits import POSITIONS_M
 from benchmarks.integrity_stats import VIEWS, targets
 
 HEAD = (
@@ -16,30 +17,42 @@ HEAD = (
     "> PL",
     "at most",
     "suspect > PL",
-    "in scenes",
+    "> AL, > PL in scenes",
+    "err/PL",
     "valid: free %",
     "both tips %",
     "one tip %",
     "no tip %",
+    *(f"{1e3 * limit_m:g} mm %" for limit_m in POSITIONS_M),
     "PL µm",
+    "since µm",
+    "absolute µm",
     "error µm",
     "PL/error",
     "NEES",
+    "first",
+    "never",
     "back %",
     "latest",
+    "knock",
     "alerts",
 )
 LEGEND = tuple(
     """\
 > AL, > PL: valid frames whose error (TCP position, or rotation) exceeds the alert limit, or the frame's own \
 protection level; at most: exact 95 % upper bound on the rate, as if frames were independent; in scenes: with at least \
-one of either
+one of each; err/PL: the largest error of a valid frame over its protection level
 suspect > PL: published with a bound but not valid, and beyond the bound
 valid: share where the whole gripper is seen, where something hides part of it but both tips' outlines are seen, where \
 one tip is hidden, and where both are; without conditions in which the gripper differs from its file, without the \
 frames just after a jump or after the view became free
-PL µm, error µm: medians of valid frames; NEES: mean of valid frames
+0.5, 1, 2 mm: the same, of all views, were that the position's alert limit: by the bounds, nothing is run again
+PL µm, error µm: medians of valid frames; since, absolute: of both bounds, where they are published; NEES: mean of \
+valid frames
+first: median of the frames until the first valid one; never: scenes without one
 back: valid within 3 frames after the view is free again; latest: the most frames that it took
+knock: medians of the frames from a jump of the mount until an alert says it, until the gripper is measured where it \
+is, and from then until it is valid; x: not before the end
 alerts: new ones that name a wrong cause: the mount, another camera, a finger, the opening, the lens""".splitlines()
 )
 
@@ -60,16 +73,30 @@ def cells(name: str, row: dict[str, Any]) -> list[str]:
         str(row["unbounded"]),
         f"{row['unbounded_at_most']:.1g}",
         str(row["suspect_unbounded"]),
-        str(row["misleading_scenes"]),
+        f"{row['lies_scenes']}, {row['unbounded_scenes']}",
+        number(row["worst_excess"]),
         *(percent(share) for share in row["available"]),
+        *(percent(share) for share in row["within"]),
         microns(row["median_level_m"]),
+        *(microns(level_m) for level_m in row["median_both_m"]),
         microns(row["median_error_m"]),
         number(row["level_over_error"]),
         number(row["nees"]),
+        number(row["first_valid"]),
+        str(row["never_valid"]),
         percent(row["back"]),
         number(row["latest_back"]),
+        knock(row),
         str(row["false_alerts"]),
     ]
+
+
+def knock(row: dict[str, Any]) -> str:
+    """Frames until a jump of the mount is said, found, and valid again."""
+    if not row["knocks"]:
+        return "–"
+    times = (row[f"knock_{what}"] for what in ("said", "found", "valid"))
+    return "/".join("x" if math.isinf(frames) else f"{frames:g}" for frames in times)
 
 
 def percent(share: float | None) -> str:
@@ -210,9 +237,17 @@ def about(results: dict[str, Any]) -> list[str]:
     machine, plan = results["machine"], results["plan"]
     seconds = results["total"]["seconds"]
     each_s = seconds / max(results["total"]["scenes"], 1)
-    limits = f"{1e3 * results['limit_m']:g} mm and {math.degrees(results['limit_rad']):.2g} degrees"
+    (low_m, high_m), rads = results["limits_m"], results["limits_rad"]
+    degrees = " to ".join(f"{math.degrees(limit_rad):.2g}" for limit_rad in rads)
+    kept = results["total"]["promised"]
+    beyond = (
+        f"valid by the {' and '.join(results['valid_by'])} bound; of {kept['scenes']} promised scenes beyond it: "
+        f"{kept['unbounded_scenes']} (95 %: at most {100.0 * kept['unbounded_scenes_at_most']:.2g} % of such scenes)"
+    )
     return [
         f"commit {', '.join(results['commits'])}, {machine['date']}, {machine['cpu']}",
         f"seed {plan['seed']}, {plan['scenes']} scenes a condition, {plan['frames']} frames a scene",
-        f"alert limit of the first scene {limits}; {each_s:.1f} s a scene on one core, {seconds / 60.0:.1f} min in all",
+        f"alert limits, fixed beforehand: {1e3 * low_m:.3g} to {1e3 * high_m:.3g} mm and {degrees} degrees",
+        beyond,
+        f"{each_s:.1f} s a scene, {seconds / 60.0:.1f} min in all",
     ]

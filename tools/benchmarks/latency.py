@@ -115,6 +115,12 @@ def add_parser(commands: Any) -> None:
         "measured again",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write speed.md there")
+    parser.add_argument(
+        "--against",
+        metavar="REV",
+        help="only this: the frame and its stages beside another revision's, in alternating blocks of one run; exit "
+        "code 1 if a frame takes longer",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -124,6 +130,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print("\n".join(f"{name:11s} {part.what}" for name, part in PARTS.items()))
         return 0
+    if arguments.against is not None:
+        return _against(arguments)
     unknown = [name for name in arguments.only if name not in PARTS]
     if unknown:
         print(f"latency: --only {unknown[0]}: no such row; one of {', '.join(PARTS)}", file=sys.stderr)
@@ -151,6 +159,25 @@ def run(arguments: argparse.Namespace) -> int:
     left_out = sum(row["value"] is None for part in results["parts"].values() for row in part["rows"])
     print((f"{len(missed)} missed" if missed else "none missed") + (f", {left_out} skipped" if left_out else ""))
     return 1 if missed else 0
+
+
+def _against(arguments: argparse.Namespace) -> int:
+    """Two revisions in one run."""
+    from dataclasses import asdict
+
+    from benchmarks import latency_against, machine
+
+    try:
+        plan = latency_against.QUICK if arguments.quick else latency_against.Plan()
+        rows, about = latency_against.run(arguments.against, plan)
+        if arguments.json is not None:
+            results = {"machine": machine.description(), **about, "rows": [asdict(row) for row in rows]}
+            arguments.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    except (ValueError, OSError) as error:
+        print(f"latency: --against {error}", file=sys.stderr)
+        return 2
+    print("\n".join(latency_against.as_lines(rows, about)))
+    return 1 if rows[0].slower else 0
 
 
 def measure(plan: Plan, names: list[str], resume: Path | None = None) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import os
 import platform
 import subprocess
@@ -81,3 +82,11 @@ def commit() -> str:
         return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain", "gripmon") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def digest_of(*patterns: str) -> str:
+    """Digest of the checkout's files as they are: what was measured with others isn't continued."""
+    digest = hashlib.sha256()
+    for path in sorted({path for pattern in patterns for path in ROOT.glob(pattern)}):
+        digest.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:10]

@@ -26,6 +26,7 @@ from gripmon.daemon.config.checks import (
     view_fault,
     with_alert_limit,
 )
+from gripmon.daemon.config.earlier import without_gone
 from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
@@ -147,7 +148,7 @@ def load_config(
     if SECTION in values:
         right = "a wrist camera's configuration; gripmon run, check and replay take both"
         raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
-    values, calibrated = with_sections(path, values)
+    values, calibrated = with_sections(path, without_gone(path, values, say=say_deprecated))
     settings = read_settings(path, Settings, values)
     try:
         settings = with_alert_limit(path, values, settings, say=say_deprecated)

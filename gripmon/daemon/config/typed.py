@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import inspect as mi
 
+from gripmon.model.decoding import decoder_of
 from gripmon.model.errors import InputError
 
 _T = TypeVar("_T")
@@ -55,6 +56,7 @@ def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:
     Raises :class:`SettingsError` with the full dotted key (below ``key``) for an unknown, missing or wrong entry, and
     for numbers that are not finite.
     """
+    decoder_of(settings_type)  # the pages convert in several threads
     node = mi.type_info(settings_type)
     fault = _find_fault(value, node, key)
     if fault is not None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.model.errors import in_short
+from gripmon.model.priority import give_way
 from gripmon.model.records import Frame, Image
 from gripmon.model.records.values import NS_PER_S
 
@@ -265,6 +266,7 @@ def _render(maker: FrameMaker, ring: _Ring, schedule: _Schedule, announce: Conne
     import cv2
 
     cv2.setNumThreads(1)
+    give_way()
     try:
         opening_m = _draw(maker, ring, schedule.first)
         announce.send(None)

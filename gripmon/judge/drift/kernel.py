@@ -345,10 +345,20 @@ def _missing(seen: Array, root: Array, inverse: Array, out: Array) -> None:
         for j in range(6):
             short[i, j] = (1.0 if i == j else 0.0) - short[i, j]
     if _root(short, part):  # all of it exceeds
-        part[:] = short
+        for i in range(6):
+            for j in range(6):
+                part[i, j] = short[i, j]
     else:
         _exceeding(short, between, part)
     _between_triangles(root, part, between, out)
+
+
+@compiled
+def _add(factor: float, matrix: Array, rest: Array, out: Array) -> None:
+    """``out`` = factor M + R, (6, 6) each."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = factor * matrix[i, j] + rest[i, j]
 
 
 @compiled
@@ -359,7 +369,6 @@ def refresh(
     times: Array,
     rare: Ints,
     reference: Array,
-    lasting: Array,
     known: Bools,
     plain: Array,
     mean_covariance: Array,
@@ -374,33 +383,35 @@ def refresh(
     often as to be always there what is missing of ``reported`` (s, 6, 6) comes on top, direction by direction.
     ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
     deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
-    (k,): length from which on noise is rare; ``lasting`` (k, 6, 6): what differences have on top.  The rest is
-    overwritten.  LinAlgError if rounding leaves no root.
+    (k,): length from which on noise is rare.  The rest is overwritten.  LinAlgError if rounding leaves no root.
     """
     lengths, streams = learnt.shape
     total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
-    root, part = np.empty((6, 6)), np.empty((6, 6))
-    never, missing = np.empty((6, 6)), np.empty((6, 6))
+    root, part, whole = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    never, missing, nothing = np.empty((6, 6)), np.empty((6, 6)), np.zeros((6, 6))
     for s in range(streams):
         for k in range(lengths - 1, -1, -1):
             # Beyond the longest, windows count as independent.
-            part[:] = (0.5 if k == lengths - 1 else 0.25) * of_difference[k, s]
-            seen[k] = seen[k + 1] + learnt[k, s] * part
+            _add(0.5 if k == lengths - 1 else 0.25, of_difference[k, s], nothing, part)
+            _add(learnt[k, s], part, seen[k + 1], seen[k])
             for way in range(3):
-                total[way, k] = times[way, k, s] * part
-                if k < lengths - 1:
-                    total[way, k] += total[way, k + 1]
+                _add(times[way, k, s], part, total[way, k + 1] if k < lengths - 1 else nothing, total[way, k])
         _whiten(reported[s], from_reported[s], to_reported[s])
         _missing(seen[0], from_reported[s], to_reported[s], never)
         for k in range(lengths):
-            _missing(seen[0] - seen[rare[k]], from_reported[s], to_reported[s], missing)
-            mean_covariance[k, s] = total[1, k] + never + reference[s]
-            way = 2 if known[0, k, s] else 0
-            _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s])
-            way = 2 if known[1, k, s] else 0
-            missing[:] = 2.0 * missing + lasting[k]
-            _whiten(times[way, k, s] * of_difference[k, s] + missing, root, whitening[1, k, s])
+            _add(-1.0, seen[rare[k]], seen[0], part)
+            _missing(part, from_reported[s], to_reported[s], missing)
+            _add(1.0, total[1, k], never, part)
+            _add(1.0, part, reference[s], mean_covariance[k, s])
+            _add(1.0, total[2 if known[0, k, s] else 0, k], never, part)
+            _add(1.0, part, reference[s], whole)
+            _whiten(whole, root, whitening[0, k, s])
+            missing[:] = 2.0 * missing
+            _add(times[2 if known[1, k, s] else 0, k, s], of_difference[k, s], missing, whole)
+            _whiten(whole, root, whitening[1, k, s])
             _whiten(of_difference[k, s], root, learnt_whitening[k, s])
             if k < plain.shape[1]:
-                _whiten(total[2, k] + never, root, plain[0, k, s])
-                _whiten(times[2, k, s] * of_difference[k, s] + missing, root, plain[1, k, s])
+                _add(1.0, total[2, k], never, whole)
+                _whiten(whole, root, plain[0, k, s])
+                _add(times[2, k, s], of_difference[k, s], missing, whole)
+                _whiten(whole, root, plain[1, k, s])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -70,22 +69,10 @@ as back; between this and the test's threshold an alert stays.
 EVIDENCE_LOOK_RATIO = 0.4
 """Part of the threshold from which the evidence is examined more closely, before the test decides."""
 
-BIAS_CHANGE_RATIO = 0.2
-"""Relative change of the lasting variance of a finer measurement from which the test is updated: a tenth of its
-standard deviation.
-"""
-
 VIBRATION_STEP_RATIO = 4.0
 """Multiple of a vibration's root mean square that two frames must be off to count as a step; a sinusoid reaches 1.4 to
 either side.
 """
-
-
-class Lasting(NamedTuple):
-    """Error that lasts: its ``covariance`` (6, 6), and the ``share`` of it that changes from frame to frame."""
-
-    covariance: Array
-    share: float
 
 
 class MotionWatch:
@@ -93,12 +80,6 @@ class MotionWatch:
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
-        self._settings = settings
-        # The finer measurement has its own noise, and therefore its own test.
-        self._other: SequentialTest | None = None
-        self._finer, self._missed = False, 0  # frames that the other test hasn't seen
-        self._reference: Array = np.zeros((6, 6))
-        self._of_bias: Array = np.zeros((6, 6))
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
@@ -114,8 +95,7 @@ class MotionWatch:
 
     def reset(self, reference_covariance: Array) -> None:
         """There is a new reference, with the covariance (6, 6) of its error: drift counts from zero."""
-        for test in self._tests:
-            test.restart(np.array([True]))
+        self.test.restart(np.array([True]))
         self.set_reference_covariance(reference_covariance)
         self._history.clear()
         self._newest.clear()
@@ -131,28 +111,19 @@ class MotionWatch:
 
     def set_reference_covariance(self, covariance: Array) -> None:
         """Covariance (6, 6) of the reference's own error, which is not a drift."""
-        self._reference = covariance
-        for test in self._tests:
-            test.set_reference_covariance(covariance)
-
-    @property
-    def _tests(self) -> tuple[SequentialTest, ...]:
-        return (self.test,) if self._other is None else (self.test, self._other)
+        self.test.set_reference_covariance(covariance)
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """Set the stream's own frame rate."""
         self._frames_per_s = frames_per_s
-        for test in self._tests:
-            test.set_frames_per_s(frames_per_s)
+        self.test.set_frames_per_s(frames_per_s)
 
-    def add(self, shift: Array | None, covariance: Array, now_s: float, bias: Lasting | None = None) -> Motion:
+    def add(self, shift: Array | None, covariance: Array, now_s: float) -> Motion:
         """Add one frame's shift (6,) against the reference, with its covariance (6, 6), at the frames' time.
 
-        ``shift`` is None while the reference's error isn't known yet.  ``bias`` is given for a frame that a finer
-        measurement refines: the lasting part of its error; ``covariance`` is then that of the rest.
+        ``shift`` is None while the reference's error isn't known yet.
         """
         self.statistic_share = None
-        self._choose_test(bias)
         if shift is None:
             self._last = Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
             return self._last
@@ -165,8 +136,6 @@ class MotionWatch:
         at_once = stepped and length <= BLOCK_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
-            if self._other is not None:
-                self._other.restart(np.array([True]))
         self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance)
         frames = max(int(test.windows.frames[0]), 1)
         level, level_covariance = self._level(min(frames, 2 * BLOCK_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
@@ -195,25 +164,6 @@ class MotionWatch:
             suspicious=bool(finding.excess[0] > EVIDENCE_LOOK_RATIO),
         )
         return self._last
-
-    def _choose_test(self, bias: Lasting | None) -> None:
-        """Select the test for frames of this kind; it restarts if its frames are old: the camera may have moved."""
-        self._missed += 1
-        if self._finer is not (bias is not None):
-            self._finer = bias is not None
-            if self._other is None:
-                self._other = SequentialTest(self._settings)
-                self._other.set_frames_per_s(self._frames_per_s)
-                self._other.set_reference_covariance(self._reference)
-            self.test, self._other = self._other, self.test
-            if self._missed > LEVEL_FRAMES:
-                self.test.restart(np.array([True]))
-            self._missed = 0
-        if bias is not None:
-            was, now = np.trace(self._of_bias[:3, :3]), np.trace(bias.covariance[:3, :3])
-            if abs(now - was) > BIAS_CHANGE_RATIO * was:
-                self._of_bias = bias.covariance
-                self.test.set_bias(*bias)
 
     def learn(self) -> None:
         """Learn from the newest frame, off the critical path; otherwise the next :meth:`add` does it first."""

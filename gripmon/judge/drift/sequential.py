@@ -106,8 +106,6 @@ class SequentialTest:
         self._seen = np.zeros(streams, dtype=np.intp)
         self._reported: Array = np.zeros((streams, 6, 6))
         self._reference: Array = np.zeros((streams, 6, 6))
-        self._bias: Array = np.zeros((6, 6))
-        self._lasting = np.zeros((len(LENGTHS), 6, 6))
         self._frames = self._since_restart = 0
         self.refreshes = 0
         """How often covariances and thresholds were computed."""
@@ -138,13 +136,6 @@ class SequentialTest:
         """Covariance (6, 6) or (s, 6, 6) of the reference's own error: that much of a mean shift is not a drift."""
         self._reference = np.broadcast_to(covariance, (self._streams, 6, 6)).copy()
         self._stale = True
-
-    def set_bias(self, covariance: Array, share: float) -> None:
-        """Covariance (6, 6) of an error common to all frames, and the ``share`` of it that changes from frame to frame.
-        That much of a mean is not a drift, and the changed part of it not a difference.
-        """
-        self._bias, self._stale = covariance, True
-        self._lasting = 2.0 * np.minimum(COUNT * share, 1.0)[:, :, None] * covariance
 
     def add(
         self, shift: Array, covariance: Array, learn: np.ndarray | None = None, at_least: int = LENGTHS[0]
@@ -281,8 +272,8 @@ class SequentialTest:
         by ``each`` (3, k, s): for assumed limits, for standard deviations, and for learnt limits.
         """
         kernel.refresh(
-            self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference + self._bias,
-            self._lasting, self._known, self._plain, self._mean_covariance, self._whitening, self._learnt_whitening,
+            self._reported, self.scatter.of_differences, self.scatter.learnt, each, RARE, self._reference,
+            self._known, self._plain, self._mean_covariance, self._whitening, self._learnt_whitening,
             self._to_reported, self._from_reported,
         )  # fmt: skip
 

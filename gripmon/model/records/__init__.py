@@ -41,15 +41,7 @@ from gripmon.model.records.frames import (
 )
 from gripmon.model.records.json_schema import json_schema, summary
 from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
-from gripmon.model.records.looks import (
-    FinerLookRecord,
-    LookBias,
-    LookNote,
-    LookPixels,
-    LookRecord,
-    LookVersion,
-    StripsRecord,
-)
+from gripmon.model.records.looks import LookRecord, StripsRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
@@ -100,7 +92,6 @@ __all__ = [
     "EdgeEvidence",
     "EdgeSums",
     "Explanation",
-    "FinerLookRecord",
     "Frame",
     "FrameNote",
     "FrameRecord",
@@ -108,11 +99,7 @@ __all__ = [
     "JawReading",
     "LaserPulse",
     "Limits",
-    "LookBias",
-    "LookNote",
-    "LookPixels",
     "LookRecord",
-    "LookVersion",
     "MeasurementTrace",
     "MessageRefused",
     "Meta",

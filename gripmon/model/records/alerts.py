@@ -8,7 +8,6 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records.looks import LookNote
 from gripmon.model.records.values import OpenEnum
 
 
@@ -61,7 +60,6 @@ class AlertKind(OpenEnum):
     RECORDING = "recording"
     OUTPUT = "output"
     SEVERAL = "several_monitors"
-    LOOK = "look"
 
 
 class AlertEvent(enum.StrEnum):
@@ -109,15 +107,9 @@ class Alert(msgspec.Struct, frozen=True):
     ] = None
     since_ns: Annotated[
         int | None,
-        Meta(
-            description="when it was raised, or since when the gripper looks different, Unix ns; null for all else "
-            "that is only noted"
-        ),
+        Meta(description="when it was raised, Unix ns; null for what is only noted"),
     ] = None
     acknowledged: Annotated[bool, Meta(description="an operator has taken note of it")] = False
-    look: Annotated[
-        LookNote | msgspec.UnsetType, Meta(description="which look, and where; left out for all other kinds")
-    ] = msgspec.UNSET
 
 
 class OpenAlert(msgspec.Struct, frozen=True):

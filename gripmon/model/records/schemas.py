@@ -7,11 +7,11 @@ and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reade
 from __future__ import annotations
 
 import contextlib
-import functools
 from typing import TypeVar, cast
 
 import msgspec
 
+from gripmon.model.decoding import decoder_of
 from gripmon.model.records.commands import CommandError, CommandReply, CommandReply1, CommandRequest
 from gripmon.model.records.frames import FrameRecord, FrameRecord1
 from gripmon.model.records.laser import LaserPulse, SpotRecord
@@ -61,6 +61,11 @@ class _Tag(msgspec.Struct, frozen=True):
     schema: str = ""
 
 
+decoder_of(_Tag)
+for _message in MESSAGES.values():
+    decoder_of(_message)  # before threads of Zenoh's decode their first messages, however they do it
+
+
 def from_json(payload: bytes, message: type[_T]) -> _T:
     """Decode a payload from the network as the type that is expected there.
 
@@ -70,11 +75,11 @@ def from_json(payload: bytes, message: type[_T]) -> _T:
     if len(payload) > largest_bytes(message):
         raise MessageRefused(f"{len(payload)} bytes; at most {largest_bytes(message)}")
     try:
-        return _decoder(message).decode(payload)
+        return decoder_of(message).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         if (older := OLDER.get(message)) is not None and _schema_of(payload) == schema_name(older):
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-                return cast(_T, _decoder(older).decode(payload).upgraded())
+                return cast(_T, decoder_of(older).decode(payload).upgraded())
         raise MessageRefused(_what_is_wrong(payload, message, error)) from None
 
 
@@ -88,11 +93,6 @@ def schema_name(message: type[msgspec.Struct]) -> str:
     return str(message.__struct_config__.tag)
 
 
-@functools.cache
-def _decoder(message: type[_T]) -> msgspec.json.Decoder[_T]:
-    return msgspec.json.Decoder(message)
-
-
 def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Exception) -> str:
     schema = _schema_of(payload)
     if schema and schema != (known := schema_name(message)):
@@ -103,6 +103,6 @@ def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Excepti
 def _schema_of(payload: bytes) -> str:
     """The schema that a payload names; empty where it names none."""
     try:
-        return msgspec.json.decode(payload, type=_Tag).schema
+        return decoder_of(_Tag).decode(payload).schema
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return ""

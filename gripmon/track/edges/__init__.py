@@ -9,7 +9,7 @@ from gripmon.track.edges.roles import has_lone_end, inner_edges, sides
 from gripmon.track.edges.settings import MeasurementSettings, SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
-from gripmon.track.edges.warming import warm_up
+from gripmon.track.edges.warming import warm_up_fit, warm_up_geometry, warm_up_profiles
 
 __all__ = [
     "JAW_UNREPORTED_SIGMA_M",
@@ -38,5 +38,7 @@ __all__ = [
     "prior_information",
     "sides",
     "trace_of",
-    "warm_up",
+    "warm_up_fit",
+    "warm_up_geometry",
+    "warm_up_profiles",
 ]

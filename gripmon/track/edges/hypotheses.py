@@ -33,6 +33,9 @@ from gripmon.track.edges.reduced import (
 POINTS_LENGTH_EXPONENT = 0.75
 """Exponent of the length in an edge's number of points: short edges across the fingers tell what long ones don't."""
 
+FEWEST_POINTS = 3
+"""Points on an edge that always shows, however short it is."""
+
 _EDGE_MARGIN = 0.03  # of an edge at each end: the neighbour shows there
 
 
@@ -63,9 +66,17 @@ class OutlinePoints:
 
 
 def outline_points(
-    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, margin_px: float, count: int
+    camera: Camera,
+    gripper: Gripper,
+    cam_T_grip: Array,
+    jaw_opening_m: float,
+    margin_px: float,
+    count: int,
+    shown: Array | None = None,
 ) -> OutlinePoints:
-    """Some ``count`` points on the outlines that show from a pose, up to ``margin_px`` outside of the image."""
+    """Some ``count`` points on the outlines that show from a pose, up to ``margin_px`` outside of the image; fewer on
+    those that are rarely ``shown`` (e,), 0 to 1.
+    """
     ends_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(ends_m, invert(cam_T_grip)[:3, 3])
     wanted = view.visible & ~view.crease
@@ -79,10 +90,13 @@ def outline_points(
         limit = np.array([camera.width_px, camera.height_px]) - 1.0 + margin_px
         near: NDArray[np.bool_] = np.all((uv >= -margin_px) & (uv <= limit), axis=2)
     way_px = np.where(near[:, 1:] & near[:, :-1], np.linalg.norm(np.diff(uv, axis=1), axis=2), 0.0)
-    weight = np.nansum(way_px, axis=1) ** POINTS_LENGTH_EXPONENT
-    counts = np.maximum(np.round(count * weight / max(float(weight.sum()), 1e-9)), 3).astype(int)
+    often = np.ones(len(edges)) if shown is None else shown[edges]
+    length_px = np.nansum(way_px, axis=1)
+    weight = often * length_px**POINTS_LENGTH_EXPONENT
+    counts = np.maximum(count * weight / max(float(weight.sum()), 1e-9), FEWEST_POINTS * often)
+    counts = np.round(counts).astype(int)
     chosen, which = [], []
-    for k in np.flatnonzero(weight > 0.0).tolist():
+    for k in np.flatnonzero((length_px > 0.0) & (counts > 0)).tolist():
         travelled = np.concatenate([[0.0], np.cumsum(way_px[k])])
         # Within what is near, equally spaced in the image.
         chosen.append(np.interp(np.linspace(0.0, travelled[-1], counts[k]), travelled, share))

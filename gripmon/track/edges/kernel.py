@@ -68,7 +68,8 @@ def fit(
     count = len(start)
     near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
     unknowns, wanted, held = np.zeros(SIZE), np.zeros(SIZE), np.ones(SIZE)
-    unknowns[:count], wanted[:count], held[:count] = start, mean, prior
+    for i in range(count):
+        unknowns[i], wanted[i], held[i] = start[i], mean[i], prior[i]
     solved, final, information, spread_px, stiffness = _irls(
         near, edge_spread_px, wanted, held, unknowns, width_px, rounds, start_width_px
     )
@@ -165,8 +166,9 @@ def _irls(
                 step[i] += weighted * residual[j]
                 for k in range(i + 1):
                     information[i, k] += weighted * jacobian[j, k]
-        normal[:] = information
         for i in range(SIZE):
+            for k in range(SIZE):
+                normal[i, k] = information[i, k]
             normal[i, i] += prior[i]
             step[i] += prior[i] * (mean[i] - xi[i])
         solved = _factorise(normal)
@@ -477,7 +479,8 @@ def contradictions_without(
     count = len(start)
     out = np.full(len(left_out), np.nan)
     wanted, held = np.zeros(SIZE), np.ones(SIZE)
-    wanted[:count], held[:count] = mean, prior
+    for i in range(count):
+        wanted[i], held[i] = mean[i], prior[i]
     for v in range(len(left_out)):
         rest = weight.copy()
         for k in range(len(sample)):
@@ -485,7 +488,8 @@ def contradictions_without(
                 rest[k] = 0.0
         near = _near(sample, offset_px, rest, jacobian, edge, start, max(width_px, TUKEY * LARGEST_SPREAD_PX))
         xi = np.zeros(SIZE)
-        xi[:count] = start
+        for i in range(count):
+            xi[i] = start[i]
         solved, final, _, _, _ = _irls(near, edge_spread_px, wanted, held, xi, width_px, rounds, width_px)
         residual_px, place = np.empty(len(final)), near[0]
         _residuals(near[1], near[2], xi, residual_px)

@@ -19,6 +19,7 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
 from gripmon.track.edges.evidence import ELSEWHERE_SHARE_RATIO, FingerMeter
+from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
 from gripmon.track.edges.profiles import unevenness
 from gripmon.track.edges.robust_fit import (
@@ -31,7 +32,13 @@ from gripmon.track.edges.search import search_poses
 from gripmon.track.edges.settling import ZOOMS, Effort, Expected, Measurement
 
 FOUND_EDGE_SHARE = 0.85
-"""Least fraction of the sampled edges that is seen at a place found by a search."""
+"""Least part of the sampled edges that usually show which is seen at a place found by a search."""
+
+FOUND_SHARE_RATIO = 0.7
+"""Fraction of the usual inlier ratio that suffices at a place found by a search, where that is less than the settings'
+``found_share``: its default over the inlier ratio that is expected before anything is known.  What shows less than
+that in its place isn't asked for more elsewhere.
+"""
 
 EVEN_SIDES = (0.35, 0.7)
 """Unevenness of the edges' calmer sides up to which a smaller part suffices, and that part."""
@@ -67,8 +74,8 @@ class Patience:
 
 class Sought(NamedTuple):
     """How a gripper is searched for: whether it is ``lost`` where it is expected, or only poor, and whether ``near``
-    by as well; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, and the one that a
-    rough fit must show.
+    by as well; the image's ``zoom``, whether the jaw's opening is reported, the share that is usual, how often each
+    edge is ``shown`` (e,), and the share that a rough fit must show.
     """
 
     lost: bool
@@ -76,6 +83,7 @@ class Sought(NamedTuple):
     zoom: int
     jaw_reported: bool
     usual_share: float
+    shown: Array
     least_share: float
 
 
@@ -95,6 +103,13 @@ class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and searches elsewhere if it isn't seen where it is expected."""
 
     _lost = 0  # frames in a row in which it wasn't seen there
+
+    @cached_property
+    def shown(self) -> Array:
+        """(e,) how often each edge shows where the gripper stands, 0 to 1; to be set once more is known than what was
+        taught.  Some are hidden or of one shade with what is behind them, and aren't asked for elsewhere either.
+        """
+        return np.ones(len(self._gripper.edge_ids)) if self._taught is None else self._taught.shown
 
     @cached_property
     def _ends(self) -> FingerEnds:
@@ -184,14 +199,14 @@ class FingertipMeter(FingerMeter):
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true, and such a place is not given up for one that isn't believed.
         beat = (ELSEWHERE_SHARE_RATIO if best.trusted else 1.0) * best.consensus.share
-        least = max(self._settings.consensus.found_share, TRUSTED_SHARE_RATIO * usual_share)
+        least = self._least_share(usual_share)
         for effort in (Effort.GRID, Effort.SEARCH) if at_once else (Effort.SEARCH,):
             enough = PROMISING_RATIO * max(beat, least)
             if effort is Effort.GRID:
                 places = self._fitted_again(image, self._near_places(image, expected), enough)
             else:
                 lost, reported = not best.trusted, self._prior is self._prior_reported
-                sought = Sought(lost, not at_once, self._zoom, reported, usual_share, enough)
+                sought = Sought(lost, not at_once, self._zoom, reported, usual_share, self.shown, enough)
                 places = search(image, expected, sought)
             for place in places:
                 other = replace(self._settle(image, place), effort=effort)
@@ -249,7 +264,7 @@ class FingertipMeter(FingerMeter):
         consensus, share = self._settings.consensus, measurement.consensus.share
         if measurement.effort is Effort.NARROW:
             return share >= max(consensus.trusted_share, TRUSTED_SHARE_RATIO * usual_share)
-        if share < max(consensus.found_share, TRUSTED_SHARE_RATIO * usual_share):
+        if share < self._least_share(usual_share):
             return False
         # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
         uneven, part = unevenness(image, measurement.prediction), FOUND_EDGE_SHARE
@@ -257,13 +272,31 @@ class FingertipMeter(FingerMeter):
             part = EVEN_SIDES[1]
         elif uneven >= UNEVEN_SIDES:
             part = 1.0
-        return bool(_seen_part(measurement.consensus, measurement.prediction) >= part)
+        return self._seen_part(measurement.consensus, measurement.prediction) >= part
+
+    def _least_share(self, usual_share: float) -> float:
+        """The share that a place elsewhere must show: never less than where the gripper is expected."""
+        consensus = self._settings.consensus
+        return max(consensus.trusted_share, min(consensus.found_share, FOUND_SHARE_RATIO * usual_share))
+
+    def _seen_part(self, consensus: RobustFit, prediction: Prediction) -> float:
+        """The sampled edges that are seen, each as much as it usually shows, over what that gives on average."""
+        edges = prediction.layout.edges
+        often = self.shown[edges]
+        return float(often @ consensus.edge_seen[edges]) / max(float(often @ often), FEWEST_EDGES)
+
+    def _shows_nearly_all(self, measurement: Measurement) -> bool:
+        return self._seen_part(measurement.consensus, measurement.prediction) >= FOUND_EDGE_SHARE
+
+    def _completeness(self, consensus: RobustFit, prediction: Prediction) -> float:
+        """The share weighted by the part of the edges that are seen: at a wrong opening one finger can agree alone."""
+        return consensus.share * self._seen_part(consensus, prediction)
 
     def _from_openings(self, image: Image, expected: Expected, satisfied: float, best: Measurement) -> Measurement:
         """Starts at other openings, for a jaw that moves and doesn't report it: nearby first, then in its whole range
         until nearly all edges are seen.
         """
-        if best.consensus.share >= satisfied and _shows_nearly_all(best):
+        if best.consensus.share >= satisfied and self._shows_nearly_all(best):
             return best
         prediction, _ = self._predicted(expected)
         rate = float(np.abs(prediction.jacobian[:, 6]).max(initial=0.0))  # px/m
@@ -279,25 +312,27 @@ class FingertipMeter(FingerMeter):
         openings_m = np.clip(openings_m, gripper.jaw_min_m, gripper.jaw_max_m)
         for opening_m in sorted(openings_m.tolist(), key=lambda o: abs(o - expected.jaw_opening_m)):
             far = abs(opening_m - expected.jaw_opening_m) > 2.1 * step_m
-            if far and best.consensus.share >= satisfied and _shows_nearly_all(best):
+            if far and best.consensus.share >= satisfied and self._shows_nearly_all(best):
                 break
             there = replace(expected, jaw_opening_m=opening_m)
             seen = self._predict(prediction.layout, there)
             edgels, prior = self._look(image, seen), self._prior_about(seen, there)
             fit = fit_irls_from_grid(edgels, prior, starts, self._settings.consensus, refine=len(starts))
-            if _completeness(fit, seen) > _completeness(best.consensus, best.prediction):
+            if self._completeness(fit, seen) > self._completeness(best.consensus, best.prediction):
                 other = self._settle(image, self._moved(seen, fit.xi, there))
-                best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
+                best = max(best, other, key=lambda m: self._completeness(m.consensus, m.prediction))
         return best
 
     def searched(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
         """Where the gripper may be, best first, by a search in the whole neighbourhood; takes the time of many
         frames.
         """
-        self._zoom = sought.zoom
+        self._zoom, self.shown = sought.zoom, sought.shown
         self._prior = self._prior_reported if sought.jaw_reported else self._prior_unreported
         search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
-        poses = search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search)
+        poses = search_poses(
+            image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search, sought.shown
+        )
         places = self._near_places(image, expected) if sought.near else []
         places += self._far_places(image, expected, poses, sought.usual_share)
         return self._fitted_again(image, places, sought.least_share)
@@ -357,18 +392,3 @@ def _promising(places: list[_Place], least: float) -> list[_Place]:
     """The best places with at least the share ``least``, and only those that may turn out as good as the first."""
     best = _best(places, SETTLED_PLACES)
     return [place for place in best if place.share >= max(least, PROMISING_RATIO * best[0].share)]
-
-
-def _shows_nearly_all(measurement: Measurement) -> bool:
-    return _seen_part(measurement.consensus, measurement.prediction) >= FOUND_EDGE_SHARE
-
-
-def _seen_part(consensus: RobustFit, prediction: Prediction) -> float:
-    """Fraction of the sampled edges that is seen."""
-    edges = prediction.layout.edges
-    return np.count_nonzero(consensus.edge_seen[edges]) / max(len(edges), 1)
-
-
-def _completeness(consensus: RobustFit, prediction: Prediction) -> float:
-    """The share weighted by the part of the edges that are seen: at a wrong opening one finger can agree alone."""
-    return consensus.share * _seen_part(consensus, prediction)

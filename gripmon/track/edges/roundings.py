@@ -81,9 +81,9 @@ class Roundings:
         _, same = np.unique(gripper.points_grip_m(), axis=0, return_inverse=True)
         _, first = np.unique(same, return_index=True)
         one = first[same.ravel()]
-        self._ends, corners = one[gripper.edge_points], set(one[gripper.corner_points].tolist())
+        self._ends, self._corners = one[gripper.edge_points], set(one[gripper.corner_points].tolist())
         self._meeting: dict[int, tuple[int, int]] = {}
-        for point in sorted(set(self._ends[outline].ravel().tolist()) - corners):
+        for point in sorted(set(self._ends[outline].ravel().tolist())):
             edges = np.flatnonzero(outline & (self._ends == point).any(axis=1)).tolist()
             if len(edges) == 2:
                 self._meeting[point] = edges[0], edges[1]
@@ -108,7 +108,9 @@ class Roundings:
         if found[0] is None or found[1] is None or found[0][0] == found[1][0]:
             return None
         (one, own, passed), (other, others, also) = found[0], found[1]
-        if not (passed or also or self._gripper.edge_curved[[one, other]].any()):
+        # A corner is seen as one, unless an edge at it is too short to be measured in this view.
+        turns = point not in self._corners and self._gripper.edge_curved[[one, other]].any()
+        if not (passed or also or turns):
             return None  # two edges that end in a point which the file doesn't take for a corner
         uv_px = prediction.uv_px
         first = [int(own[0]), int(others[0])]

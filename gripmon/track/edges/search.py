@@ -62,16 +62,17 @@ def search_poses(
     cam_T_grip: Array,
     jaw_opening_m: float,
     settings: SearchSettings,
+    shown: Array | None = None,
 ) -> Array:
     """Poses (s, 4, 4) about an expected one from which a joint fit may find the gripper, best first.
 
-    Empty when none of its outlines can be in the image.
+    ``shown`` (e,): how often each edge shows, 0 to 1; None: all are looked for alike.  Empty when none of its outlines can be in the image.
     """
     depth_m = float(cam_T_grip[2, 3])
     if not depth_m > 0.0:
         return np.zeros((0, 4, 4))
     margin_px = settings.reach_m / depth_m * camera.fx_px
-    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, POINTS)
+    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, POINTS, shown)
     if not len(points):
         return np.zeros((0, 4, 4))
     place = _Place(cam_T_grip, points, settings)
@@ -87,7 +88,7 @@ def search_poses(
         np.array(apart(poses, points, window, scores, 0.5 * DISTINCT_CELLS / POLISHING_ZOOM, POLISHED_PLACES))
     )
     finer = window.finer(POLISHING_ZOOM)
-    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS)
+    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS, shown)
     profiles = ProfileScore(points, finer, *rectify(image, camera, finer), POLISHING_ZOOM * BESIDE_CELLS)
     poses = profiles.polished(poses, POLISH_REACH, POLISH_ROUNDS, place.sigma)
     best = apart(poses, points, finer, profiles.score(poses), DISTINCT_CELLS, settings.starts)

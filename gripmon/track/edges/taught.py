@@ -203,7 +203,8 @@ class TaughtEdges:
     visible part; ``shift_grip_m`` (e, 2, 3): the line's shift at both ends of the model's edge, gripper frame;
     ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
     taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
-    gripper (1: brighter to the right).  An edge that isn't known has no shift.  ``usual_m``: root mean square offset of
+    gripper (1: brighter to the right); ``shown`` (e,): part of it that showed.  An edge that isn't known has no shift,
+    and is expected to show.  ``usual_m``: root mean square offset of
     the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
     at, which their offsets have in them: one standard deviation along each of k directions, m and rad.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
@@ -218,6 +219,7 @@ class TaughtEdges:
     depth_grip: Array
     depth_sigma_m: Array
     polarity: NDArray[np.int8]
+    shown: Array
     usual_m: float
     reference_error: Array
     reference_offset: Array
@@ -252,6 +254,7 @@ class TaughtEdges:
             depth,
             np.array([e.depth_sigma_m for e in listed]),
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
+            np.array([e.seen for e in listed]),
             float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
             np.zeros((0, 6)) if covariance is None else np.linalg.cholesky(np.reshape(covariance, (6, 6))).T,
             np.array(offset),

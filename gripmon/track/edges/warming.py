@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from gripmon.track.edges import prediction_kernel
@@ -11,6 +9,8 @@ from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction
 from gripmon.track.edges.profiles import (
+    Candidates,
+    Edgels,
     blur_px,
     estimate_noise,
     find_candidates,
@@ -18,39 +18,49 @@ from gripmon.track.edges.profiles import (
     read_profiles,
     weigh,
 )
-from gripmon.track.edges.robust_fit import Prior, assess, contradictions_without, fit_irls
+from gripmon.track.edges.robust_fit import Prior, RobustFit, assess, contradictions_without, fit_irls
 from gripmon.track.edges.settings import CornerSettings, EdgeSettings, RobustFitSettings, SamplingSettings
 from gripmon.track.edges.settling import corner_rms
 
 
-def warm_up() -> float:
-    """Compile, or load what was compiled before, for grey and colour images of eight bits; the seconds that it took.
+def warm_up_profiles() -> None:
+    """Compile, or load what was compiled before, what reads grey and colour images of eight bits.
 
     Other images are compiled for, once on a machine, when the first of them comes.
     """
-    begin_s = time.perf_counter()
-    prediction, settings = _of_one_edge(), RobustFitSettings()
+    prediction = _of_one_edge()
     for shape in ((9, 9), (9, 9, 3)):
         profiles = read_profiles(np.zeros(shape, dtype=np.uint8), prediction.map_x, prediction.map_y)
-    noise = estimate_noise(profiles)
-    candidates = find_candidates(profiles, prediction.ok, noise, 255.0, EdgeSettings())
-    edgels = weigh(candidates, prediction, np.zeros(1, dtype=np.int8), settings)
-    prior, start = Prior(np.zeros(6), np.ones(6)), np.zeros(6)
+    candidates = find_candidates(profiles, prediction.ok, estimate_noise(profiles), 255.0, EdgeSettings())
+    weigh(candidates, prediction, np.zeros(1, dtype=np.int8), RobustFitSettings())
+    blur_px(candidates, np.zeros(0), EdgeSettings())
+    edge_means(candidates.sample, np.zeros(0), np.zeros(0), prediction.layout.edge, 1)
+
+
+def warm_up_fit() -> None:
+    """The same for the joint fit."""
+    edgels, prior, start, settings = _no_edgels(), Prior(np.zeros(6), np.ones(6)), np.zeros(6), RobustFitSettings()
     consensus = fit_irls(edgels, prior, start, settings)
-    line_weight = assess(edgels, consensus, prior.information).line_weight
+    assess(edgels, consensus, prior.information)
     contradictions_without(edgels, prior, start, settings)
-    nothing = np.zeros(0, dtype=np.intp)
+
+
+def warm_up_geometry() -> None:
+    """The same for the prediction of what will be seen, and for corners where fitted edges meet."""
+    edgels, nothing = _no_edgels(), np.zeros(0, dtype=np.intp)
+    prediction = edgels.prediction
     places = nothing.reshape(0, 4)
     geometry = CornerGeometry(nothing, nothing, nothing, np.zeros((0, 3)), places, np.zeros(1, dtype=np.intp))
-    corners = intersect_edges(edgels, consensus, line_weight, geometry, CornerSettings())
-    prediction.moved_px(consensus.xi)
-    blur_px(candidates, consensus.weight, EdgeSettings())
+    fitted = RobustFit(
+        np.zeros(6), np.zeros(0), np.zeros(0), np.zeros((6, 6)), 1.0, 1.0, np.zeros(4, dtype=np.bool_), np.zeros(1),
+        np.zeros(1, dtype=np.bool_), 0.0,
+    )  # fmt: skip
+    corners = intersect_edges(edgels, fitted, np.zeros(0), geometry, CornerSettings())
+    prediction.moved_px(fitted.xi)
     here, edge, points_m = prediction.cam_T_grip, prediction.layout.edge, prediction.corners.cam_m
     corner_rms(corners.xy, corners.usable, points_m, here, here, prediction.corners.d_uv_d_xy)
-    agreeing_shares(np.zeros(1, dtype=np.intp), edge, prediction.ok, consensus.supported, 1)
-    edge_means(candidates.sample, consensus.weight, consensus.residual_px, edge, 1)
+    agreeing_shares(np.zeros(1, dtype=np.intp), edge, prediction.ok, fitted.supported, 1)
     _predict(prediction)
-    return time.perf_counter() - begin_s
 
 
 def _predict(prediction: Prediction) -> None:
@@ -63,6 +73,13 @@ def _predict(prediction: Prediction) -> None:
     by.maps(prediction.uv_px, prediction.normal, *np.zeros((2, 3), dtype=np.float32))
     _, way_xy, *_ = by.ideal_lines(points_cam_m, layout.edge, layout.edges, layout.first, 1)
     by.gains(points_cam_m, prediction.normal, d_uv, way_xy)
+
+
+def _no_edgels() -> Edgels:
+    """No edgel hypothesis, of one edge; only its types count."""
+    none = np.zeros(0)
+    candidates = Candidates(np.zeros(0, dtype=np.intp), none, none, none, none, none, 1.0, 255.0)
+    return Edgels(candidates, _of_one_edge(), none, np.zeros(1), np.zeros(1))
 
 
 def _of_one_edge() -> Prediction:

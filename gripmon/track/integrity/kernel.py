@@ -64,7 +64,10 @@ def _inverse(matrix: Array, inverse: Array, root: Array, between: Array) -> None
     if _root(matrix, root):
         _invert(root, inverse, between)
     else:
-        inverse[:] = np.linalg.inv(matrix)
+        inverted = np.linalg.inv(matrix)
+        for i in range(len(inverted)):
+            for k in range(len(inverted)):
+                inverse[i, k] = inverted[i, k]
 
 
 @compiled
@@ -74,9 +77,10 @@ def _square(covariance: Array, values: Array, root: Array, white: Array) -> floa
     """
     total = 0.0
     if not _root(covariance, root):
-        white[:] = np.linalg.solve(covariance, values)
+        solved = np.linalg.solve(covariance, values)
         for i in range(len(white)):
-            total += values[i] * white[i]
+            white[i] = solved[i]
+            total += values[i] * solved[i]
         return total
     for i in range(len(root)):
         rest = values[i]

@@ -22,7 +22,6 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image, StripsRecord
 from gripmon.track.look.agreement import LookRefused
-from gripmon.track.look.kernel import CLIP_SIGMAS
 
 LENGTH_PX, REACH_PX = 64, 96
 """How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: as far as a
@@ -49,6 +48,11 @@ INDEPENDENT_PX = 4.0
 ONE_EDGE_PX = 2
 """Edges of an image that are nearer to each other are one, and fitted ten times better: no mark on a finger is taken
 for its end then, and a slide up to this can't be seen.
+"""
+
+CLIP_SIGMAS = 3.0
+"""Standard deviations that a grey level counts for at most in a strip's mean: a bright thing in front of a finger
+weighs no more than a line on it.
 """
 
 EXPLAINED_CORRELATION = 0.87

@@ -166,7 +166,6 @@ def refresh(
     times: Array,
     rare: Ints,
     reference: Array,
-    lasting: Array,
     known: Bools,
     plain: Array,
     mean_covariance: Array,
@@ -178,7 +177,6 @@ def refresh(
     from_reported[:] = np.linalg.cholesky(reported)
     to_reported[:] = np.linalg.inv(from_reported)
     of_mean, of_differences = covariances(reported, of_difference, learnt, times, rare)
-    of_differences += lasting[:, None]
     short = plain.shape[1]
     plain[:] = whitening_of(np.stack([of_mean[2, :short], of_differences[2, :short]]))
     of_mean += reference
