@@ -245,4 +245,4 @@ def test_a_rate_of_zero_is_refused_with_what_would_be_right(tmp_path: Path, caps
     path.write_text(text.replace("\nmonitor:\n", "\nmonitor:\n  policy: {mount_jumps_per_month: 0}\n"))
     assert main(["check", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "monitor.policy.mount_jumps_per_month: is 0; 0.001 to 100000" in line
+    assert "monitor.policy.mount_jumps_per_month: is 0; a number >= 0.001 and <= 100000" in line
