@@ -15,6 +15,7 @@ from support.grippers import gripper_from_dict
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.gripper import Gripper
@@ -217,7 +218,7 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
         (
             "0.002",
             "{}",
-            "alert_limit_m is 0.001, below the reference's own standard deviation of 0.002 m; at least that",
+            "alert_limit_m is 0.001, below the reference's own standard deviation of 0.002 m; at least",
         ),
         ("0.002", "{valid_by: reference}", None),
         (None, "{valid_by: reference}", None),
@@ -234,7 +235,7 @@ def test_an_absolute_bound_says_in_a_line_if_the_reference_is_not_known_well_eno
     assert count == 1
     path = tmp_path / "config.yaml"
     path.write_text(text.replace("\nmonitor:\n", f"\nmonitor:\n  policy: {policy}\n"))
-    line = limits_warning(load_config(path))
+    line = reference_doubt(load_config(path).settings)
     assert line is None if said is None else (said in (line or "") and "valid_by: reference" in (line or ""))
 
 
@@ -244,4 +245,4 @@ def test_a_rate_of_zero_is_refused_with_what_would_be_right(tmp_path: Path, caps
     path.write_text(text.replace("\nmonitor:\n", "\nmonitor:\n  policy: {mount_jumps_per_month: 0}\n"))
     assert main(["check", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "monitor.policy.mount_jumps_per_month: is 0; 0.001 to 100000" in line
+    assert "monitor.policy.mount_jumps_per_month: is 0; a number >= 0.001 and <= 100000" in line

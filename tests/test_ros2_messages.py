@@ -134,6 +134,7 @@ def test_values_of_diagnostics(messages: Messages):
     assert values == {
         "state": "tracking",
         "verdict": "valid",
+        "valid by": "absolute",
         "broadcast": "no: verdict suspect",
         "reference": "plate-2",
         "revision": "3",

@@ -22,6 +22,7 @@ from gripmon.model.records import (
     CommandReply,
     FrameRecord,
     MonitorState,
+    Protection,
     Since,
     ValidBy,
     Verdict,
@@ -29,8 +30,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.refits import CommonError
-from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, Opened
+from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, CommonError, Opened
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript
 from gripmon.track.integrity import Separation
@@ -63,7 +63,7 @@ class Seen(NamedTuple):
 
 
 def scene(frames: int = 28, **sections: object) -> Scenario:
-    return Scenario(name="since", fps=FPS, duration_s=frames / FPS, **sections)  # type: ignore[arg-type]
+    return Scenario(name="since", fps=FPS, duration_s=frames / FPS, **sections)
 
 
 def scaled(gripper: Gripper, factor: float, sigma: float) -> Gripper:
@@ -272,14 +272,14 @@ def test_what_valid_by_names_is_what_is_published_and_judged():
         if name is ValidBy.ABSOLUTE:
             assert record.cam_T_grip == record.measured_T
     # The same is measured, whatever is published of it.
-    measured = [pose_of(run.records[-1].measured_T) for run in by.values()]  # type: ignore[arg-type]
+    measured = [pose_of(run.records[-1].measured_T) for run in by.values()]
     assert np.linalg.norm(difference(*measured)[:3]) < 5e-5
 
 
 # --- when it begins ---
 
 
-class Average:
+class Mean:
     """Stands in for the anchor: an average of ``frames``, with a bound of a millimetre."""
 
     def __init__(self, cam_T_grip: np.ndarray, frames: int = 1):
@@ -288,9 +288,7 @@ class Average:
     def fits(self) -> Separation:
         return at_reference(self.cam_T_grip).fits
 
-    def bound(self, risk: float):
-        from gripmon.model.records import Protection
-
+    def bound(self, risk: float) -> Protection:
         return Protection(1e-3, 0.02, risk)
 
 
@@ -299,10 +297,10 @@ def begun() -> AtReferences:
 
 
 def test_it_is_the_average_of_the_first_frames_that_proved_a_pose():
-    kept, anchor = begun(), Average(np.eye(4))
+    kept, anchor = begun(), Mean(np.eye(4))
     for number in range(2 * FIRST_FRAMES):
         anchor.cam_T_grip = moved(np.eye(4), np.array([1e-6 * (number + 1), 0.0, 0.0, 0.0, 0.0, 0.0]))
-        kept.add(anchor, 0.03 + 1e-5 * number, 1000 + number)  # type: ignore[arg-type]
+        kept.add(anchor, 0.03 + 1e-5 * number, 1000 + number)
         assert kept.changes == int(number >= FIRST_FRAMES - 1)
     at = kept.current
     assert at is not None and (at.frames, at.since_ns, at.since) == (30, 1000, Since.FIRST_PROVED)
@@ -316,10 +314,10 @@ def test_it_is_the_average_of_the_first_frames_that_proved_a_pose():
 )
 def test_a_place_that_the_very_first_frames_allow_begins_it_anew(frames: int, shift_m: float, anew: bool):
     assert UNSETTLED_FRAMES == 5
-    kept, first = begun(), Average(np.eye(4), frames)
-    kept.add(first, 0.03, 1)  # type: ignore[arg-type]
-    there = Average(moved(np.eye(4), np.array([shift_m, 0.0, 0.0, 0.0, 0.0, 0.0])))
-    kept.add(there, 0.03, 2)  # type: ignore[arg-type]
+    kept, first = begun(), Mean(np.eye(4), frames)
+    kept.add(first, 0.03, 1)
+    there = Mean(moved(np.eye(4), np.array([shift_m, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    kept.add(there, 0.03, 2)
     at = kept.current
     assert at is not None and at.since_ns == (2 if anew else 1)
     assert at.cam_T_grip[0, 3] == (shift_m if anew else 0.0)
@@ -360,12 +358,12 @@ def test_a_restart_goes_on_with_it_and_sees_a_knock_in_between():
 
 
 def test_a_reference_that_is_measured_again_begins_it_from_its_own_frames_and_an_undo_goes_back():
-    kept, anchor = begun(), Average(np.eye(4), 40)
+    kept, anchor = begun(), Mean(np.eye(4), 40)
     for _ in range(FIRST_FRAMES):
-        kept.add(anchor, 0.03, 1)  # type: ignore[arg-type]
-    there = Average(moved(np.eye(4), np.array([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0])), 20)
+        kept.add(anchor, 0.03, 1)
+    there = Mean(moved(np.eye(4), np.array([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0])), 20)
     new = msgspec.structs.replace(reference_at(there.cam_T_grip), reference_id="recalibration-2", stamp_ns=77)
-    kept.measured(new, there, 0.02)  # type: ignore[arg-type]
+    kept.measured(new, there, 0.02)
     kept.refer(new)
     at = kept.current
     assert at is not None and (at.since, at.since_ns, at.frames, at.jaw_opening_m) == (Since.REFERENCE, 77, 20, 0.02)

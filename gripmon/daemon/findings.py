@@ -166,6 +166,7 @@ def _of_wrist(forecast: Forecast) -> list[Finding | None]:
         _mount(forecast.reference),
         _view(forecast.in_view, forecast.gripper, forecast.accuracy.corners),
         _promise(forecast),
+        None if forecast.doubt is None else Finding("WARN", "reference", forecast.doubt),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
     ]

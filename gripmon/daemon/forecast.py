@@ -116,6 +116,7 @@ def forecast(config: Config) -> Forecast:
         needed=None if found is None or found.reachable else found.needed,
         promise="nothing: too little is in view" if found is None else found.text(),
         in_view=_in_view(config),
+        doubt=reference_doubt(settings),
     )
 
 
@@ -158,13 +159,10 @@ def promise_of(config: Config) -> Promise | None:
 
 
 def limits_warning(config: Config) -> str | None:
-    """A warning if no transform of the configured view can be valid, or if what the bound rests on isn't known; None
-    otherwise.
-    """
+    """A warning if no transform of the configured view can be valid; None otherwise."""
     found = promise_of(config)
     if found is None or found.reachable:
-        doubt = reference_doubt(config.settings)
-        return None if doubt is None else f"{config.path}: {doubt}"
+        return None
     return f"{config.path}: no transform of this view can be valid: valid needs {found.needed} (monitor.policy)"
 
 

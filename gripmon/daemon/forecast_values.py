@@ -254,7 +254,8 @@ class Forecast(msgspec.Struct, frozen=True):
     ``protection``: the protection level of one frame, which ``valid_by`` names: that of the motion ``since_reference``,
     before the reference's frames are averaged, or the ``absolute`` one; ``protection_if_bevelled``: the same if the
     gripper has bevels that are neither stated nor taught, null if that is excluded; ``needed``: the alert limits that
-    this view could meet, or teaching, if no transform of it can be valid.
+    this view could meet, or teaching, if no transform of it can be valid; ``doubt``: why what is valid by its absolute
+    error may be farther off, null if nothing says so.
     """
 
     config: str
@@ -279,3 +280,4 @@ class Forecast(msgspec.Struct, frozen=True):
     needed: str | None
     promise: str
     in_view: InView
+    doubt: str | None

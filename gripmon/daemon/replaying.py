@@ -19,6 +19,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import NEGLIGIBLE_PX, compare_cameras
 from gripmon.daemon.api import Monitor, open_source
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_pulses, load_second
+from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.recorded_run import RecordedRun, one_recording
 from gripmon.daemon.watch import is_refused
@@ -298,6 +299,8 @@ def open_replay(
             warn(note)
         if (text := limits_warning(config)) is not None:
             warn(text)
+        if given is not None and (text := reference_doubt(given.settings)) is not None:
+            warn(f"{given.path}: {text}")
         warm_up()
         yield FrameReplay(source, config, run, warn)
 

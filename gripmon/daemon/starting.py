@@ -16,6 +16,7 @@ import cv2
 
 from gripmon.daemon.api import Monitor, look_ahead, open_configured, unlike_light
 from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_second
+from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
@@ -108,6 +109,8 @@ def run_monitor(
     cv2.setNumThreads(1)
     if keep_state and (text := limits_warning(config)) is not None:
         _log.warning("%s", text)
+    if keep_state and (text := reference_doubt(settings)) is not None:
+        _log.warning("%s: %s", config.path, text)
     live = None if view is None else LiveView(settings.view, view, config.path)
     with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None

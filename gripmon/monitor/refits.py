@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
-from gripmon.model.geometry import log_rotation
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.since import AtReference, Bounds, Opened
+from gripmon.monitor.since import AtReference, Bounds, CommonError, Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.track.integrity import (
     Doubts,
@@ -67,6 +66,12 @@ def _vague(count: int, m: int) -> Array:
     return np.tile(np.diag(information), (count, 1, 1))
 
 
+@cache
+def _in_the_references_frames(names: tuple[str, ...]) -> tuple[str, ...]:
+    """What lasting hypotheses but the first are called where they hold in those frames alone."""
+    return tuple(f"{name}, in the frames of the reference" for name in names[1:])
+
+
 class Anchored(NamedTuple):
     """Fits with the anchor's pose as one more measurement, and the ``square`` (h,) of its normalised innovation against
     each fit without it.
@@ -84,39 +89,6 @@ class Known(NamedTuple):
     anchor_T: Array
     covariance: Array
     of_model: Array
-
-
-class CommonError(NamedTuple):
-    """What no frame tells, since all are off by it alike: ``scale_sigma``, the standard deviation of a factor on all
-    lengths of the gripper file (a larger gripper farther away gives the same image); ``taught`` (k, 6), the error of
-    the reference at which edges were taught, by one standard deviation along each of k directions; ``offset`` (6,), how
-    far off that reference the teaching images showed the gripper.
-    """
-
-    scale_sigma: float
-    taught: Array
-    offset: Array
-
-    def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
-        """The fits near a pose (4, 4) with it."""
-        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
-        parts = np.vstack([self.taught, farther])
-        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
-        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
-
-    def reaching(self, doubts: Doubts) -> Doubts:
-        """The doubts, each farther away by the offset: it is measured, so it counts once, not as a deviation."""
-        lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
-        return replace(doubts, away=doubts.away + lengths[:, None])
-
-    def of_motion(self, motion: Array, at_T: Array) -> Array:
-        """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T
-        (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
-        """
-        rows = np.vstack([self.taught, self.offset])
-        share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
-        moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
-        return np.diag(share * np.repeat([moved, turned], 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +255,7 @@ class Refits:
         fits = self._free if anchored is None else anchored.fits
         now = Separation(fits.shift[:1], fits.covariance[:1] + self._floor, fits.of_model[:1])
         wrong = first.staying(first.wrong_at_first(now, cam_T_grip, reference_T), cam_T_grip, reference_T, staying)
-        name = tuple(f"{each}, in the frames of the reference" for each in lasting.name[1:])
+        name = _in_the_references_frames(lasting.name)
         return replace(doubts, since=doubts.since + Doubts.of(name, prior[1:], wrong, SIGMA_INFLATION))
 
     def knocked(

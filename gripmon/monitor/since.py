@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, invert, skew
+from gripmon.model.geometry import from_record, invert, log_rotation, skew
 from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
     Absolute,
@@ -35,10 +36,7 @@ from gripmon.model.records import (
     ValidBy,
 )
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Separation, follow
-
-if TYPE_CHECKING:
-    from gripmon.monitor.refits import Anchor, CommonError
+from gripmon.track.integrity import Doubts, Separation, follow
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -94,6 +92,52 @@ class Opened(NamedTuple):
             return cls(0.0, np.zeros(6))
         known = max(measurement.jaw_known_sigma_m**2, covariance[6, 6])  # exact: as certain as the fit
         return cls(measurement.jaw_opening_m, covariance[:6, 6] / known if known > 0.0 else np.zeros(6))
+
+
+class CommonError(NamedTuple):
+    """What no frame tells, since all are off by it alike: ``scale_sigma``, the standard deviation of a factor on all
+    lengths of the gripper file (a larger gripper farther away gives the same image); ``taught`` (k, 6), the error of
+    the reference at which edges were taught, by one standard deviation along each of k directions; ``offset`` (6,), how
+    far off that reference the teaching images showed the gripper.
+    """
+
+    scale_sigma: float
+    taught: Array
+    offset: Array
+
+    def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
+        """The fits near a pose (4, 4) with it."""
+        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
+        parts = np.vstack([self.taught, farther])
+        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
+        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
+
+    def reaching(self, doubts: Doubts) -> Doubts:
+        """The doubts, each farther away by the offset: it is measured, so it counts once, not as a deviation."""
+        lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
+        return replace(doubts, away=doubts.away + lengths[:, None])
+
+    def of_motion(self, motion: Array, at_T: Array) -> Array:
+        """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T
+        (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
+        """
+        rows = np.vstack([self.taught, self.offset])
+        share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
+        moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
+        return np.diag(share * np.repeat([moved, turned], 3))
+
+
+class Average(Protocol):
+    """An average of proven poses: the anchor."""
+
+    cam_T_grip: Array
+    frames: int
+
+    def fits(self) -> Separation:
+        """The averages under the lasting hypotheses, as shifts from ``cam_T_grip``."""
+
+    def bound(self, risk: float) -> Protection:
+        """The protection level of the average itself."""
 
 
 class AtReference(NamedTuple):
@@ -187,7 +231,7 @@ class AtReferences:
         self._valid_by = valid_by
         self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
         self._known: dict[str, AtReference] = {}
-        self._growing: Anchor | None = None  # the average that b follows until there are enough frames
+        self._growing: Average | None = None  # the average that b follows until there are enough frames
         self._risk = risk
         self.changes = 0
         """Grows with each change that a restart should know."""
@@ -233,12 +277,12 @@ class AtReferences:
         self.reference_T = from_record(reference.cam_T_grip)
         self._growing = None
 
-    def measured(self, reference: ReferenceRecord, anchor: Anchor, jaw_opening_m: float) -> None:
+    def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""
         at = anchor.cam_T_grip, anchor.fits(), jaw_opening_m, anchor.frames, Since.REFERENCE, reference.stamp_ns
         self._keep(reference.reference_id, AtReference(*at))
 
-    def add(self, anchor: Anchor, jaw_opening_m: float, stamp_ns: int) -> None:
+    def add(self, anchor: Average, jaw_opening_m: float, stamp_ns: int) -> None:
         """A frame has proved a pose, which ``anchor`` includes."""
         growing = self._growing
         if growing is None and self.current is not None:
@@ -259,7 +303,7 @@ class AtReferences:
         self._known.pop(self._id, None)
         self._growing = None
 
-    def _was_wrong(self, first: Anchor, anchor: Anchor) -> bool:
+    def _was_wrong(self, first: Average, anchor: Average) -> bool:
         """Whether the first frames were wrong, rather than the mount knocked just after them, when another place is
         proved: the other place is one that they allow by their own bound.
         """

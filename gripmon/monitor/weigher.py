@@ -22,7 +22,6 @@ from gripmon.monitor.refits import (
     UNBOUNDED_RAD,
     Anchor,
     Anchored,
-    CommonError,
     Known,
     Lasting,
     ModelError,
@@ -33,7 +32,7 @@ from gripmon.monitor.refits import (
     reaching,
 )
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import AtReferences, Bounds
+from gripmon.monitor.since import AtReferences, Bounds, CommonError
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import (
