@@ -184,8 +184,8 @@ class Integrity:
         if due or self._past_limit(trust.bounds) or trust.displaced or not self._weigher.proved:
             ends, strictly = self._tracker.ends(frame, measurement), 0
             if self._weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
-                strict = self._tracker.ends(frame, measurement, strict=True)
-                strictly = int(np.count_nonzero((strict.seen > 0) & (strict.seen >= ends.seen)))
+                nothing_beyond = self._tracker.ends(frame, measurement, strict=True).seen
+                strictly = int(np.count_nonzero((nothing_beyond > 0) & (nothing_beyond >= ends.seen)))
             trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)
             self._ends_seen = trust.proven
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
@@ -195,11 +195,11 @@ class Integrity:
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
             fingers = int(np.count_nonzero(ends.seen))
-            strictly = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
-            proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
+            strict = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
+            proven = strict.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
-            here = here._replace(trust=replace(strictly, proven=proven))
+            here = here._replace(trust=replace(strict, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:

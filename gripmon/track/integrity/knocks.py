@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 
@@ -23,10 +24,13 @@ TURN_SIGMA_RAD = 0.02
 
 ALONG_SHARE = (0.35, 0.45, 0.20)
 ALONG_SIGMA_M = (1.7e-3, 3.8e-3, 8.5e-3)
-"""Of knocks along the fingers: likewise, m; across them and in their turn a hundredth of that."""
+"""Of knocks along the fingers: likewise, m; nothing across them, and no turn."""
 
 ALONG_OF_ALL = 1.0 / 3.0
 """Share of the knocks along the fingers."""
+
+
+_ANYWHERE = np.stack([np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M])
 
 
 class Knocks(NamedTuple):
@@ -36,24 +40,20 @@ class Knocks(NamedTuple):
 
     share: Array
     covariance: Array
-    along: Array
+    along: NDArray[np.bool_]
 
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
-        """With fingers in the direction ``axis_cam`` (3,), camera frame; none: all knocks go anywhere."""
+        """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
         length = float(np.linalg.norm(axis_cam))
-        anywhere = [np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M]
         if length == 0.0:
-            return cls(np.array(ANY_SHARE), np.stack(anywhere), np.zeros(len(ANY_SHARE), dtype=bool))
-        way = axis_cam / length
-        along = []
-        for sigma_m in ALONG_SIGMA_M:
-            covariance = np.zeros((6, 6))
-            covariance[:3, :3] = sigma_m**2 * np.outer(way, way)
-            along.append(covariance)
+            return cls(np.array(ANY_SHARE), _ANYWHERE, np.zeros(len(ANY_SHARE), dtype=np.bool_))
+        count = len(ANY_SHARE) + len(ALONG_SHARE)
+        covariance, way = np.zeros((count, 6, 6)), axis_cam / length
+        covariance[: len(ANY_SHARE)] = _ANYWHERE
+        covariance[len(ANY_SHARE) :, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * np.outer(way, way)
         share = [(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]
-        is_along = np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE)
-        return cls(np.concatenate(share), np.stack(anywhere + along), is_along)
+        return cls(np.concatenate(share), covariance, np.arange(count) >= len(ANY_SHARE))
 
     @property
     def spread(self) -> Array:
