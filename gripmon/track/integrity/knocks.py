@@ -1,7 +1,7 @@
 """How far a knock moves a camera's mount: a mixture of normal distributions, in place of "anywhere".
 
-Brackets slip by millimetres.  The sizes approximate a log-normal length of 3 mm in the median, 1 to 10 mm for nineteen
-of twenty knocks (assumed before anything was measured here; mounts that were hit in this project's own recordings moved
+Brackets slip by millimetres.  The sizes approximate a log-normal length of 3 mm in the median, for four of five knocks
+from 1 to 10 mm (assumed before anything was measured here; mounts that were hit in this project's own recordings moved
 by 0.9 to 4.5 mm).  One knock in three goes along the fingers and doesn't turn the camera: what the fingers' sides can't
 show has its own share, so that it isn't taken for improbable because it is special.
 """
