@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 
@@ -36,7 +37,7 @@ class Knocks(NamedTuple):
 
     share: Array
     covariance: Array
-    along: Array
+    along: NDArray[np.bool_]
 
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
