@@ -246,8 +246,8 @@ class Refits:
         staying: Array,
     ) -> TwoDoubts:
         """The doubts with those about the motion since the reference that a lasting hypothesis held in the reference's
-        frames, each of the ``prior`` (g,), and no longer does.  ``anchored``: None where the pose (4, 4) rests on the frame alone;
-        ``staying`` as for :meth:`ModelError.since`.
+        frames, each of the ``prior`` (g,), and no longer does.  ``anchored``: None where the pose (4, 4) rests on the
+        frame alone; ``staying`` as for :meth:`ModelError.since`.
         """
         first, reference_T = self.model.first
         if first is None:
@@ -344,8 +344,8 @@ def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[
 
 class Anchor:
     """The average of the proven poses, from the first one on; before one is ``proven``, of what edges show without the
-    fingers' ends.  ``origin``: what was known of the pose before, (4, 4) and its covariance (6, 6): it stays the prior of
-    what the frames don't show.
+    fingers' ends.  ``origin``: what was known of the pose before, (4, 4) and its covariance (6, 6): it stays the prior
+    of what the frames don't show.
     """
 
     def __init__(

@@ -195,11 +195,11 @@ class Integrity:
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
             fingers = int(np.count_nonzero(ends.seen))
-            strict = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
-            proven = strict.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
+            again = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
+            proven = again.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
-            here = here._replace(trust=replace(strict, proven=proven))
+            here = here._replace(trust=replace(again, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:

@@ -355,10 +355,10 @@ class Weigher:
             self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
             self.question = Question(self.unexplained, self._revision)
         if self.anchor is None or trust.displaced or proven > self.anchor.proven:
-            origin_T, covariance = self.expected if self.proved else self._expected
+            origin_T, known = self.expected if self.proved else self._expected
             if trust.displaced:
-                covariance = covariance + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
-            at = cam_T_grip, trust.fits, rows, now_s, (origin_T, covariance)
+                known = known + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
+            at = cam_T_grip, trust.fits, rows, now_s, (origin_T, known)
             self.anchor = Anchor(self._lasting, *at, trust.misread, proven, trust.displaced)
         else:
             self._in_place = proven

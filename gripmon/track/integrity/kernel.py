@@ -249,9 +249,10 @@ def jumped(
     """Probabilities (h, c) of the jumps that may have carried a pose away from where it is known to have been, given
     a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6) and errors by the model, ``off`` (h, f, 6).
 
-    ``at`` (6,) with its covariance ``known`` C (6, 6) and ``known_off`` (f or 1, 6): the pose before; ``jumps`` J (c, 6, 6), of the probability
-    ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a jump's probability is its
-    prior times the normal density of the fit with ``times`` R + C + J (and :func:`between`), over the sum of these and of having stayed.
+    ``at`` (6,) with its covariance ``known`` C (6, 6) and ``known_off`` (f or 1, 6): the pose before; ``jumps`` J
+    (c, 6, 6), of the probability ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a
+    jump's probability is its prior times the normal density of the fit with ``times`` R + C + J (and :func:`between`),
+    over the sum of these and of having stayed.
     """
     count, kinds = prior.shape
     root, white, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6))

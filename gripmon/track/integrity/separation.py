@@ -157,8 +157,9 @@ def jumped(
     times: float,
 ) -> Array:
     """Probabilities (h, c) that under each hypothesis the pose, known to have been ``at`` (6,) but for a covariance
-    ``known`` (6, 6) and ``of_model`` (f or 1, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior`` (h, c), given the frame's fits;
-    ``stays`` (h,): whether it may as well have stayed.  ``times``: factor on the fits' covariances for their tails.
+    ``known`` (6, 6) and ``of_model`` (f or 1, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior``
+    (h, c), given the frame's fits; ``stays`` (h,): whether it may as well have stayed.  ``times``: factor on the fits'
+    covariances for their tails.
     """
     return kernel.jumped(*frame, at, known, of_model, jumps, prior, stays, times)
 
