@@ -112,7 +112,9 @@ def errors_of(gripper, cam_T_grip, covariance, frames, truths) -> tuple[float, i
 
 
 def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> None:
-    """On backgrounds that it wasn't made from, while the camera moves by 1.3 mm."""
+    """On backgrounds that it wasn't made from, while the camera moves by 1.3 mm: faster than mounts creep, so that two
+    frames of sixty, besides the first, wait for a proof of the new place.
+    """
     _, found = box
     creep = Creep(start_s=0.5, time_s=0.8, tcp_shift_m=(0.0012, 0.0005))
     scenario = Scenario(name="x", duration_s=4.0, fps=15.0, mount=(creep,), background=Background(kind="printed"))
@@ -122,7 +124,7 @@ def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> No
     standing = [Frame(f.seq, f.stamp_ns, f.image, None, f.name) for f in shown]
     exact = errors_of(truth, truths[0].cam_T_grip, np.diag([1e-8] * 3 + [1e-6] * 3), shown, truths)
     made = errors_of(found.gripper, found.cam_T_grip, found.covariance, standing, truths)
-    assert made[0] >= 0.98
+    assert made[0] >= 0.95
     assert made[1] == 0
     across, along = (np.sqrt(np.square(e[2][:, :2]).sum(axis=1).mean()) for e in (exact, made))
     assert along <= max(2.0 * across, 3e-5)

@@ -183,7 +183,7 @@ class Integrity:
         self._frames += 1
         if due or self._past_limit(trust.bounds) or trust.displaced or not self._weigher.proved:
             ends, strictly = self._tracker.ends(frame, measurement), 0
-            if self._weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
+            if trust.displaced or self._weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
                 nothing_beyond = self._tracker.ends(frame, measurement, strict=True).seen
                 strictly = int(np.count_nonzero((nothing_beyond > 0) & (nothing_beyond >= ends.seen)))
             trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)

@@ -358,8 +358,12 @@ class Weigher:
             origin_T, known = self.expected if self.proved else self._expected
             if trust.displaced:
                 known = known + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
+            misread = trust.misread
+            beside_px = measurement.prediction.moved_px(perturbation_between(origin_T, cam_T_grip))
+            if self.proved and beside_px < ONE_EDGE_PX:
+                misread = min(misread, self.misread_ever)  # so near to it nothing else is taken for the ends
             at = cam_T_grip, trust.fits, rows, now_s, (origin_T, known)
-            self.anchor = Anchor(self._lasting, *at, trust.misread, proven, trust.displaced)
+            self.anchor = Anchor(self._lasting, *at, misread, proven, trust.displaced)
         else:
             self._in_place = proven
             self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s, trust.misread)
