@@ -322,7 +322,7 @@ class Weigher:
             probable[hypotheses.ends] = 0.0  # the same as that nothing is wrong
         doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, least)
         besides = unseen * prior[hypotheses.ends]
-        without = None
+        without = None if across.any() else fits
         if across.any() and (displaced or not self.proved or besides * WRONG_EDGE > least):
             endless_too, more = hypotheses.without_ends()
             without = Refits(measurement, endless_too, self._tracker.floor, fits.model, fits.known)
