@@ -143,7 +143,7 @@ class Weigher:
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
         self._newest: tuple[Measurement, float, Refits] | None = None
-        self._swing = np.zeros(6)
+        self._swing: Array = np.zeros(6)
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
