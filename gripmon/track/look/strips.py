@@ -207,7 +207,7 @@ class FingerStrips:
         return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
-        """Correlation of strips, as read at a pose, with what was learnt.  Gain and brightness are free: light changes."""
+        """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
         there = np.clip(strips, -self._most, self._most) * layout.within
         return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
 
@@ -334,8 +334,8 @@ def _independent(within: NDArray[np.float32]) -> float:
 
 
 def _farther_on(alike: Array) -> Array:
-    """Correlations at each slide, zero from the place itself to where they are first no longer alike: what is left is of
-    something else that looks alike.
+    """Correlations at each slide, zero from the place itself to where they are first no longer alike: what is left is
+    of something else that looks alike.
     """
     low = np.flatnonzero(alike < LIKE_CORRELATION)
     before, after = low[low < REACH_PX], low[low > REACH_PX]
