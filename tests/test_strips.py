@@ -17,7 +17,7 @@ from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
 from gripmon.track.edges.roles import along_fingers
 from gripmon.track.look import FingerStrips, StripsRefused, StripsSeen
-from gripmon.track.look.strips import FIRST_FRAMES, RELEARN_S
+from gripmon.track.look.strips import FIRST_FRAMES, MOST_FRAMES, RELEARN_S
 
 RISK = 1e-3
 SLIDES_M = (1.5e-3, -1.5e-3, 3.3e-3, -3.3e-3, 6e-3, -6e-3)
@@ -25,6 +25,9 @@ LINED = FingerLook(
     level_dn=83.0, texture=0.1, marks=(FingerMark(from_tip_m=(3.5e-3, 3.8e-3), across=(-2.0, 2.0), gain=2.5),)
 )
 """A thin bright line round each finger."""
+
+OTHER_MARK = FingerMark(from_tip_m=(5.2e-3, 5.6e-3), across=(-2.0, 2.0), gain=2.5)
+"""The same elsewhere."""
 
 PLAIN = FingerLook(texture=0.0, carriers=False)
 DARK = Background(kind="stripes", level_dn=51.0, contrast=0.4)
@@ -226,3 +229,30 @@ def test_out_of_view_there_is_nothing_to_learn():
         strips.learn(image, away_T, None, float(i))
     assert not strips.ready and not strips.awaited and strips.state() is None
     assert strips.compare(image, away_T, None, RISK) == StripsSeen()
+
+
+def covered_frame(strips: FingerStrips, now_s: float) -> None:
+    """Learn from an image in which something hides the fingers, as if the pose were proven."""
+    covered = filmed(LINED, covers=(Cover(start_s=2.0, end_s=5.0, move_s=0.5),))
+    truth = covered.truth(LAST)
+    strips.learn(covered.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, now_s)
+
+
+def test_of_what_hides_them_for_a_while_nothing_is_learnt():
+    simulation = filmed(LINED)
+    strips, image = taught(simulation), simulation.render(LAST)
+    for k in range(MOST_FRAMES - 1):
+        covered_frame(strips, 10.0 + 2.0 * RELEARN_S * k)
+    assert told_m(simulation, strips, image, 0.0) is None
+    assert told_m(simulation, strips, image, 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
+
+
+def test_fingers_that_look_otherwise_for_good_are_learnt_anew():
+    """Taped or painted: at the same place, now without the line that they were learnt with."""
+    taped = filmed(msgspec.structs.replace(LINED, marks=(OTHER_MARK,)))
+    strips, truth = taught(filmed(LINED)), taped.truth(LAST)
+    for k in range(MOST_FRAMES):
+        seen = strips.compare(taped.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, RISK)
+        assert not seen.here
+        strips.learn(taped.render(k % LAST), taped.truth(k % LAST).cam_T_grip, truth.jaw_opening_m, 10.0 + 2.0 * k)
+    assert strips.compare(taped.render(LAST), truth.cam_T_grip, truth.jaw_opening_m, RISK).here

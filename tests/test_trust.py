@@ -147,7 +147,7 @@ def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_follo
     assert_nothing_misleads(seen)
     assert not valid(seen)[25:37].any()
     shift_m = [np.linalg.norm(r.drift.tcp_shift_m) for r in seen.records[25:37] if r.drift is not None]
-    assert max(shift_m) < 2e-4 and bounds_m(seen)[25:37].min() > 3e-3
+    assert max(shift_m) < 2e-4 and bounds_m(seen)[25:37].min() > max(abs(size_m), PolicySettings().alert_limit_m)
 
 
 @pytest.mark.parametrize("size_m", [-3e-3, 1e-3, 3e-3])
@@ -320,10 +320,10 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
         for later_s in (0.0, 1.0):
             trust = weigher.weigh(measurement, monitor._cam_T_grip, half, weigher.anchor.now_s + later_s)
             assert not (trust.proven or trust.displaced)
-            bound_m[rate, later_s] = trust.protection.position_m
+            bound_m[rate, later_s] = trust.bounds.absolute.position_m
     limit_m = PolicySettings().alert_limit_m
     assert bound_m[1.0, 0.0] < limit_m and bound_m[1.0, 1.0] < limit_m and bound_m[1e5, 0.0] < limit_m
-    assert bound_m[1e5, 1.0] > 0.1
+    assert bound_m[1e5, 1.0] > 10.0 * limit_m, "as far as a knock goes"
 
 
 def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
@@ -342,7 +342,7 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
         assert weigher._misread(seen, ends, None) == pytest.approx(MISREAD_PROBABILITY**times)
         trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
         assert not (trust.proven or trust.displaced)
-        assert (trust.protection.position_m < limit_m) == (times > 1)
+        assert (trust.bounds.absolute.position_m < limit_m) == (times > 1)
 
 
 def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pytest.MonkeyPatch):
@@ -478,7 +478,7 @@ def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():
         for slid in (False, True)
     )
     assert proven.proven and not slid.proven
-    assert slid.protection.position_m > 2.0 * proven.protection.position_m
+    assert slid.bounds.absolute.position_m > 2.0 * proven.bounds.absolute.position_m
 
 
 @pytest.mark.parametrize("seen_along", [False, True])
@@ -503,13 +503,12 @@ def test_a_pose_that_stays_slid_after_it_was_measured_again_is_not_followed(monk
     assert not knock_followed(monkeypatch, _along=lambda *_, **__: slid)
 
 
-def test_a_slide_is_doubted_until_the_fingers_are_seen_where_they_are_expected(monkeypatch: pytest.MonkeyPatch):
+def test_a_slide_is_doubted_in_the_frame_that_shows_it_and_later_ones_are_judged_by_themselves(
+    monkeypatch: pytest.MonkeyPatch,
+):
     """Something in front of them looked like them, a millimetre farther along, in one frame."""
     frames, _ = frames_of(scene(BEGINS + 4))
-    for after, verdict in (
-        (StripsSeen(here=True), Verdict.VALID),
-        (StripsSeen(), Verdict.SUSPECT),
-    ):
+    for after in (StripsSeen(here=True), StripsSeen()):
         monitor = new_monitor()
         for frame in frames[:BEGINS]:
             assert monitor.process(frame) is not None
@@ -517,7 +516,7 @@ def test_a_slide_is_doubted_until_the_fingers_are_seen_where_they_are_expected(m
             patch.setattr(Integrity, "_along", lambda *_, **__: StripsSeen(np.array([0.0, 0.0, 1e-3])))
             assert monitor.process(frames[BEGINS]).verdict is Verdict.SUSPECT
             patch.setattr(Integrity, "_along", lambda *_, after=after, **__: after)
-            assert {monitor.process(frame).verdict for frame in frames[BEGINS + 1 :]} == {verdict}
+            assert {monitor.process(frame).verdict for frame in frames[BEGINS + 1 :]} == {Verdict.VALID}
 
 
 def test_a_knock_has_to_prove_itself_strictly(monkeypatch: pytest.MonkeyPatch):
@@ -605,8 +604,9 @@ def test_white_and_black_that_is_cut_off_beside_the_fingers_is_named(gain: float
 
     seen = watch(tuple(replace(f, image=lit(f.image)) for f in frames), truths, new_monitor())
     assert_nothing_misleads(seen)
-    assert ["is cut off" in (record.reason or "") for record in seen.records[1:]] == [not whole] * 7
+    # A frame that is valid nevertheless is as exact as it says: its bound has what the cut-off may shift.
     assert valid(seen)[1:].all() == whole
+    assert ["is cut off" in (record.reason or "") for record in seen.records[1:]] == (~valid(seen)[1:]).tolist()
 
 
 @pytest.mark.parametrize("gains", [(0.5, 5.0, 0.5), (0.8, 2.5, 2.5), (1.0, 1.0, 1.0)])

@@ -325,7 +325,7 @@ class Integrity:
         measurement, _, _, along, trust = candidate
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
-        slid = along.undecided
+        slid = along.slide_m is not None or along.undecided
         seen = not slid and self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen, slid)
         at = measurement, cam_T_grip, covariance, trust.bounds

@@ -489,7 +489,7 @@ def follow(
 ) -> tuple[Array, Array, Array, Array]:
     """One more measurement for each of g Kalman filters: their means (g, 6), covariances (g, 6, 6) and errors by the
     model (g, f, 6) after it, and the traces of their gains (g,).  With P = covariance + creep and K = P (P + R)^-1
-    these are mean + K (shift - mean), (1 - K) P and off + K (of_model - off); R is ``of_frame``, ``creep`` (6,)
+    these are mean + K (shift - mean), K R and off + K (of_model - off); R is ``of_frame``, ``creep`` (6,)
     variances.
     """
     count = len(mean)
@@ -514,9 +514,10 @@ def follow(
             taken[g] += gain[i, i]
         for i in range(6):
             for j in range(6):
-                total = before[i, j]
+                # K R is (1 - K) P, which cancels where what was known before leaves a direction open.
+                total = 0.0
                 for k in range(6):
-                    total -= gain[i, k] * before[k, j]
+                    total += gain[i, k] * of_frame[g, k, j]
                 between[i, j] = total
         for i in range(6):
             for j in range(6):

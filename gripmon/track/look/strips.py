@@ -70,6 +70,11 @@ noise alone.
 RELEARN_S = 1.0
 """Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
 
+LIKE_CORRELATION = 0.5
+"""Correlation below which strips aren't those that were learnt: a quarter of the variance, when noise leaves seven
+tenths of it.  Something is in front of them then, unless it stays for :data:`MOST_FRAMES`.
+"""
+
 
 class _Layout(NamedTuple):
     """Where n strips lie, gripper frame: their points nearest to the finger's end (n, 3), the steps (n, 3) from each
@@ -108,6 +113,7 @@ class FingerStrips:
         self._camera, self._gripper, self._along = camera, gripper, along
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.frames = 0
+        self._unlike = 0  # frames that could have been learnt and didn't look like those that were, in succession
         self._learnt_s = -math.inf
         self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
         self._layout: _Layout | None = None
@@ -129,8 +135,14 @@ class FingerStrips:
         if self._layout is None:
             return
         strips, within = self._read(self._layout, image, cam_T_grip, jaw_opening_m), self._layout.within
-        self.frames += 1
         self._learnt_s = now_s
+        if self.frames >= FIRST_FRAMES and self._alike_here(self._layout, strips) < LIKE_CORRELATION:
+            self._unlike += 1
+            if self._unlike < MOST_FRAMES:
+                return
+            self.frames = 0  # not something in front: the fingers look otherwise now
+        self._unlike = 0
+        self.frames += 1
         self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
         self._prepare(self._layout)
         usual = self._alike(self._layout, image, cam_T_grip, jaw_opening_m)
@@ -169,10 +181,7 @@ class FingerStrips:
         layout = self._layout
         if layout is None or not self.ready:
             return StripsSeen()
-        most, learnt, own = self._most, self._learnt, self._own
-        # Gain and brightness are free: light changes.
-        there = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m), -most, most) * layout.within
-        alike_here = float((there * learnt).sum()) / math.sqrt(float(np.square(there).sum()) * own + 1e-12)
+        alike_here = self._alike_here(layout, self._read(layout, image, cam_T_grip, jaw_opening_m))
         independent = _independent(layout.within)
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
@@ -196,6 +205,11 @@ class FingerStrips:
         # Odds of ten to one for this slide: what hides a part of them leaves less.
         undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= best
         return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
+
+    def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
+        """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
+        there = np.clip(strips, -self._most, self._most) * layout.within
+        return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
 
     def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
         """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
@@ -320,10 +334,10 @@ def _independent(within: NDArray[np.float32]) -> float:
 
 
 def _farther_on(alike: Array) -> Array:
-    """Correlations at each slide, zero from the place itself to where they first fall below a half: what is left is of
-    something else that looks alike.
+    """Correlations at each slide, zero from the place itself to where they are first no longer alike: what is left is
+    of something else that looks alike.
     """
-    low = np.flatnonzero(alike < 0.5)
+    low = np.flatnonzero(alike < LIKE_CORRELATION)
     before, after = low[low < REACH_PX], low[low > REACH_PX]
     out = np.maximum(alike, 0.0)
     out[before[-1] if len(before) else 0 : after[0] if len(after) else len(out)] = 0.0
