@@ -22,6 +22,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import AlertKind, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.refits import SIGMA_INFLATION
+from gripmon.monitor.since import AtReferences
 from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, BentFinger, Bump, FingerLook, Sensor
@@ -100,7 +101,7 @@ def test_tapered_fingers_need_ends_where_one_more_wrong_edge_leaves_too_little()
     assert exceeded_once_in_a_thousand * worst_m > limit_m > 4.42 * SIGMA_INFLATION * sigma_m_of(measurement, sides)
     trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, weigher.anchor.now_s)
     assert trust.displaced and not trust.proven
-    assert trust.protection.position_m > MISREAD_PROBABILITY * exceeded_once_in_a_thousand * worst_m
+    assert trust.bounds.absolute.position_m > MISREAD_PROBABILITY * exceeded_once_in_a_thousand * worst_m
 
 
 def test_a_pose_that_needs_no_ends_is_remembered_without_them():
@@ -108,11 +109,13 @@ def test_a_pose_that_needs_no_ends_is_remembered_without_them():
     monitor, measurement = knocked_tapered_fingers()
     wide = MonitorSettings(jaw_sigma_m=0.0, policy=PolicySettings(alert_limit_m=1.0, alert_limit_rad=3.0))
     tracker, gripper = monitor._tracker, monitor._gripper
-    weigher = Weigher(tracker, gripper, wide, reference_of(nominal_cam_T_grip()))
+    reference = reference_of(nominal_cam_T_grip())
+    since = AtReferences(reference, wide.policy.valid_by, wide.policy.integrity_risk, ())
+    weigher = Weigher(tracker, gripper, wide, reference, since)
     covariance = measurement.covariance[:6, :6]
     trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, 0.0)
     assert trust.displaced and trust.proven
-    weigher.settle(trust, measurement.cam_T_grip, covariance, 0.0)
+    weigher.settle(trust, measurement, measurement.cam_T_grip, covariance, 0.0)
     assert weigher.anchor is not None
     claimed_m = np.sqrt(np.linalg.eigvalsh(weigher.anchor.covariance[:3, :3])[-1])
     sides = tracker.along[measurement.normal.edge]
