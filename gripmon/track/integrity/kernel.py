@@ -456,7 +456,8 @@ def levels(
         equally = math.log10(max(left / count / prior[h], 1e-300))
         for part in range(2):
             s, f = sigma[part, h], factor[part, h]
-            least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
+            if alone < 0.0:  # what is less probable than the risk may lie beyond the level altogether
+                least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
             most[part] = max(most[part], away[part, h] + s * _radius(equally, f, squares, spacing))
     # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
     for part in range(2):

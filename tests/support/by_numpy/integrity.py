@@ -146,7 +146,9 @@ def levels(
     left = risk - float(prior[prior <= share].sum())
     prior, away, tails = prior[counted], away[:, counted], Tails(sigma[:, counted], factor[:, counted])
     # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
-    least = (away + tails.radius(np.broadcast_to(left / prior, away.shape))).max(axis=1)
+    # What is less probable than the risk may lie beyond the level altogether.
+    alone = np.where(prior > left, away + tails.radius(np.broadcast_to(left / prior, away.shape)), 0.0)
+    least = alone.max(axis=1)
     most = (away + tails.radius(np.broadcast_to(left / len(prior) / prior, away.shape))).max(axis=1)
     least = np.maximum(least, 1e-3 * most)
     while (most > near * least).any():
