@@ -35,6 +35,7 @@ from gripmon.model.records import (
     Frame,
     MonitorState,
     json_schema,
+    schema_name,
     to_json,
     unmeasured_record,
 )
@@ -207,7 +208,7 @@ def test_every_field_says_what_it_is():
 
 def test_the_list_names_every_message(capsys: pytest.CaptureFixture[str]):
     lines = printed(capsys, "--list").splitlines()
-    assert [line.split()[:2] for line in lines] == [[name, f"gripmon.{name}/1"] for name in MESSAGES]
+    assert [line.split()[:2] for line in lines] == [[name, schema_name(MESSAGES[name])] for name in MESSAGES]
     assert all(len(line.split()) > 5 and "`" not in line for line in lines)
     assert tuple(MESSAGES) == _NAMES
 

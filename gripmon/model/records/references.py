@@ -61,12 +61,14 @@ class StripsRecord(msgspec.Struct, frozen=True):
 class AtReferenceRecord(msgspec.Struct, frozen=True):
     """What was measured at a reference; bytes are little-endian float64, base64 in JSON."""
 
-    reference_id: str
+    reference_id: Annotated[str, Meta(description="the reference")]
     measured_as: Annotated[str, Meta(description="digest of the taught edges and settings that it was measured with")]
     cam_T_grip: Annotated[Transform, Meta(description="the average over its frames")]
     shift: Annotated[bytes, Meta(description="(g, 6): the same under each lasting hypothesis, from there, m and rad")]
     covariance: Annotated[bytes, Meta(description="(g, 6, 6) of these, m², m rad, rad²")]
-    of_model: Annotated[bytes, Meta(description="(g, f, 6): how far they are off where a finger is longer")]
+    of_model: Annotated[
+        bytes, Meta(description="(g, f, 6): how far off where a finger is longer, or an edge lies beside its place")
+    ]
     jaw_opening_m: Annotated[float, Meta(description="opening in its frames; 0 without a jaw")]
     frames: Annotated[int, Meta(description="how many of them were averaged")]
     since: Since
