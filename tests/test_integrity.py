@@ -97,7 +97,7 @@ def separate(
     known_pull: np.ndarray,
 ) -> Separation:
     """The fits under all hypotheses, with a gripper model that is exact."""
-    model = np.zeros(pull.shape), np.zeros(len(pull), dtype=np.intp), 1
+    model = np.zeros((1, *pull.shape)), np.zeros((1, len(pull)), dtype=np.intp), 1
     return Sums.of_kept(pull, information, middle, model, keep, known, known_pull).fits(pull.shape[1])
 
 
