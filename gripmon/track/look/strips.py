@@ -45,8 +45,9 @@ INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
 FEWEST_POINTS = 40
-"""Independent points of the fingers in view below which strips say nothing: two faces of each of two fingers that show
-50 px.  Fewer look alike elsewhere by chance, and an exposure that changes moves them as much as a slide would.
+"""Independent points of the fingers in view below which strips don't say that the gripper has slid: two faces of each of
+two fingers that show 50 px.  Fewer look alike elsewhere by chance, and an exposure that changes moves them as much as a
+slide would: 25 px of two fingers said so in half of the stills of a gripper that didn't move.
 """
 
 ONE_EDGE_PX = 2
@@ -199,6 +200,8 @@ class FingerStrips:
         unexplained[beyond_chance * unexplained >= _unexplained(farther, most_alike)] = 1.0
         slide_px = int(np.argmin(unexplained)) - REACH_PX
         if here > beyond_chance * float(unexplained.min()):
+            if independent < FEWEST_POINTS:
+                return StripsSeen()
             return StripsSeen(slide_px * layout.step_m.mean(axis=0))
         if alone:
             return StripsSeen()
@@ -269,7 +272,7 @@ class FingerStrips:
         uv_px = self._camera.project((along_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]).reshape(-1, 3))
         last_px = np.array([self._camera.width_px - 1.0, self._camera.height_px - 1.0])
         within *= ((uv_px >= 0.0) & (uv_px <= last_px)).all(axis=1).reshape(within.shape)
-        if _independent(within) < FEWEST_POINTS:
+        if not within.any():
             return
         fingers_m = self._gripper.points_grip_m(jaw_opening_m)[self._first]
         self._layout = _Layout(start, pitch_m * way, within, finger, fingers_m)
