@@ -454,14 +454,16 @@ class Anchor:
 
 
 def _with_origin(fits: Separation, at_T: Array, origin: tuple[Array, Array], wander: Array) -> Separation:
-    """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before them."""
+    """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before, a motion of variances
+    ``wander`` (6,) ago.
+    """
     (origin_T, covariance), count = origin, len(fits.shift)
     before = Separation(
         np.tile(perturbation_between(at_T, origin_T), (count, 1)),
-        np.tile(covariance, (count, 1, 1)),
+        np.tile(covariance + np.diag(wander), (count, 1, 1)),
         np.zeros_like(fits.of_model),
     )
-    return follow(fits, before, wander)[0]
+    return follow(fits, before, np.zeros(6))[0]
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

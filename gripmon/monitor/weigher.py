@@ -235,6 +235,8 @@ class Weigher:
         misread = 1.0 if slid else self._misread(measurement, ends, kept)
         if proven:
             misread *= MISREAD_PROBABILITY**strictly
+        if seen_along and not slid:
+            misread *= LOOK_ODDS
         # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
