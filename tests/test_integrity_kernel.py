@@ -198,7 +198,7 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
 def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, seed: int):
     found, expected = records(kernel, monkeypatch, seed), records(by_numpy, monkeypatch, seed)
     assert {record.verdict for record in expected} >= {"valid", "suspect"}
-    for number, (one, other) in enumerate(zip(found, expected, strict=True)):
+    for one, other in zip(found, expected, strict=True):
         # A bound is found to 2 %, and which improbable knocks it leaves out hangs on rounding, and after a knock which
         # edge points are searched.
         near = 0.02

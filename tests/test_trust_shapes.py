@@ -271,8 +271,8 @@ def test_a_lone_finger_is_valid_where_it_was_or_is_seen_along_itself(
 
     [shape] = (replace(shape, tone=tone) for shape in shapes() if shape.name == "sharp box, one finger")
     seen = track(shape, *MOTIONS[motion], 60, 1, tmp_path)
-    # The first ten frames of the motion, 0.3 mm, are within what the reference allows.
-    assert seen.valid == pytest.approx(valid * seen.frames, abs=3 if valid else 10) and seen.beyond == 0
+    # The beginning of the motion, some 0.6 mm, is within what the reference allows.
+    assert seen.valid == pytest.approx(valid * seen.frames, abs=3 if valid else 18) and seen.beyond == 0
     assert seen.error_m < 2e-5, "it is measured all the same"
 
 

@@ -259,17 +259,26 @@ class Refits:
         return replace(doubts, since=doubts.since + Doubts.of(name, prior[1:], wrong, SIGMA_INFLATION))
 
     def knocked(
-        self, cam_T_grip: Array, prior: Array, knocks: Knocks, probable: Array, stays: NDArray[np.bool_], least: float
+        self,
+        cam_T_grip: Array,
+        prior: Array,
+        knocks: Knocks,
+        probable: Array,
+        stays: NDArray[np.bool_],
+        endless: NDArray[np.bool_],
+        least: float,
     ) -> tuple[TwoDoubts, float]:
         """What may be wrong with a published pose (4, 4) if the mount was knocked since the pose that is known.
 
         ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether the fit
-        under it is where the pose was.  Those less probable than ``least``, given the fits, are left out; also returns
-        their probability together.
+        under it is where the pose was; ``endless`` (h,): whether it leaves no end of a finger.  Those less probable
+        than ``least``, given the fits, are left out; also returns their probability together.
         """
         at, covariance, of_model = self._known
         share = probable[:, None] * knocks.share
         given = jumped(self._free, at, covariance, of_model, knocks.covariance, share, stays, SIGMA_INFLATION**2)
+        # Without an end nothing shows a knock along the fingers; that it is exactly along them isn't held against it.
+        given = np.where(endless[:, None] & knocks.along, np.maximum(given, share), given)
         weight = prior[:, None] * given
         counts = weight > least
         fit, jump = np.nonzero(counts)

@@ -44,6 +44,7 @@ from gripmon.track.edges import (
     own_steps,
     sides,
 )
+from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Hypotheses, Knocks, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
@@ -242,7 +243,7 @@ class Weigher:
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         unseen = 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
-        knocks = Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis)
+        knocks = Knocks.of(self._along_cam(fits, cam_T_grip))
         jumped = unseen * float(knocks.share[knocks.along].sum()) * prior[hypotheses.ends] > risk
         doubts, left_out, without = self._doubts_of_knocks(
             measurement, fits, prior, holds, knocks, unseen, cam_T_grip, now_s, displaced
@@ -289,6 +290,14 @@ class Weigher:
             return both
         return both._replace(absolute=larger(both.absolute, self._not_as_expected(self.unexplained)))
 
+    def _along_cam(self, fits: Refits, cam_T_grip: Array) -> Array:
+        """(3,) the way along the fingers, camera frame, that their sides don't show: tapered ones have one of their own
+        beside that of the fingers.  Zero for fingers without a direction.
+        """
+        axis = cam_T_grip[:3, :3] @ self._tracker.finger_axis
+        least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
+        return least_known if abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis) else axis
+
     def _staying(self, now_s: float, knocks: Knocks, displaced: bool) -> Array:
         """(6, 6) covariance of the motion since the first proven frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
@@ -322,7 +331,7 @@ class Weigher:
         probable = np.where(endless, unseen, self._knocked(now_s, hidden=False))
         if not across.any():
             probable[hypotheses.ends] = 0.0  # the same as that nothing is wrong
-        doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, least)
+        doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, endless, least)
         besides = unseen * prior[hypotheses.ends]
         without = None if across.any() else fits
         if across.any() and (displaced or not self.proved or besides * WRONG_EDGE > least):
@@ -330,7 +339,9 @@ class Weigher:
             without = Refits(measurement, endless_too, self._tracker.floor, fits.model, fits.known)
             both = prior[hypotheses.ends] * hypotheses.prior * more
             stays = without.anchored.square <= CONTRADICTION_SQUARE
-            of_both, more_out = without.knocked(cam_T_grip, both, knocks, np.full(len(both), unseen), stays, least)
+            of_both, more_out = without.knocked(
+                cam_T_grip, both, knocks, np.full(len(both), unseen), stays, np.ones_like(stays), least
+            )
             doubts, left_out = doubts + of_both, left_out + more_out
         return doubts, left_out, without
 

@@ -45,9 +45,9 @@ INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
 FEWEST_POINTS = 40
-"""Independent points of the fingers in view below which strips don't say that the gripper has slid: two faces of each of
-two fingers that show 50 px.  Fewer look alike elsewhere by chance, and an exposure that changes moves them as much as a
-slide would: 25 px of two fingers said so in half of the stills of a gripper that didn't move.
+"""Independent points of the fingers in view below which strips don't say that the gripper has slid: two faces of each
+of two fingers that show 50 px.  Fewer look alike elsewhere by chance, and an exposure that changes moves them as much
+as a slide would: 25 px of two fingers said so in half of the stills of a gripper that didn't move.
 """
 
 ONE_EDGE_PX = 2
