@@ -31,7 +31,7 @@ and what is common to all doubts in one place: a function, and one call more.  W
 were valid 4.5 mm off: a file, five functions, seven calls, three constants.  With both bounds, knocks of all sizes and
 ends looked at in three frames of four: six files, 66 functions, and 581 calls, 300 of them of generators' items.
 """
-MOST_CONSTANTS = 368
+MOST_CONSTANTS = 369
 """Named at the top of the rooms that a frame passes: what can't be justified goes, and one idea has one number."""
 PACKAGE = str(Path(gripmon.__file__).parent)
 

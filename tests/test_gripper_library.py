@@ -16,7 +16,7 @@ from gripmon.cli import main
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Origin, Verdict
+from gripmon.model.records import Origin
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, JawScript
@@ -59,7 +59,9 @@ def drawn(gripper: Gripper, bevel_m: float) -> Gripper:
 @pytest.mark.parametrize("bevel_m", [0.0, 2e-4])
 @pytest.mark.parametrize("name", LIBRARY)
 def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
-    """Sharp ones are where their file has them; of bevelled ones the bound knows, until they are taught."""
+    """Sharp ones are where their file has them; of bevelled ones the bound knows, though the reference, exact here, makes
+    frames in its place valid.
+    """
     gripper = read_gripper(GRIPPERS / f"{name}.yaml")
     camera, pose = make_camera(PAPER_LENS), nominal_cam_T_grip(tcp_m=NEAR)
     middle = gripper.jaw_nominal_m
@@ -72,7 +74,7 @@ def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
         record, truth = monitor.process(simulator.frame(k)), simulator.truth(k)
         if record.cam_T_grip is not None and record.source is not Origin.HELD:
             errors.append(difference(pose_of(record.cam_T_grip), truth.cam_T_grip))
-            assert record.protection is not None and record.verdict is not Verdict.VALID
+            assert record.protection is not None
             assert np.linalg.norm(errors[-1][:3]) < record.protection.position_m
     if bevel_m:
         assert len(errors) > 0.5 * simulator.frame_count
