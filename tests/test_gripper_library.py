@@ -59,7 +59,7 @@ def drawn(gripper: Gripper, bevel_m: float) -> Gripper:
 @pytest.mark.parametrize("bevel_m", [0.0, 2e-4])
 @pytest.mark.parametrize("name", LIBRARY)
 def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
-    """Sharp ones are where their file has them; of bevelled ones the bound knows, though the reference, exact here, makes
+    """Sharp ones are where their file has them; of bevelled ones the bound knows.  The reference, exact here, makes
     frames in its place valid.
     """
     gripper = read_gripper(GRIPPERS / f"{name}.yaml")
