@@ -206,7 +206,7 @@ class FingerStrips:
         if alone:
             return StripsSeen()
         # Odds of ten to one for this slide: what hides a part of them leaves less.
-        undecided = math.exp(2.0 / independent * math.log(10.0)) * here >= best
+        undecided = independent >= FEWEST_POINTS and math.exp(2.0 / independent * math.log(10.0)) * here >= best
         return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
