@@ -67,7 +67,7 @@ def fits(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Fit], dict
         (["wider"], "none fits; wider: of its outline L_in_far_along 0 % is seen"),
         (
             ["wider", "thicker", "other"],
-            "none fits; wider: .*; thicker: valid in . of .. frames; parallel_.*: valid in 0",
+            "none fits; wider: .*; thicker: of its outline L_out_near_along 0 % is seen; parallel_.*: valid in 0",
         ),
         # All that is in view is shifted by a millimetre: no image tells that from another place of the camera.
         (["true", "longer"], "two_box_fingers and longer fit alike; one file fewer"),
