@@ -131,7 +131,8 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
         near = millimetres(off.size_m, off.sigma_m)
         return f"It has moved back: {measured}, the camera was where it began, to within {near}."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
-    text = f"It is {'still ' if motions else ''}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    still = "still " if motions else ""
+    text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     now = report.at_end_against_reference
     if len(report.references) < 2 or now is None:
         return f"{text}, and there is no new reference."
