@@ -85,6 +85,11 @@ def test_averages_are_those_of_numpy(seed: int):
     rng = np.random.default_rng(seed)
     average, frame, at, wander = fits(rng), fits(rng), shifts(rng, 1)[0], rng.uniform(size=6) * SIZE[:6] ** 2
     agree(kernel.follow(*average, *frame, wander), by_numpy.follow(*average, *frame, wander))
+    known = at, covariances(rng, 1)[0]
+    agree(kernel.with_known(*frame, *known), by_numpy.with_known(*frame, *known))
+    which, (lever, turn) = rng.integers(0, HYPOTHESES, HYPOTHESES), rng.normal(size=(2, 6, 6))
+    of = *frame, which, *average, lever * SIZE[:6, None] / SIZE[:6], turn * SIZE[:6, None] / SIZE[:6], known[1]
+    agree(kernel.of_motion(*of), by_numpy.of_motion(*of))
     rows = rng.integers(-1, HYPOTHESES, HYPOTHESES)
     told = by_numpy.telling(*average, at, wander, *frame, rows, 12.0)
     agree(kernel.telling(*average, at, wander, *frame, rows, 12.0), told)

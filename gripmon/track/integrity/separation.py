@@ -136,6 +136,20 @@ def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separ
     return Separation(*after), gains
 
 
+def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
+    """The fits, each joined with what is known of all of them besides: ``at`` (6,) but for a ``covariance`` (6, 6)."""
+    return Separation(*kernel.with_known(*fits, at, covariance))
+
+
+def of_motion(
+    fits: Separation, first: Separation, which: NDArray[np.intp], lever: Array, turn: Array, more: Array
+) -> Separation:
+    """Fits x made those of the motion since the ones of ``first`` b that are their ``which`` (h,): L (x - T b) with the
+    Jacobians ``lever`` L and ``turn`` T (6, 6), and covariances L (C_x + T C_b T' + M) L', M = ``more`` (6, 6).
+    """
+    return Separation(*kernel.of_motion(*fits, which, *first, lever, turn, more))
+
+
 def telling(
     averages: Separation, at: Array, wander: Array, frame: Separation, rows: NDArray[np.intp], limit: float
 ) -> Separation:
@@ -275,6 +289,7 @@ def warm_up() -> None:
         fits = Sums.of_kept(*of).fits()
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
+    with_known(of_motion(fits, fits, np.arange(2), np.eye(6), np.eye(6), np.eye(6)), none, np.eye(6))
     jumped(
         fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0
     )
