@@ -220,17 +220,22 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
+    together: bool,
 ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
     """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
-    besides, and the normalised squares (h,) of the former's distance from that.
+    besides, none of these if they aren't asked for ``together``, and the normalised squares (h,) of the former's
+    distance from that.
     """
     sums, normal, spread, of_model = add_up(
         pull, information, middle, model, part, parts, keep, known, known_pull
     )  # fmt: skip
     alone = separate(sums, normal, spread, of_model, 6)
-    sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
-    together = separate(sums, normal, spread, of_model, 6)
-    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+    asked = len(sums) if together else 0
+    sums, normal, spread, of_model = with_pose(
+        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, covariance, off
+    )  # fmt: skip
+    with_it = separate(sums, normal, spread, of_model, 6)
+    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
 
 
 @compiled

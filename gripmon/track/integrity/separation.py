@@ -117,15 +117,17 @@ def with_and_without(
     covariance: Array,
     of_model: Array,
     times: float,
+    together: bool = True,
 ) -> tuple[Separation, Separation, Array]:
     """The fits of six unknowns by what :meth:`Sums.of_kept` is made of, and the same with these known to be ``at`` (6,)
     but for a ``covariance`` (6, 6), and off by ``of_model`` (f, 6), or (1, 6) of zeros.  And the normalised squares
-    (h,) of the former's distances from there, by ``times`` their own covariances and that one.
+    (h,) of the former's distances from there, by ``times`` their own covariances and that one.  Not ``together``:
+    without the second ones, of which there are none then.
     """
     pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
     of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
-    alone, together, squares = kernel.with_and_without(*of)
-    return Separation(*alone), Separation(*together), squares
+    alone, with_pose, squares = kernel.with_and_without(*of, together)
+    return Separation(*alone), Separation(*with_pose), squares
 
 
 def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:

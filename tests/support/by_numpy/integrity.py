@@ -67,11 +67,12 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
+    together: bool,
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
     sums = add_up(pull, information, middle, model, part, parts, keep, known, known_pull)
     alone = separate(*sums, 6)
-    together = separate(*with_pose(*sums, at, covariance, off), 6)
-    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+    with_it = separate(*with_pose(*(each[: len(each) * together] for each in sums), at, covariance, off), 6)
+    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
 
 
 def jumped(
