@@ -33,9 +33,9 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
+from gripmon.monitor.ends import MISREAD_PROBABILITY
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import MISREAD_PROBABILITY
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
@@ -340,7 +340,7 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
     for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
         ends, seen = FingerEndsSeen(np.array(corners), np.array([3, 3])), replace(measurement, normal=sides_and)
-        assert weigher._misread(seen, ends, None) == pytest.approx(MISREAD_PROBABILITY**times)
+        assert weigher._ends.misread(seen, ends) == pytest.approx(MISREAD_PROBABILITY**times)
         trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
         assert not (trust.proven or trust.displaced)
         assert (trust.bounds.absolute.position_m < limit_m) == (times > 1)
