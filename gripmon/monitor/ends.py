@@ -38,11 +38,13 @@ class EndsEvidence:
         self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
     ) -> float:
         """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
-        measured edges that count, None for all.  A finger's root isn't an end, and edges on one line count once, of
-        whichever fingers: a single straight border may show them all.
+        measured edges that count, None for all.  A finger's root isn't an end, nor is an edge that goes on beyond a
+        corner, and edges on one line count once, of whichever fingers: a single straight border may show them all.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]
+        if ends is not None and ends.past:
+            edges = edges[~np.isin(edges, list(ends.past))]
         if kept is not None:
             edges = edges[np.isin(edges, measurement.normal.edge[kept])]
         times = self._times(edges, ends)
