@@ -217,6 +217,8 @@ class Weigher:
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
         there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
         how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
+        Of narrow tips a view may have one corner each: they prove the pose, too, where all of that together leaves no
+        more than the risk that they are something else.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -234,10 +236,13 @@ class Weigher:
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._misread(measurement, ends, kept)
-        if proven:
-            misread *= MISREAD_PROBABILITY**strictly
         if seen_along and not slid:
             misread *= LOOK_ODDS
+        misread_strictly = misread * MISREAD_PROBABILITY**strictly
+        if ends is not None and ends.at_each and not slid and (strictly or not displaced):
+            proven = proven or _within(misread_strictly, risk)
+        if proven:
+            misread = misread_strictly
         # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
@@ -455,7 +460,7 @@ class Weigher:
         edge = measurement.normal.edge
         sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
         excluded = self._knocked(now_s, hidden=True) * MISREAD_PROBABILITY**sides
-        return excluded <= (1.0 + 1e-9) * self._policy.integrity_risk  # powers of ten are equal but for rounding
+        return _within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
@@ -504,6 +509,11 @@ class Weigher:
             hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open)
             self._kept[key] = hypotheses, self._lasting.rows(hypotheses, edges)
         return self._kept[key]
+
+
+def _within(probability: float, risk: float) -> bool:
+    """Whether a probability is no more than a risk; powers of ten are equal but for rounding."""
+    return probability <= (1.0 + 1e-9) * risk
 
 
 def _proven(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
