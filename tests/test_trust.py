@@ -499,6 +499,27 @@ def test_three_corners_prove_a_pose_elsewhere_where_the_fingers_are_seen_along_t
         assert trust.displaced and trust.proven == proven
 
 
+@pytest.mark.parametrize(
+    ("corners", "seen_along", "strictly", "proven"),
+    [([1, 1], True, 1, True), ([1, 1], True, 0, False), ([1, 1], False, 2, False), ([2, 0], True, 2, False)],
+)
+def test_one_corner_of_each_finger_proves_a_pose_elsewhere_if_it_is_too_improbable_that_they_are_something_else(
+    corners: list[int], seen_along: bool, strictly: int, proven: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """0.1 each, 0.1 for each that is seen strictly, 1e-3 for the strips: at most the risk, 1e-5."""
+    monkeypatch.setattr(Integrity, "_knocked", lambda *_: False)
+    monitor = new_monitor()
+    for frame in frames_of(scene(BEGINS + 3, mount=(along_fingers(3e-3, BEGINS_S),)))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
+    trust = weigher.weigh(
+        measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along, strictly=strictly
+    )
+    assert trust.displaced and trust.proven == proven
+
+
 def test_a_pose_that_stays_slid_after_it_was_measured_again_is_not_followed(monkeypatch: pytest.MonkeyPatch):
     slid = StripsSeen(np.array([0.0, 0.0, 1e-4]))
     assert not knock_followed(monkeypatch, _along=lambda *_, **__: slid)

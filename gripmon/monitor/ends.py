@@ -74,6 +74,11 @@ def strict_fingers(strict: FingerEndsSeen, ends: FingerEndsSeen) -> int:
     return int(np.count_nonzero((strict.seen > 0) & (strict.seen >= ends.seen)))
 
 
+def within(probability: float, risk: float) -> bool:
+    """Whether a probability is no more than a risk; powers of ten are equal but for rounding."""
+    return probability <= (1.0 + 1e-9) * risk
+
+
 def proves(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
     """Whether the fingers' ends are seen as ends.  Not ``elsewhere`` than expected fewer corners suffice; where the
     innovation is within noise (``again``), one of each finger.

@@ -140,6 +140,7 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
+            self._weigher.learnt_along()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a

@@ -32,7 +32,7 @@ from gripmon.monitor.bounds import (
     reaching,
     unbounded,
 )
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, within
 from gripmon.monitor.mount import KNOCK_UNSEEN_PROBABILITY, Mount
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
@@ -94,6 +94,7 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
+        self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
@@ -163,6 +164,8 @@ class Weigher:
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
         there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
         how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
+        Of narrow tips a view may have one corner each: they prove the pose, too, where all of that together leaves no
+        more than the risk that they are something else.
         """
         risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
@@ -175,13 +178,17 @@ class Weigher:
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
         proven = not slid and proves(ends, displaced and not seen_along, again)
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
-        # The priors: only that of the ends depends on the frame.
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
-        misread *= MISREAD_PROBABILITY**strictly if proven else 1.0
-        misread *= LOOK_ODDS if seen_along and not slid else 1.0
+        misread_strictly = misread * MISREAD_PROBABILITY**strictly
+        since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
+        if ends is not None and ends.at_each and not slid and (strictly or not displaced):
+            proven = proven or within(misread_strictly * since_learnt, risk)
+        if proven:
+            misread = misread_strictly
+        # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
+        prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
@@ -195,11 +202,17 @@ class Weigher:
         made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
+        # What was taken for the ends when the strips were learnt looks right ever after.
+        misread = min(misread, misread * since_learnt + self._along_misread)
         trust = Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         if anchor is None:
             return trust
         along_unseen = besides * float(knocks.share[knocks.along].sum()) > risk
         return self._explained(trust, measurement, cam_T_grip, prior, fits, along_unseen)
+
+    def learnt_along(self) -> None:
+        """The fingers' strips were learnt at the anchor."""
+        self._along_misread = self.misread_ever
 
     def displaced(self, measurement: Measurement, now_s: float) -> bool:
         """Whether a measured pose isn't where the gripper is expected."""
@@ -397,7 +410,7 @@ class Weigher:
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
         excluded = self._knocked(now_s, hidden=True) * self._ends.sides_misread(measurement)
-        return excluded <= (1.0 + 1e-9) * self._policy.integrity_risk  # powers of ten are equal but for rounding
+        return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
