@@ -32,7 +32,7 @@ from gripmon.monitor.bounds import (
     reaching,
     unbounded,
 )
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, within
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.mount import KNOCK_UNSEEN_PROBABILITY, Mount
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
@@ -155,17 +155,16 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
         seen_along: bool = False,
-        strictly: int = 0,
     ) -> Trust:
         """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
-        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
-        how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
-        Of narrow tips a view may have one corner each: they prove the pose, too, where all of that together leaves no
-        more than the risk that they are something else.
+        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  Each finger beyond
+        whose ends nothing goes on even by a few pixels is worth as much as one more corner.  Of narrow tips a view may
+        have one corner each: they prove the pose, too, where all of that together leaves no more than the risk that
+        they are something else.
         """
         risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
@@ -180,6 +179,7 @@ class Weigher:
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
+        strictly = 0 if ends is None else strict_fingers(ends)
         misread_strictly = misread * MISREAD_PROBABILITY**strictly
         since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
         if ends is not None and ends.at_each and not slid and (strictly or not displaced):
