@@ -167,8 +167,8 @@ def test_what_lies_behind_the_fingers_ends_is_no_part_of_them(level_dn: float):
 
 @pytest.mark.parametrize("pitch_m", [1e-3, 1.5e-3, 2e-3, 4e-3])
 def test_ribs_are_not_seen_where_they_look_alike_a_rib_farther_on(pitch_m: float):
-    """At poses slid by a pitch or two: they are seen some pitches away, or nothing is decided.  Nor do they confirm where
-    they are: light changes ribs by as much as one more or less does.
+    """At poses slid by a pitch or two: they are seen some pitches away, or nothing is decided.  Nor do they confirm
+    where they are: light changes ribs by as much as one more or less does.
     """
     ribs = [
         FingerMark(from_tip_m=(k * pitch_m, (k + 0.5) * pitch_m), across=(-2.0, 2.0), gain=0.5)
