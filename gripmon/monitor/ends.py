@@ -38,15 +38,16 @@ class EndsEvidence:
         self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
     ) -> float:
         """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
-        measured edges that count, None for all.  A finger's root isn't an end, nor is an edge that goes on beyond a
-        corner, and edges on one line count once, of whichever fingers: a single straight border may show them all.  A
-        finger counts once less where something goes on by a few pixels beyond each of its corners: that is what a slide
-        by a few pixels looks like.
+        measured edges that count, None for all.  A finger's root isn't an end, and edges on one line count once, of
+        whichever fingers, where no corner is seen: a single straight border may show them all.  An edge that goes on
+        beyond a finger that shows no corner is such a border, whatever corner another finger makes with it.  A finger
+        counts once less where something goes on by a few pixels beyond each of its corners: that is what a slide by a
+        few pixels looks like.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]
-        if ends is not None and ends.past:
-            edges = edges[~np.isin(edges, list(ends.past))]
+        if ends is not None:
+            edges = edges[~np.isin(edges, list(ends.past)) | (ends.seen[self._finger[edges]] > 0)]
         if kept is not None:
             edges = edges[np.isin(edges, measurement.normal.edge[kept])]
         times = self._times(edges, ends)

@@ -49,8 +49,7 @@ class FingerEndsSeen:
     """(f,) corners at the end of each finger, or places where its sides turn into a curve: ``seen`` with nothing that
     goes on beyond them, and those that ``might`` be seen in this view; ``strictly`` those seen beyond which nothing
     goes on by a few pixels either, as beyond a step on the finger; clutter does, too.  ``past``: the edges at the ends
-    that go on beyond one of their corners: borders of something longer, which a finger's side may cross in a second
-    corner.
+    that go on beyond one of their corners.
     """
 
     seen: NDArray[np.intp]
@@ -147,7 +146,6 @@ class FingerEnds:
         self.axis, self.along = along_fingers(gripper)
         self._roundings = Roundings(gripper, self.along, float(PROBES_PX[-1]), PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
-        self._at_corner = [gripper.edges_at_corner(number) for number in range(len(gripper.corner_points))]
         self._kept: tuple[Prediction, _Probes] | None = None
         self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
 
@@ -180,8 +178,8 @@ class FingerEnds:
     def _at_places(
         self, image: Image, measurement: Measurement
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], frozenset[int]]:
-        """(s,) the measured places that are ends: no edge goes on beyond them, nor an edge across the finger beyond its
-        other corner; (s,) those of them that are ends strictly.  And which edges across go on.
+        """(s,) the measured places that are ends: no edge goes on beyond them; (s,) those that are strictly.  And which
+        edges across go on.
         """
         prediction, places = measurement.prediction, self._places
         if self._kept is None or self._kept[0] is not prediction:
@@ -202,8 +200,6 @@ class FingerEnds:
         extended = edge[probes.sample]
         past = frozenset(extended[goes_on & ~self.along[extended]].tolist())
         measured[probes.place[goes_on]] = False
-        for number in np.flatnonzero(measured & (places.corner >= 0)).tolist():
-            measured[number] = past.isdisjoint(self._at_corner[places.corner[number]])
         strictly = measured.copy()
         strictly[probes.place[by_a_few_px]] = False
         return measured, strictly, past
