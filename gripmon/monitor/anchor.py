@@ -29,44 +29,11 @@ YOUNG_VARIANCE_RATIO = 0.2
 would gain little, given the least variance that an average may claim.
 """
 
-LEFT_WITH_BACKGROUND, ATTACHED_SHARE = 0.3, 1e-2
-"""Share of the things that were taken for an edge that still are before another background; and of those that always
-are, being attached to the gripper: a cable, a strip of tape.  Assumed, not measured.
-"""
-
-ANOTHER_STEP_RATIO = 0.25
-"""Change of an edge's step, over that of all edges in common, from which it stands before another background: assumed,
-and far above the noise of an edge of forty profiles.
-"""
-
 CONFIRMING_FRAMES = 5
 """Frames after a knock, besides the first, that need the full proof of the new place."""
 
 NO_FIT, UNKNOWN_VARIANCE_RATIO = -1, 1e12
 """Number of a missing fit; and the factor on the covariance of the fit in its place that removes its information."""
-
-
-class Backgrounds:
-    """Before how many different backgrounds each edge of a gripper has stood in its place: ``seen`` (e,).
-
-    A background of another brightness changes the height of the edge's step; light changes those of all edges alike.
-    """
-
-    def __init__(self, edges: int):
-        self.seen: Array = np.zeros(edges)
-        self._step = np.full(edges, np.nan)
-
-    def add(self, edges: NDArray[np.intp], step: Array) -> None:
-        """Add a frame that shows ``edges`` (v,), each with its mean ``step`` (e,) in grey levels."""
-        before, now = self._step[edges], step[edges]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = now / before
-        known = np.isfinite(ratio)
-        if known.any():
-            ratio[known] /= np.median(ratio[known])
-        another = known & (np.abs(ratio - 1.0) > ANOTHER_STEP_RATIO)
-        self.seen[edges[another]] += 1.0
-        self._step[edges[another | ~known]] = now[another | ~known]
 
 
 class Lasting(NamedTuple):
@@ -79,17 +46,11 @@ class Lasting(NamedTuple):
     doubts: NDArray[np.bool_]
     opening: NDArray[np.bool_]
 
-    def priors(self, misread: float, backgrounds: Array | None = None) -> Array:
-        """(g,) after so many ``backgrounds`` (e,) before which each edge stood in its place, if any: what isn't the
-        gripper's mostly leaves with its background, unless it is attached.  ``misread``: of all ends, as the clearest
-        frame has it.
-        """
+    def priors(self, misread: float) -> Array:
+        """(g,) with the probability ``misread`` that no end is what it seems, as the clearest frame has it."""
         prior = self.prior.copy()
         prior[-1] = misread
-        if backgrounds is None:
-            return prior
-        seen = (self.doubts * backgrounds).max(axis=1)
-        return np.asarray(prior * np.maximum(LEFT_WITH_BACKGROUND**seen, ATTACHED_SHARE))
+        return prior
 
     @classmethod
     def of(cls, every: Hypotheses) -> Lasting:

@@ -20,7 +20,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
-from gripmon.monitor.anchor import Anchor, Backgrounds, Lasting
+from gripmon.monitor.anchor import Anchor, Lasting
 from gripmon.monitor.bounds import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
@@ -33,13 +33,13 @@ from gripmon.monitor.bounds import (
     reaching,
     unbounded,
 )
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds, CommonError, Differences
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, own_steps, sides
+from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Hypotheses, Knocks, Mount, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
@@ -97,7 +97,7 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
-        self._backgrounds = Backgrounds(len(every))
+        self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
@@ -158,15 +158,16 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
         seen_along: bool = False,
-        strictly: int = 0,
     ) -> Trust:
         """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
-        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
-        how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
+        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  Each finger beyond
+        whose ends nothing goes on even by a few pixels is worth as much as one more corner.  Of narrow tips a view may
+        have one corner each: they prove the pose, too, where all of that together leaves no more than the risk that
+        they are something else.
         """
         risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
@@ -179,13 +180,18 @@ class Weigher:
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
         proven = not slid and proves(ends, displaced and not seen_along, again)
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
-        # The priors: only that of the ends depends on the frame.
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
-        misread *= MISREAD_PROBABILITY**strictly if proven else 1.0
-        misread *= LOOK_ODDS if seen_along and not slid else 1.0
+        strictly = 0 if ends is None else strict_fingers(ends)
+        misread_strictly = misread * MISREAD_PROBABILITY**strictly
+        since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
+        if ends is not None and ends.at_each and not slid and (strictly or not displaced):
+            proven = proven or within(misread_strictly * since_learnt, risk)
+        if proven:
+            misread = misread_strictly
+        # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
+        prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
@@ -200,11 +206,17 @@ class Weigher:
         made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
+        # What was taken for the ends when the strips were learnt looks right ever after.
+        misread = min(misread, misread * since_learnt + self._along_misread)
         trust = Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         if anchor is None:
             return trust
         along_unseen = besides * float(knocks.share[knocks.along].sum()) > risk
         return self._explained(trust, measurement, cam_T_grip, prior, fits, along_unseen)
+
+    def learnt_along(self) -> None:
+        """The fingers' strips were learnt at the anchor."""
+        self._along_misread = self.misread_ever
 
     def displaced(self, measurement: Measurement, now_s: float) -> bool:
         """Whether a measured pose isn't where the gripper is expected."""
@@ -263,7 +275,7 @@ class Weigher:
         """The doubts with those of what may have been wrong all along, or in the reference's frames."""
         anchor, since, lasting = self.anchor, list[Cases](), list[NDArray[np.intp]]()
         ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
-        prior = self._lasting.priors(ever, self._backgrounds.seen)
+        prior = self._lasting.priors(ever)
         every = np.arange(len(prior))
         if anchor is not None and not displaced:
             rows, wander = self._about(fits.edges).rows, self._wander(now_s)
@@ -346,7 +358,6 @@ class Weigher:
         proven = trust.proven
         if self.proved and not proven:
             return
-        self._backgrounds.add(trust.fits.edges, own_steps(measurement))
         rows = self._about(trust.fits.edges).rows
         if proven:
             self._slid = trust.may_have_slid
@@ -416,7 +427,7 @@ class Weigher:
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
         excluded = self._knocked(now_s, hidden=True) * self._ends.sides_misread(measurement)
-        return excluded <= (1.0 + 1e-9) * self._policy.integrity_risk  # powers of ten are equal but for rounding
+        return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
