@@ -34,7 +34,6 @@ from gripmon.monitor.bounds import (
     unbounded,
 )
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
-from gripmon.monitor.mount import KNOCK_UNSEEN_PROBABILITY, Mount
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds, CommonError, Differences
@@ -42,8 +41,9 @@ from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Hypotheses, Knocks, bounds, hypotheses_of
+from gripmon.track.integrity import Hypotheses, Knocks, Mount, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
+from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
@@ -85,7 +85,9 @@ class Weigher:
         """``since``: what was measured at the reference in force."""
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._ends, self._lone = EndsEvidence(gripper, tracker.along), has_lone_end(gripper)
-        self._mount = Mount(settings)
+        creep = settings.smoothing
+        variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
+        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month)
         self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))

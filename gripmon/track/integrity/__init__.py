@@ -1,7 +1,7 @@
 """What may be promised of a transform: bounds on its error under everything that may be wrong, at a stated risk."""
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
-from gripmon.track.integrity.knocks import Knocks
+from gripmon.track.integrity.knocks import Knocks, Mount
 from gripmon.track.integrity.separation import (
     Doubts,
     Separation,
@@ -20,6 +20,7 @@ __all__ = [
     "Doubts",
     "Hypotheses",
     "Knocks",
+    "Mount",
     "Separation",
     "Sums",
     "bounds",

@@ -1,4 +1,6 @@
-"""How far a knock moves a camera's mount: a mixture of normal distributions, in place of "anywhere".
+"""How a camera's mount may have moved since it was seen: it creeps, it vibrates, and rarely it is knocked.
+
+How far a knock moves it is a mixture of normal distributions, in place of "anywhere".
 
 Brackets slip by millimetres.  The sizes approximate a log-normal length of 3 mm in the median, for four of five knocks
 from 1 to 10 mm (assumed before anything was measured here; mounts that were hit in this project's own recordings moved
@@ -13,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
 
 ANY_SHARE = (0.40, 0.45, 0.15)
@@ -28,6 +31,15 @@ ALONG_SIGMA_M = (1.7e-3, 3.8e-3, 8.5e-3)
 
 ALONG_OF_ALL = 1.0 / 3.0
 """Share of the knocks along the fingers."""
+
+VIBRATION_FRAMES = 20.0
+"""Proven frames over which the mount's vibration is learnt."""
+
+KNOCK_UNSEEN_PROBABILITY = 1e-3
+"""Probability that the mount was knocked where nothing has shown it: while something hides the fingers' ends, since the
+gripper touches things then, and between the reference's images and the first frame.  A policy, once for each such
+occlusion, since the average rate of knocks is too low for both (docs/integrity.md).
+"""
 
 
 _ANYWHERE = np.stack([np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M])
@@ -59,3 +71,38 @@ class Knocks(NamedTuple):
     def spread(self) -> Array:
         """(6, 6) covariance of the motion by any knock."""
         return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
+
+
+def swinging(swing: Array, way: Array, noise: Array) -> Array:
+    """(6,) variance of the mount's vibration after one more ``way`` (6,) between consecutive poses; ``noise`` (6,):
+    variances that the poses' own errors add to it, which is taken off.  Negative where there happens to be less.
+    """
+    # A knock is not a vibration, but what rings after it is.
+    most = CONTRADICTION_SQUARE * (noise + np.maximum(swing, 0.0))
+    return np.asarray(swing + (np.minimum(np.square(way), most) - noise - swing) / VIBRATION_FRAMES)
+
+
+class Mount:
+    """The motions that one mount is expected to make."""
+
+    def __init__(self, creep: Array, jumps_per_month: float):
+        """``creep`` (6,): variance that its slow motion grows by in a second, m² and rad²."""
+        self._creep, self._jumps_per_s = creep, jumps_per_month / (30.0 * 86_400.0)
+        self._swing: Array = np.zeros(6)
+
+    @property
+    def swing(self) -> Array:
+        """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
+        return np.maximum(self._swing, 0.0)
+
+    def learn(self, way: Array, noise: Array) -> None:
+        """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
+        self._swing = swinging(self._swing, way, noise)
+
+    def creep(self, elapsed_s: float) -> Array:
+        """(6,) variance of the slow motion in a time; a clock that was set back is no time."""
+        return np.asarray(self._creep * max(elapsed_s, 0.0))
+
+    def knocked(self, elapsed_s: float, hidden: bool) -> float:
+        """Probability of a knock in a time; ``hidden``: something hides what would show it."""
+        return max(self._jumps_per_s * elapsed_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
