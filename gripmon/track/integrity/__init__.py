@@ -6,13 +6,14 @@ from gripmon.track.integrity.separation import (
     Doubts,
     Separation,
     Sums,
-    after_jumps,
     bounds,
     follow,
-    jumped,
+    knocked,
+    of_motion,
     telling,
     warm_up,
     with_and_without,
+    with_known,
 )
 
 __all__ = [
@@ -21,12 +22,13 @@ __all__ = [
     "Knocks",
     "Separation",
     "Sums",
-    "after_jumps",
     "bounds",
     "follow",
     "hypotheses_of",
-    "jumped",
+    "knocked",
+    "of_motion",
     "telling",
     "warm_up",
     "with_and_without",
+    "with_known",
 ]

@@ -202,10 +202,14 @@ class FingerStrips:
             if independent < FEWEST_POINTS:
                 return StripsSeen()
             return StripsSeen(slide_px * layout.step_m.mean(axis=0))
-        # Odds of ten to one for this slide: what hides a part of them leaves less.
-        as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= best
-        undecided = not alone and independent >= FEWEST_POINTS and as_well
-        return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
+        if alone:
+            return StripsSeen(here=beyond_chance * here <= best)
+        # Where something looks alike farther on, a rib or a thread, strips never confirm a place.  Odds of ten to one
+        # for this slide; what hides a part of them leaves less.  One of the places that look alike is seen no better
+        # than they are from the place itself, whichever of them is the best now.
+        rival = min(best, float(_unexplained(farther.max(), most_alike)))
+        as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= rival
+        return StripsSeen(undecided=independent >= FEWEST_POINTS and as_well)
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
         """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
