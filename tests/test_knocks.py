@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from gripmon.track.integrity import Knocks
+from gripmon.track.integrity.knocks import ANY_SHARE, ANY_SIGMA_M, log_likely
 
 AXIS_CAM = np.array([0.0, 0.6, 0.8])
 
@@ -27,6 +29,13 @@ def test_one_in_three_goes_along_the_fingers():
     shift_m = sampled_m(Knocks.of(AXIS_CAM))
     across_m = np.linalg.norm(shift_m - np.outer(shift_m @ AXIS_CAM, AXIS_CAM), axis=1)
     assert np.mean(across_m < 1e-9) == pytest.approx(1.0 / 3.0, abs=0.02)
+
+
+def test_how_likely_a_shift_is_follows_the_density_of_what_is_sampled():
+    shift_m = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 3e-3, 4e-3], [1.2e-2, 0.0, 5e-3]])
+    kinds = zip(ANY_SHARE, ANY_SIGMA_M, strict=True)
+    density = sum(share * multivariate_normal(np.zeros(3), sigma_m**2).pdf(shift_m) for share, sigma_m in kinds)
+    np.testing.assert_allclose(log_likely(shift_m), np.log(density / density[0]), atol=1e-9)
 
 
 def test_fingers_without_a_direction_have_none_along_them():

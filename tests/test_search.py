@@ -162,6 +162,26 @@ def test_no_proposed_pose_lies_far_beyond_the_reach():
     assert np.abs(xi[:, 3:]).max() <= 2.5 * 0.03
 
 
+@pytest.mark.usefixtures("tools_importable")
+def test_before_a_chequer_a_knock_of_a_usual_size_is_found_where_many_far_places_look_alike():
+    """Two dozen places 15 mm away, in which borders of the chequer run like the fingers' sides, had most votes."""
+    from benchmarks.integrity_practice import CONDITIONS
+    from benchmarks.integrity_scenes import make_integrity_scene
+
+    (bump,) = [condition for condition in CONDITIONS if condition.name == "bump"]
+    scene = make_integrity_scene(bump, 1504, 0, 96)
+    simulator, before, after = scene.simulator, scene.first + 41, range(scene.first + 42, scene.first + 48)
+    expected, found = simulator.truth(before).cam_T_grip, 0
+    for index in after:
+        frame, true = simulator.frame(index), simulator.truth(index)
+        assert frame.image is not None
+        poses = search_poses(
+            frame.image, simulator.camera, scene.gripper, expected, true.jaw_opening_m, SearchSettings()
+        )
+        found += min(np.linalg.norm(difference(pose, true.cam_T_grip)[:3]) for pose in poses) < 1.5e-3
+    assert found >= 4, "1 of the 6 frames where far places count as much as near ones"
+
+
 def test_nothing_is_searched_for_when_nothing_can_be_seen():
     pose = moved(nominal_cam_T_grip(), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
     image = picture(plain_scenario())

@@ -303,17 +303,14 @@ def knocked_round_tips(knock_m: float, radius_m: float, background: Background, 
 
 
 @pytest.mark.usefixtures("tools_importable")
-def test_a_knock_that_is_not_found_at_once_is_reported_as_what_it_may_be():
-    """Before dense speckle both corners of each round tip don't show in one frame for a while: the frames are suspect
-    at the old place, where most of what is seen is, until the fingers' look shows that they don't stand there.
-    """
+def test_a_knock_is_found_though_both_corners_of_each_round_tip_do_not_show_in_one_frame():
+    """Before dense speckle one of each is seen in most frames, and the strips along the fingers."""
     dense = Background(kind="speckle", contrast=0.9)
-    seen = knocked_round_tips(-6e-3, 4e-3, dense, MonitorSettings(policy=PolicySettings(update_alert_s=0.5)))
+    seen = knocked_round_tips(-6e-3, 4e-3, dense, MonitorSettings())
     error_m = np.linalg.norm(seen.errors()[:, :3], axis=1)
     valid = np.array([verdict is Verdict.VALID for verdict in seen.verdicts()])
-    assert not valid[KNOCK : KNOCK + 15].any() and valid[-10:].all() and error_m[valid].max() < 3e-4
-    texts = [alert.text for record in seen.records[KNOCK:] for alert in record.alerts]
-    assert any("or the camera has moved along the fingers" in text for text in texts), texts
+    assert not valid[KNOCK] and np.mean(valid[KNOCK + 1 : KNOCK + 15]) > 0.5 and valid[-10:].all()
+    assert error_m[valid].max() < 3e-4
     assert any(alert.kind is AlertKind.DRIFT for record in seen.records for alert in record.alerts)
 
 

@@ -2,8 +2,8 @@
 
 In a reduced image (``reduced``) the points on the predicted outlines vote for shifts in all three directions and turns
 about the optical axis.  The best places are perturbed in all six directions, tilts included, then refined by least
-squares on an image of twice the resolution (``hypotheses``); the result is a few starts for the joint fit on the full
-image, which decides.
+squares on an image of twice the resolution (``hypotheses``).  Far places need better evidence than near ones, as few
+knocks are so large; the result is a few starts for the joint fit on the full image, which decides.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from gripmon.track.edges.hypotheses import (
 )
 from gripmon.track.edges.reduced import BESIDE_CELLS, Floats, Window, evidence_maps, rectify, window_about
 from gripmon.track.edges.settings import SearchSettings
+from gripmon.track.integrity.knocks import log_likely
 
 POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""
@@ -86,14 +87,16 @@ def search_poses(
     score = MapScore(points, window, maps)
     for count, cells, part in PERTURBATION_ROUNDS:
         poses, scores = score.shaken(poses, place.shakes(count, cells * window.pitch, part), place.middle_m)
+    likely = scores + place.log_likely(poses)
     poses = poses.take(
-        np.array(apart(poses, points, window, scores, 0.5 * DISTINCT_CELLS / POLISHING_ZOOM, POLISHED_PLACES))
+        np.array(apart(poses, points, window, likely, 0.5 * DISTINCT_CELLS / POLISHING_ZOOM, POLISHED_PLACES))
     )
     finer = window.finer(POLISHING_ZOOM)
     points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS, shown)
     profiles = ProfileScore(points, finer, *rectify(image, camera, finer), POLISHING_ZOOM * BESIDE_CELLS)
     poses = profiles.polished(poses, POLISH_REACH, POLISH_ROUNDS, place.sigma)
-    best = apart(poses, points, finer, profiles.score(poses), DISTINCT_CELLS, settings.starts)
+    likely = profiles.score(poses) + place.log_likely(poses)
+    best = apart(poses, points, finer, likely, DISTINCT_CELLS, settings.starts)
     return poses.take(np.array(best)).matrices()
 
 
@@ -114,6 +117,10 @@ class _Place:
         self.reach_m = settings.reach_m + settings.tilt_rad * float(np.linalg.norm(self.middle_m))
         turns = [settings.tilt_rad, settings.tilt_rad, settings.turn_rad]
         self.sigma = np.array([0.5 * settings.reach_m] * 3 + [0.6 * turn for turn in turns]) + 1e-6
+
+    def log_likely(self, poses: Poses) -> Floats:
+        """(h,) natural logarithms of how likely a knock brings the gripper there: the votes reach farther than most."""
+        return np.asarray(log_likely(poses.translation_m - self._expected.translation_m), dtype=np.float32)
 
     def shakes(self, count: int, shift: float, part: float) -> Array:
         """(count, 6) perturbations: by up to ``shift`` (ideal) in the image, and a part of the searched tilt."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
@@ -43,6 +44,16 @@ occlusion, since the average rate of knocks is too low for both (docs/integrity.
 
 
 _ANYWHERE = np.stack([np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M])
+
+
+def log_likely(shift_m: Array) -> Array:
+    """(n,) natural logarithms of how likely knocks in any direction shift the TCP by ``shift_m`` (n, 3), over that of
+    no shift at all.
+    """
+    sigma = np.array(ANY_SIGMA_M)
+    density = np.array(ANY_SHARE) / sigma**3
+    beyond = 0.5 * np.square(shift_m).sum(axis=1)[:, None] / sigma**2
+    return np.asarray(logsumexp(-beyond, axis=1, b=density / density.sum()))
 
 
 class Knocks(NamedTuple):
