@@ -128,7 +128,7 @@ def at_reference(cam_T_grip: np.ndarray, count: int = 1, sigma: float = 1e-4) ->
     fits = Separation(
         np.zeros((count, 6)), np.tile(np.diag(np.square([sigma] * 6)), (count, 1, 1)), np.zeros((count, 1, 6))
     )
-    return AtReference(cam_T_grip, fits, 0.03, 30, Since.FIRST_PROVED, 0)
+    return AtReference(cam_T_grip, fits, 0.03, 30, Since.FIRST_PROVED, 0, 1e-6)
 
 
 def random_pose(rng: np.random.Generator, size: float = 1.0) -> np.ndarray:

@@ -102,7 +102,7 @@ class Anchor:
         """
         self.misread, self.proven = misread, proven
         self._lasting, self._base_T, self._origin = lasting, base_T, origin
-        self.began_s, self.now_s, self.frames, self.knocked = now_s, now_s, 1, knocked
+        self.now_s, self.frames = now_s, 1
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
@@ -126,6 +126,8 @@ class Anchor:
         frame = _chosen(fits, rows, self._base_T)
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
         self._filters, gains = follow(self._filters, frame, creep)
+        origin_T, known = self._origin
+        self._origin = origin_T, known + np.diag(creep)
         share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
         self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
         self._scatter += (share - self._scatter) / self._weight

@@ -136,18 +136,16 @@ class Refits:
         name = tuple(self.hypotheses.name[k] for k in fit.tolist())
         return Cases(name, weight, self._beside(fits, cam_T_grip)), left_out
 
-    def wrong_at_first(self, lasting: tuple[str, ...], prior: Array, anchored: Anchored | None) -> Cases:
+    def wrong_at_first(
+        self, lasting: tuple[str, ...], prior: Array, cam_T_grip: Array, anchored: Anchored | None
+    ) -> Cases:
         """Of the motion since the reference's frames: one of the lasting hypotheses but the first, by name and of a
-        ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the pose rests on the frame alone.
+        ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the pose (4, 4) rests on the frame
+        alone.
         """
         name = _in_the_references_frames(lasting)
-        covariance, of_model = (self._free if anchored is None else anchored.fits)[1:]
-        now = Separation(
-            np.zeros((len(name), 6)),
-            np.tile(covariance[0] + self._floor, (len(name), 1, 1)),
-            np.tile(of_model[0], (len(name), 1, 1)),
-        )
-        return Cases(name, prior[1:], now)
+        now = self._beside(self._free if anchored is None else anchored.fits, cam_T_grip)
+        return Cases(name, prior[1:], Separation(*(np.repeat(each[:1], len(name), axis=0) for each in now)))
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

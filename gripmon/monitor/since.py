@@ -132,6 +132,7 @@ class Average(Protocol):
 
     cam_T_grip: Array
     frames: int
+    misread: float
 
     def fits(self) -> Separation:
         """The averages under the lasting hypotheses, as shifts from ``cam_T_grip``."""
@@ -171,6 +172,8 @@ class Differences(NamedTuple):
 class AtReference(NamedTuple):
     """What the monitor measured at the reference: ``fits`` under each of g lasting hypotheses as shifts from
     ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
+    ``misread``: probability that what looked like the fingers' ends in all of these was something else; ``knocked``:
+    whether the mount was, later on.
     """
 
     cam_T_grip: Array
@@ -179,6 +182,8 @@ class AtReference(NamedTuple):
     frames: int
     since: Since
     since_ns: int
+    misread: float
+    knocked: bool = False
 
     def motion(self, cam_T_grip: Array) -> Array:
         """exp(d) (4, 4) of a measured pose (4, 4)."""
@@ -229,12 +234,30 @@ class AtReferences:
         self._risk = risk
         self.changes = 0
         """Grows with each change that a restart should know."""
+        self.now_ns = 0
+        """Stamp of the newest frame."""
         self.refer(reference)
 
     @property
     def current(self) -> AtReference | None:
         """At the reference in force; None until a frame proves a pose."""
         return self._known.get(self._id)
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the reference's frames; of a clock that was set back none."""
+        first = self.current
+        return 0.0 if first is None else max(1e-9 * (self.now_ns - first.since_ns), 0.0)
+
+    @property
+    def knocked(self) -> bool:
+        """Whether the mount was knocked since then."""
+        return self.current is not None and self.current.knocked
+
+    @property
+    def misread(self) -> float:
+        """Probability that what looked like the fingers' ends in those frames was something else."""
+        return 1.0 if self.current is None else self.current.misread
 
     @property
     def published_by(self) -> tuple[AtReference | None, Array]:
@@ -274,10 +297,10 @@ class AtReferences:
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""
         at = anchor.cam_T_grip, anchor.fits(), jaw_opening_m, anchor.frames, Since.REFERENCE, reference.stamp_ns
-        self._keep(reference.reference_id, AtReference(*at))
+        self._keep(reference.reference_id, AtReference(*at, anchor.misread))
 
     def add(self, anchor: Average, jaw_opening_m: float, stamp_ns: int) -> None:
-        """A frame has proved a pose, which ``anchor`` includes."""
+        """A frame has proved a pose, which ``anchor`` includes; nothing else begins what is known of a reference."""
         growing = self._growing
         if growing is None and self.current is not None:
             return
@@ -288,14 +311,14 @@ class AtReferences:
             self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
         self._openings_m.append(jaw_opening_m)
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
-        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns)
+        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns, anchor.misread)
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
 
-    def forget(self) -> None:
-        """Begin again at the reference in force."""
-        self._known.pop(self._id, None)
-        self._growing = None
+    def moved(self) -> None:
+        """The mount was knocked: that it stays where it was says nothing about the motion since any reference."""
+        self._known = {name: at._replace(knocked=True) for name, at in self._known.items()}
+        self.changes += 1
 
     def _was_wrong(self, first: Average, anchor: Average) -> bool:
         """Whether the first frames were wrong, rather than the mount knocked just after them, when another place is
@@ -312,9 +335,9 @@ class AtReferences:
     def _keep(self, reference_id: str, at: AtReference) -> None:
         self._known[reference_id] = at
         self.changes += 1
-        while len(self._known) > KEPT_REFERENCES:  # the configured one is the first
-            oldest = [each for each in self._known if each != self._id][1]
-            del self._known[oldest]
+        while len(self._known) > KEPT_REFERENCES:
+            _configured, *others = self._known
+            del self._known[next(each for each in others if each != self._id)]
 
     def state(self) -> tuple[AtReferenceRecord, ...]:
         """What survives a restart: without an average that is still growing, which begins anew."""
@@ -334,28 +357,30 @@ class AtReferences:
             at.frames,
             at.since,
             at.since_ns,
+            at.misread,
+            at.knocked,
         )
 
     def restore(self, records: Iterable[AtReferenceRecord], lasting: int, fingers: int) -> str | None:
         """Go on with what an earlier run measured, with these numbers of lasting hypotheses and fingers.  Returns why
         some of it isn't used: settings or taught edges have changed since; None if all of it is.
         """
-        refused = None
-        if self._valid_by is ValidBy.REFERENCE and self._id not in {each.reference_id for each in records}:
+        refused, right = None, "the motion since the reference counts from the next 30 frames that prove where it is"
+        if self._id not in {each.reference_id for each in records}:
             refused = (
                 "the state has nothing of the reference's frames: it is from an earlier version, or too few frames had "
-                "proved where the gripper is; the motion since the reference counts from the first frames"
+                f"proved where the gripper is; {right}, or recalibrate"
             )
         for each in records:
             fits = _fits(each, lasting, fingers) if each.measured_as == self._digest else None
             if fits is None:
                 refused = (
                     "where the reference's frames had the gripper isn't used: the edges were taught again, or measured "
-                    "with other settings, since; the motion since the reference counts from the first frames"
+                    f"with other settings, since; {right}, or recalibrate"
                 )
             else:
                 at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns
-                self._known[each.reference_id] = AtReference(*at)
+                self._known[each.reference_id] = AtReference(*at, each.misread, each.knocked)
         return refused
 
 

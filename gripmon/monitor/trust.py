@@ -154,6 +154,7 @@ class Integrity:
 
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
         """What to publish of a measurement, and how far it is trusted; None where the gripper isn't seen."""
+        self.since.now_ns = frame.stamp_ns
         if measurement.trusted:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)
@@ -288,14 +289,15 @@ class Integrity:
         moved = self._knocked(trust, beside_px, along.here)
         knocked = moved and beside_px >= ONE_EDGE_PX
         proves = trust.proven and (moved or not trust.displaced)
-        unproven, anchor = self._weigher.proved and not proves, self._weigher.anchor
+        unproven = self._weigher.proved and not proves
         if trust.fits is not None and (proves or not (trust.displaced or self._weigher.proved)):
             self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
             assert self._weigher.anchor is not None
-            if proves and anchor is not None and not anchor.proven:
-                self.since.forget()  # what was known until now was so without the fingers' ends
             self._jaw_opening_m = measurement.jaw_opening_m
-            self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
+            if proves:
+                if trust.displaced:
+                    self.since.moved()
+                self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
         if proves and frame.image is not None and not (moved or trust.may_have_slid):
             # A copy: learning can wait, and the caller may read the next image into the same memory.
             self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s

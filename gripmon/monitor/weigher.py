@@ -284,11 +284,12 @@ class Weigher:
             since, lasting = [told], [every]
         if differences is not None:
             anchored = None if displaced else fits.anchored
-            since.append(fits.wrong_at_first(self._lasting.name, prior, anchored))
+            at_first = self._lasting.priors(self._since.misread)
+            since.append(fits.wrong_at_first(self._lasting.name, at_first, cam_T_grip, anchored))
             lasting.append(every[1:])
         if not since:
             return doubts
-        staying = self._staying(now_s, knocks, displaced)
+        staying = self._staying(knocks, displaced)
         more = doubts_since(Cases.together(since), differences, np.concatenate(lasting), staying)
         return replace(doubts, since=doubts.since + more)
 
@@ -301,14 +302,12 @@ class Weigher:
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
 
-    def _staying(self, now_s: float, knocks: Knocks, displaced: bool) -> Array:
-        """(6, 6) covariance of the motion since the first proven frames that isn't excluded: of a mount that creeps and
+    def _staying(self, knocks: Knocks, displaced: bool) -> Array:
+        """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
         """
-        elapsed_s = 0.0 if self.anchor is None else now_s - self.anchor.began_s
-        covariance = np.diag(self._mount.creep(elapsed_s) + self.swing) + self._tracker.floor
-        knocked = displaced or (self.anchor is not None and self.anchor.knocked)
-        return covariance + knocks.spread if knocked else covariance
+        covariance = np.diag(self._mount.creep(self._since.elapsed_s) + self.swing) + self._tracker.floor
+        return covariance + knocks.spread if displaced or self._since.knocked else covariance
 
     def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the

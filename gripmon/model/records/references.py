@@ -75,6 +75,10 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     since_ns: Annotated[
         int, Meta(description="stamp of the newest of its own frames, or of the first proved one, Unix ns")
     ]
+    misread: Annotated[
+        float, Meta(description="probability that what looked like the fingers' ends in all of them was something else")
+    ]
+    knocked: Annotated[bool, Meta(description="whether the mount was knocked later on")]
 
 
 class MonitorState(msgspec.Struct, frozen=True):

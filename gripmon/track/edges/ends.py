@@ -163,10 +163,9 @@ class FingerEnds:
         """How many of each finger's ends are seen; takes a quarter of a measurement's time."""
         fingers = len(self._gripper.finger_ids)
         places, strictly, past = self._at_places(image, measurement)
-        in_view = self.in_view(measurement.prediction)
-        return FingerEndsSeen(
-            *(np.bincount(self.finger[each], minlength=fingers) for each in (places, in_view, strictly)), past
-        )
+        asked = places, self.in_view(measurement.prediction), strictly
+        seen, might, strictly = (np.bincount(self.finger[each], minlength=fingers) for each in asked)
+        return FingerEndsSeen(seen, might, strictly, past)
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
         """(s,) the places that might be seen as ends in this view."""
