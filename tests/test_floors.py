@@ -201,6 +201,14 @@ def test_help_imports_nothing_heavy(arguments: list[str]):
     assert "gripmon" in done.stdout
 
 
+def test_a_monitor_starts_without_what_others_need():
+    """Recorder, replay, analysis and calibration import these: half a second of a daemon's start without need."""
+    needless = ("rerun", "pyarrow", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.spatial")
+    code = f"import sys, gripmon.daemon.starting; print(sorted(set({needless!r}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
 def test_package_list_matches_the_tree():
     """``packages`` in pyproject.toml is written by hand; a forgotten one would be missing from the wheel."""
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
