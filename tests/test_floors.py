@@ -201,10 +201,19 @@ def test_help_imports_nothing_heavy(arguments: list[str]):
     assert "gripmon" in done.stdout
 
 
-def test_a_monitor_starts_without_what_others_need():
-    """Recorder, replay, analysis and calibration import these: half a second of a daemon's start without need."""
-    needless = ("rerun", "pyarrow", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.spatial")
-    code = f"import sys, gripmon.daemon.starting; print(sorted(set({needless!r}) & set(sys.modules)))"
+@pytest.mark.parametrize(
+    ("module", "needless"),
+    [
+        (
+            "gripmon.daemon.starting",
+            ("rerun", "pyarrow", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.spatial"),
+        ),
+        ("gripmon.record.worker", ("numba", "scipy", "zenoh", "gripmon.track", "gripmon.judge")),
+    ],
+)
+def test_processes_of_a_monitor_start_without_what_others_need(module: str, needless: tuple[str, ...]):
+    """Half a second of each start of the monitor, as much of its recorder's."""
+    code = f"import sys, {module}; print(sorted(set({needless!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.strip() == "[]"
 
