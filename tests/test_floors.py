@@ -201,6 +201,23 @@ def test_help_imports_nothing_heavy(arguments: list[str]):
     assert "gripmon" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("module", "needless"),
+    [
+        (
+            "gripmon.daemon.starting",
+            ("rerun", "pyarrow", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.spatial"),
+        ),
+        ("gripmon.record.worker", ("numba", "scipy", "zenoh", "gripmon.track", "gripmon.judge")),
+    ],
+)
+def test_processes_of_a_monitor_start_without_what_others_need(module: str, needless: tuple[str, ...]):
+    """Half a second of each start of the monitor, as much of its recorder's."""
+    code = f"import sys, {module}; print(sorted(set({needless!r}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
 def test_package_list_matches_the_tree():
     """``packages`` in pyproject.toml is written by hand; a forgotten one would be missing from the wheel."""
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])

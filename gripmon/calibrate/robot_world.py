@@ -21,8 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from gripmon.calibrate.sighting import CalibrationError
@@ -101,6 +99,8 @@ def rotations(cam_R_target: Array, base_R_ee: Array) -> tuple[Array, Array]:
     vectors of ``sum Q(a)ᵀ W(b)`` with the largest singular value.  A quaternion and its negative are the same rotation:
     signs are chosen by motions from the first pose, which have the same angle on both sides.
     """
+    from scipy.spatial.transform import Rotation
+
     a = Rotation.from_matrix(cam_R_target).as_quat()
     b = Rotation.from_matrix(base_R_ee).as_quat()
     # Scalar part of q q_first⁻¹: the quaternions' inner product.
@@ -180,6 +180,8 @@ def refine(
 
 def residuals(cam_T_target: Array, base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
     """(n, 6): measured against predicted ``cam_T_target``, position and rotation, camera axes."""
+    from scipy.spatial.transform import Rotation
+
     predicted = cam_T_base @ base_T_ee @ ee_T_target
     out = np.empty((len(predicted), 6))
     out[:, :3] = cam_T_target[:, :3, 3] - predicted[:, :3, 3]
@@ -233,6 +235,8 @@ def arm_sigmas(
     derivatives by the k unknowns, ``values`` (n, 6) the residuals, weighted per pose by ``weights`` (n,).  Starts at
     the values ``before``, if given.
     """
+    from scipy.optimize import minimize
+
     scaled = rows / np.linalg.norm(rows.reshape(-1, rows.shape[2]), axis=0)
 
     def unlikely(log_sigmas: Array) -> float:

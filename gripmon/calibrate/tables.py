@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
-from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.formats import as_number, read_mapping
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
@@ -305,6 +304,8 @@ def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "
     effect of the camera's own independent errors (6, k).  :class:`~gripmon.model.targets.TargetError` for a target
     without a unique orientation, :class:`CalibrationError` for an image that doesn't show it.
     """
+    from gripmon.calibrate.detection import detect, upright  # which takes longer to import than a table to read
+
     if not tells_its_turn(target):
         raise TargetError(
             f"{name_of(target)}: an image of it doesn't tell which way up it is, so any pose may be turned by half; a "

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -18,15 +19,13 @@ from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.errors import InputError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
-from gripmon.record.compared import ComparedRecorder
 from gripmon.record.keeping import keep_whole
 from gripmon.record.read import RecordedFrames, recording_files
-from gripmon.record.recorder import Recorder, make_scene
+from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, make_scene
 from gripmon.record.write import open_recorder
 
-RECORDING_PATIENCE_S = 30.0
-"""How long a source that can wait, and is read faster than any camera, waits for the recording before a frame is
-dropped (s)."""
+if TYPE_CHECKING:
+    from gripmon.record.compared import ComparedRecorder
 
 
 class RecordedRun:
@@ -77,6 +76,8 @@ class RecordedRun:
 
         Raises :class:`InputError` if ``path`` can't be written, :class:`NoResultError` if writing fails later.
         """
+        from gripmon.record.compared import ComparedRecorder  # with rerun, which a live monitor's process does without
+
         config, reference = self.config, self.config.reference
         if path.resolve() in {source.resolve() for source in self.source.paths}:
             raise InputError(f"{path}: is the replayed file; another file", "recording")

@@ -21,7 +21,6 @@ from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.network import open_network, with_source
-from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
 from gripmon.daemon.running import run, run_second
 from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Source
@@ -31,7 +30,7 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
 from gripmon.monitor import warm_up
-from gripmon.record.recorder import Recorder, ViewSettings
+from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, ViewSettings
 from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, has_display, is_free
 from gripmon.record.write import open_recorder
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from gripmon.judge.policy.alerts import RANK
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity
@@ -56,7 +55,7 @@ class Trigger:
         self._rank: dict[str, int] = {}
 
     def by(self, alert: Alert | AlertRecord) -> bool:
-        rank = RANK[alert.severity]
+        rank = alert.severity.rank
         if alert.event is AlertEvent.CLEARED:
             self._rank.pop(alert.alert_id, None)
             return False

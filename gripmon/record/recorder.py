@@ -37,6 +37,10 @@ from gripmon.model.records import (
 
 LOOPBACK = "127.0.0.1"
 
+RECORDING_PATIENCE_S = 30.0
+"""How long a source that can wait, and is read faster than any camera, waits for the recording before a frame is
+dropped (s)."""
+
 Trace = Callable[[], MeasurementTrace | None]
 Notes = Callable[[], MonitorNotes]
 

@@ -21,12 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gripmon.laser.refinement import Refined
 from gripmon.laser.setup import LaserCalibration, LaserSetup, laser_lines, setup_of, spots_on_plane
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
@@ -47,6 +47,9 @@ from gripmon.record.columns import (
     two_columns,
 )
 from gripmon.record.recorder import Events, Scene
+
+if TYPE_CHECKING:
+    from gripmon.laser.refinement import Refined
 
 IMAGE = "base/camera/image"
 _USED, _LEFT_OUT, _BEAM, _PLANE = (40, 120, 230, 255), (230, 60, 60, 255), (235, 90, 90, 255), (90, 180, 120, 90)

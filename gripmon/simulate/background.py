@@ -149,7 +149,7 @@ class TableView:
             for dy in (-size, 0, size):
                 corners = np.round((hull * self._px_per_m + (dx, dy)) * 16).astype(np.int32)
                 cv2.fillPoly(mask, [corners], 255, cv2.LINE_AA, 4)
-        u, v, w, h = cv2.boundingRect(cv2.findNonZero(mask))
+        u, v, w, h = cv2.boundingRect(mask)
         window = self._tile[v : v + h, u : u + w]
         shade = 1.0 - 0.5 * cv2.GaussianBlur(mask[v : v + h, u : u + w], (0, 0), 1.5).astype(np.float32) / 255.0
         window[:] = (window * shade).astype(np.uint8)

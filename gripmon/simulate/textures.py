@@ -23,6 +23,9 @@ Factor = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 Rng = np.random.Generator
 
+_SCRATCH_PX = 8
+"""Around a scratch: its blur of 0.6 px (sigma) reaches 3 px."""
+
 
 def even(height_px: int, width_px: int) -> Factor:
     """A uniform surface."""
@@ -42,9 +45,12 @@ def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: fl
         start = rng.uniform((0, 0), (width_px, height_px))
         turn = rng.uniform(0.0, 2.0 * math.pi)
         end = start + rng.uniform(1.0, 6.0) * mm * np.array([math.cos(turn), math.sin(turn)])
-        line = np.zeros_like(out)
-        cv2.line(line, _fixed(start), _fixed(end), 1.0, 1, cv2.LINE_8, 4)
-        out += strength * float(rng.choice([-1.2, 1.0, 1.8])) * cv2.GaussianBlur(line, (0, 0), 0.6)
+        low, high = np.minimum(start, end).astype(int) - _SCRATCH_PX, np.maximum(start, end).astype(int) + _SCRATCH_PX
+        low = np.maximum(low, 0)
+        around = out[low[1] : high[1], low[0] : high[0]]
+        line = np.zeros_like(around)
+        cv2.line(line, _fixed(start - low), _fixed(end - low), 1.0, 1, cv2.LINE_8, 4)
+        around += strength * float(rng.choice([-1.2, 1.0, 1.8])) * cv2.GaussianBlur(line, (0, 0), 0.6)
     fall_off = np.linspace(0.5, -0.5, width_px, dtype=np.float32)
     return np.maximum(out + 0.8 * strength * fall_off, 0.2).astype(np.float32)
 
@@ -130,10 +136,10 @@ def _tile_noise(rng: Rng, size_px: int, sigma_px: float) -> Factor:
 
 def _chequer(rng: Rng, size_px: int, px_per_m: float) -> Factor:
     squares = max(2 * round(size_px / px_per_m / (2.0 * 0.035)), 2)
-    index = (np.arange(size_px) * squares) // size_px
-    board = (index[:, None] + index[None, :]) % 2
+    odd = (np.arange(size_px) * squares) // size_px % 2
+    rows = (np.array([odd, 1 - odd]) * 1.3 - 0.65).astype(np.float32)
     wear = _tile_noise(rng, size_px, 8e-3 * px_per_m)
-    return cv2.GaussianBlur((board * 1.3 - 0.65).astype(np.float32), (0, 0), 0.6) + 0.1 * wear
+    return cv2.GaussianBlur(rows[odd], (0, 0), 0.6) + 0.1 * wear
 
 
 def _discs(rng: Rng, size_px: int, px_per_m: float) -> Factor:

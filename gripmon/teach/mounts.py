@@ -13,7 +13,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gripmon.judge.drift import foresee
 from gripmon.judge.recalibrate import refusal
@@ -56,12 +55,16 @@ class Mount(NamedTuple):
         if math.sin(tilt) < 1e-6:
             side, roll = 0.0, math.atan2(rotation[1, 0], rotation[0, 0])
         else:
+            from scipy.spatial.transform import Rotation
+
             roll, tilt, turn = Rotation.from_matrix(rotation).as_euler("ZXZ")
             side = -turn
         return cls(float(np.linalg.norm(cam_T_grip[:3, 3])), float(tilt), float(side), float(roll))
 
     def cam_T_grip(self, towards: Array) -> Array:
         """The pose (4, 4) with the TCP in the direction ``towards`` (3,) of the camera frame."""
+        from scipy.spatial.transform import Rotation
+
         rotation = Rotation.from_euler("ZXZ", [self.roll_rad, self.tilt_rad, -self.side_rad]).as_matrix()
         return make_transform(rotation, self.distance_m * towards / np.linalg.norm(towards))
 

@@ -124,7 +124,7 @@ def _samples(gripper: Gripper, layout: EdgeLayout, points_grip_m: Array) -> tupl
 _LEVI_CIVITA = np.zeros((3, 3, 3))
 _LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _LEVI_CIVITA[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
-_WITHOUT = ([1, 2], [0, 2], [0, 1])
+_WITHOUT = np.array([[1, 2], [0, 2], [0, 1]])
 
 
 def behind_another_finger(
@@ -135,35 +135,33 @@ def behind_another_finger(
     eye hide all that the others do.  Without faces nothing counts as hidden.
     """
     hidden = np.zeros(len(targets_m), dtype=bool)
+    if not gripper.faces:
+        return hidden
+    loops = points_grip_m[gripper.face_loops]
+    spokes = loops[:, 1:] - loops[:, :1]
+    normals = np.einsum("ijk,fnj,fnk->fi", _LEVI_CIVITA, spokes[:, :-1], spokes[:, 1:])  # outwards, twice the area long
+    heights = np.einsum("fi,fi->f", eye_grip_m - loops[:, 0], normals)
+    front = np.flatnonzero(heights > 0.0)
+    loops, normals = loops[front], normals[front]
     rays = targets_m - eye_grip_m
     length_m = np.sqrt(np.einsum("ni,ni->n", rays, rays))
-    for face in gripper.faces:
-        other = (finger != face.finger) & ~hidden
-        if not other.any():
-            continue
-        loop = points_grip_m[face.points]
-        spokes = loop[1:] - loop[0]
-        normal = np.einsum("ijk,nj,nk->i", _LEVI_CIVITA, spokes[:-1], spokes[1:])  # outwards, twice the area long
-        height = float((eye_grip_m - loop[0]) @ normal)
-        if height <= 0.0:
-            continue
-        towards = -(rays @ normal)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = height / towards
-            crosses = other & (share > 0.0) & ((1.0 - share) * length_m > TOUCHING_M)
-        which = np.flatnonzero(crosses)
-        if not len(which):
-            continue
-        hits = eye_grip_m + share[which, None] * rays[which]
-        hidden[which] = _in_polygon(hits, loop, int(np.abs(normal).argmax()))
+    others = finger[:, None] != gripper.face_finger[front]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = heights[front] / -(rays @ normals.T)
+        target, face = np.nonzero(others & (share > 0.0) & ((1.0 - share) * length_m[:, None] > TOUCHING_M))
+    hits = eye_grip_m + share[target, face, None] * rays[target]
+    inside = _in_polygons(hits, loops[face], np.abs(normals).argmax(axis=1)[face])
+    hidden[target[inside]] = True
     return hidden
 
 
-def _in_polygon(points: Array, loop: Array, drop: int) -> NDArray[np.bool_]:
-    """Mask (n,) of points (n, 3) inside of a planar loop in their plane (even-odd rule), seen along axis ``drop``."""
-    x, y = points[:, _WITHOUT[drop]].T[:, :, None]
-    ax, ay = loop[:, _WITHOUT[drop]].T
-    bx, by = np.append(ax[1:], ax[0]), np.append(ay[1:], ay[0])
+def _in_polygons(points: Array, loops: Array, drop: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Mask (n,) of points (n, 3) inside of their planar loops (n, k, 3) in these planes (even-odd rule), each seen
+    along its axis ``drop`` (n,).
+    """
+    x, y = np.take_along_axis(points, _WITHOUT[drop], axis=1).T[:, :, None]
+    ax, ay = np.moveaxis(np.take_along_axis(loops, _WITHOUT[drop][:, None], axis=2), 2, 0)
+    bx, by = np.roll(ax, -1, axis=1), np.roll(ay, -1, axis=1)
     spans = (ay > y) != (by > y)
     with np.errstate(divide="ignore", invalid="ignore"):
         left = x < ax + (y - ay) * (bx - ax) / (by - ay)
@@ -228,7 +226,9 @@ def border(rig: Rig, sight: LandmarkView) -> Border | None:
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
-    """How far the camera may shift and turn along each of its axes at a fixed jaw opening."""
+    """How far the camera may shift and turn along each of its axes at a fixed jaw opening, to 1/4000 of a step: some
+    micrometres.
+    """
     found = [_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for axis in np.eye(6) for sign in (-1.0, 1.0)]
     limits = np.reshape([amount for amount, _ in found], (6, 2))
     return Freedom(limits, tuple((found[k][1], found[k + 1][1]) for k in range(0, 12, 2)))
@@ -244,7 +244,7 @@ def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> floa
 
 
 def _limit(
-    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 24
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 12
 ) -> tuple[float, str | None]:
     """The amount of a motion along the unit vector ``axis`` (6,) after which the view doesn't suffice, and why; NaN if
     it always does.

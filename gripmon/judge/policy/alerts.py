@@ -12,8 +12,6 @@ import msgspec
 
 from gripmon.model.records import Alert, AlertEvent, Cause, OpenAlert, Severity
 
-RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
-
 
 @dataclass(frozen=True, slots=True)
 class _Open:
@@ -100,9 +98,9 @@ class AlertBook:
             event=AlertEvent.UPDATED,
             alert_id=known.alert_id,
             since_ns=known.since_ns,
-            acknowledged=known.acknowledged and RANK[alert.severity] <= RANK[known.severity],
+            acknowledged=known.acknowledged and alert.severity.rank <= known.severity.rank,
         )
-        worse = RANK[alert.severity] > RANK[known.severity]
+        worse = alert.severity.rank > known.severity.rank
         explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
         due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
         if worse or (due and (news or _differ(known, updated))):

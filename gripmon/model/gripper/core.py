@@ -78,6 +78,10 @@ class Gripper:
         self.notes: list[str] = []
         self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
         self._check_outwards()
+        longest = max((len(face.points) for face in self.faces), default=0)
+        padded = [np.pad(face.points, (0, longest - len(face.points)), mode="edge") for face in self.faces]
+        self.face_loops = np.array(padded, dtype=np.intp).reshape(len(self.faces), longest)
+        self.face_finger = np.array([face.finger for face in self.faces], dtype=np.intp)
         self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._point_faces = self._adjacency()
         self.landmarks = self._stand_for_the_tips()

@@ -12,11 +12,16 @@ from gripmon.model.records.values import OpenEnum
 
 
 class Severity(enum.StrEnum):
-    """How severe an alert is."""
+    """How severe an alert is, from the least to the most."""
 
     INFO = "info"
     WARNING = "warning"
     ERROR = "error"
+
+    @property
+    def rank(self) -> int:
+        """0 for the least."""
+        return tuple(Severity).index(self)
 
 
 class Cause(OpenEnum):

@@ -26,7 +26,7 @@ from gripmon.track.look.agreement import (
     LookAgreement,
     patch_evidence,
 )
-from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, lay_out
+from gripmon.track.look.layout import PATCH_SIDE_POINTS, POINTS, Layout, get_ready, lay_out
 
 FORGET_S = 4.0 * 3600.0
 """Time after which a frame counts 1/e, s: a shift of work; dirt and wear take hours, lamps and daylight minutes."""
@@ -84,6 +84,7 @@ class GripperLook:
 
     def __init__(self, camera: Camera, gripper: Gripper, axis_grip: Sequence[float] | Array = (0.0, 0.0, 1.0)):
         self._camera, self._gripper = camera, gripper
+        get_ready(gripper)
         axis = np.asarray(axis_grip, dtype=float)
         steps_m = np.array([sign * way for way in SLIDES_M for sign in (1.0, -1.0)])
         self._slides_grip_m = steps_m[:, None] * (axis / np.linalg.norm(axis))

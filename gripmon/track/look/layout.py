@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import QhullError
 
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
@@ -50,6 +49,12 @@ class Layout:
     points_grip_m: Array
     finger: NDArray[np.intp]
     guard: NDArray[np.bool_]
+
+
+def get_ready(gripper: Gripper) -> None:
+    """Import now what a finger without faces needs: at a frame it would take as long as dozens of frames."""
+    if {face.finger for face in gripper.faces} != set(range(len(gripper.finger_ids))):
+        importlib.import_module("scipy.interpolate")
 
 
 def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> Layout:
@@ -157,6 +162,9 @@ def _fill_between_edges(camera: Camera, ends_cam_m: Array, depth_m: Array) -> No
     along, uv_px = along[sound], uv_px[sound]
     if len(along) < PATCH_SIDE_POINTS:
         return
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import QhullError
+
     # One over the depth is linear in ideal coordinates on a plane.
     try:
         inverse = LinearNDInterpolator(along[:, :2] / along[:, 2:], 1.0 / along[:, 2])
