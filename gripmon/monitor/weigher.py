@@ -45,6 +45,7 @@ from gripmon.track.edges import (
     sides,
 )
 from gripmon.track.edges.roles import PARALLEL_COSINE
+from gripmon.track.edges.words import Words, in_words
 from gripmon.track.integrity import Hypotheses, Knocks, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
@@ -140,7 +141,8 @@ class Weigher:
         self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
-        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
+        self._words = in_words(gripper, from_record(reference.cam_T_grip))
+        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open, self._words))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
         self._newest: tuple[Measurement, float, Refits] | None = None
         self._swing: Array = np.zeros(6)
@@ -501,7 +503,7 @@ class Weigher:
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
-            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open)
+            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open, self._words)
             self._kept[key] = hypotheses, self._lasting.rows(hypotheses, edges)
         return self._kept[key]
 
@@ -526,9 +528,11 @@ def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
     return bool(np.abs(off_px @ np.linalg.svd(off_px, full_matrices=False)[2][-1]).max() < ONE_EDGE_PX)
 
 
-def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
-    names = tuple(gripper.edge_ids[edge] for edge in edges)
-    of_each = gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], inner_edges(gripper)[edges]
+def _hypotheses_about(
+    edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool, words: Words
+) -> Hypotheses:
+    names = tuple(words.edges[edge] for edge in edges)
+    of_each = gripper.edge_finger[edges], words.fingers, tracker.along[edges], inner_edges(gripper)[edges]
     return hypotheses_of(names, *of_each, may_open, tuple(side[edges] for side in sides(gripper)))
 
 
@@ -545,9 +549,9 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     if not len(measurement.normal.edge):
         unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
         return Bounds(unbounded, unbounded)
-    hypotheses = _hypotheses_about(
-        measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
-    )
+    may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0
+    words = in_words(gripper, measurement.prediction.cam_T_grip)
+    hypotheses = _hypotheses_about(measurement.normal.edge, gripper, tracker, may_open, words)
     model = _model_error(tracker, gripper)
     nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
