@@ -25,8 +25,8 @@ from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 from gripmon.teach.inset import INSET_SIGMA_M
-from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
-from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
+from gripmon.teach.views import SampledEdge, TeachingRefused, View, Viewer
 from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
@@ -254,11 +254,6 @@ TAUGHT_SHARE = 0.5
 LOST_SHARE = 0.25
 """Part below which the gripper, or a finger, counts as absent."""
 
-AGREEING_PX = 0.5
-"""Largest median distance of an image's edges from where all images show them; above it something has moved."""
-
-_FEWEST_SHARED = 4
-
 
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
     """Refuse if too little of the gripper, or of one finger, is seen."""
@@ -275,36 +270,6 @@ def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
         own = viewer.gripper.edge_finger == finger
         if profiles[own].sum() and seen[own].sum() < LOST_SHARE * profiles[own].sum():
             raise TeachingRefused(f"finger {name} isn't seen; images in focus, all fingers free")
-
-
-def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
-    """Refuse the image whose gripper is farthest from where the others show it: most of its ``edges``, each searched
-    for in every image separately, are then displaced.  A few displaced edges are clutter, or bevels in front of another
-    background.
-    """
-    if len(views) < 2:
-        return
-    places_px = np.full((len(views), len(edges)), np.nan)
-    for number, view in enumerate(views):
-        for k, edge in enumerate(edges):
-            seen = sampled([view], edge)
-            line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
-            if line is not None:
-                places_px[number, k] = line.ends_px.mean()
-    # Use edges that most images show.
-    places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
-    enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
-    if not enough.any():
-        return
-    off_px = np.zeros(len(views))
-    off_px[enough] = np.nanmedian(np.abs(places_px[enough] - np.nanmedian(places_px, axis=0)), axis=1)
-    worst = int(off_px.argmax())
-    if off_px[worst] > AGREEING_PX:
-        raise ImageRefused(
-            views[worst].image,
-            f"the gripper appears {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
-            "px: images without motion of the camera, each with its own jaw opening",
-        )
 
 
 def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> tuple[PoseOffset, str | None]:

@@ -28,11 +28,11 @@ from gripmon.teach.estimate import (
     check_edges,
     check_enough,
     check_reference,
-    check_standing,
     estimate_edges,
     found_off,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
+from gripmon.teach.play import with_play
 from gripmon.teach.views import (
     REMEDIES,
     ImageRefused,
@@ -97,7 +97,7 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
             viewer = Viewer(rig, reference, used)
             return replace(_teach_or_locate(viewer, used, list(fits.values())), left_out=left_out)
         except ImageRefused as refused:
-            number = next(n for n in fits if images[n] is refused.image)
+            number = next(n for n in fits if images[n].image is refused.image.image)
             if 2 * (len(fits) - 1) <= len(images):
                 raise _with_reasons(refused, left_out) from None
             del fits[number]
@@ -116,7 +116,7 @@ def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> Teac
 def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
     """Teach from these images; if that fails, an image that shows the gripper displaced is the more likely reason."""
     try:
-        return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
+        return _teach(viewer, images, fits)
     except ImageRefused:
         raise
     except TeachingRefused:
@@ -147,10 +147,13 @@ def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
     )
 
 
-def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
-    gripper, images = viewer.gripper, [view.image for view in views]
+def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
+    gripper = viewer.gripper
+    views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
+    images = with_play(viewer, views)
+    if any(image.play is not None for image in images):
+        views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
     lines, untaught = _lines(viewer, views, search=True)
-    check_standing(views, list(lines))
     check_enough(viewer, views, lines)
     offset, doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
@@ -212,12 +215,12 @@ def _lines_of(seen: SampledEdge, images: int, search: bool) -> EdgeLines | str:
 
 
 def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
-    """Largest distance (px) of the gripper from the reference in images measured with what they taught."""
+    """Largest distance (px) of the gripper from where it stands in images measured with what they taught."""
     worst_px, refused_px = 0.0, 0.0
     refused: ImageRefused | None = None
     for image in images:
         found = viewer.measured(image, arrays)
-        xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
+        xi = perturbation_between(found.cam_T_grip, viewer.stands(image))
         away_px = found.prediction.moved_px(xi) if found.trusted else math.inf
         explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE_SQUARE
         worst_px = max(worst_px, away_px)
