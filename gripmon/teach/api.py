@@ -223,7 +223,9 @@ def taught_model(
         ),
         camera=lens,
         gripper=model,
-        reference=msgspec.structs.replace(stated_reference, offset=taught.reference_offset),
+        reference=msgspec.structs.replace(
+            stated_reference, offset=taught.reference_offset, images_covariance=taught.reference_covariance
+        ),
         edge_settings=settings.corners.edges,
         edges=taught.edges,
         corners=taught.corners,
@@ -235,6 +237,8 @@ _HEADER = """\
 # It belongs to exactly this camera, gripper file, reference and edge settings, and is refused with any others.
 #   reference.offset    how far off the reference the gripper appeared in the images, as far as bevels don't explain it:
 #                       along and about the camera's axes (m, rad); every bound includes it
+#   reference.images_covariance  how well the images show where the gripper was, 6 x 6 row by row; with the covariance
+#                       of the configured reference it is what absolute bounds include of the reference's error
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
 #                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from gripmon.model.records import Array
 from gripmon.teach.inset import INSET_SIGMA_M
 from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
 from gripmon.teach.views import SampledEdge, TeachingRefused, View, Viewer
+from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
@@ -272,12 +274,22 @@ def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
             raise TeachingRefused(f"finger {name} isn't seen; images in focus, all fingers free")
 
 
-def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> tuple[PoseOffset, str | None]:
+class ReferenceSeen(NamedTuple):
+    """Where the images show the gripper: its ``offset`` (6,) from the reference, which bounds have to include, with the
+    ``covariance`` (36,) of where the images alone show it, sharp edges but for plausible bevels, a file exact but for
+    its fingers' lengths; ``doubt``: a text if the offset is above a pixel.
+    """
+
+    offset: PoseOffset
+    covariance: tuple[float, ...]
+    doubt: str | None
+
+
+def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> ReferenceSeen:
     """Refuse a gripper whose pose or jaw opening differs by more than the stated standard deviations allow.
 
     Each is tested with the other one taken as stated, since both together can hardly be separated; the one that leaves
-    smaller own offsets to the edges is named first.  Returns the gripper's offset (6,) from the reference, which bounds
-    have to include, and a text if it is above a pixel.
+    smaller own offsets to the edges is named first.
     """
     stated = viewer.prior_covariance
     free_jaw = stated.copy()
@@ -310,13 +322,17 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         turn = np.zeros(3)  # a turn within its noise says nothing of the reference
     x, y, z, about_x, about_y, about_z = (round(v, 9) for v in (*pose[:3].tolist(), *turn.tolist()))
     offset = (x, y, z, about_x, about_y, about_z)
+    longer = np.zeros(6)
+    longer[:3] = viewer.rig.settings.model_sigma_m * viewer.ref_cam_T_grip[:3, :3] @ along_fingers(viewer.gripper)[0]
+    shown = tuple(float(f"{v:.6e}") for v in (covariance + np.outer(longer, longer)).ravel().tolist())
     if away_px <= NOTED_PX:
-        return offset, None
-    return offset, (
+        return ReferenceSeen(offset, shown, None)
+    doubt = (
         f"the gripper appears up to {away_px:.1f} px off the reference, {viewer.distance(pose)}, and every bound is "
         f"larger by as much: calibrate again, or take the measured pose with its standard deviations as "
         f"{viewer.pose(pose, covariance)}"
     )
+    return ReferenceSeen(offset, shown, doubt)
 
 
 def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:

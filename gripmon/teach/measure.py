@@ -62,9 +62,10 @@ passes only if that measurement's covariance explains it."""
 class Taught:
     """What was learnt.  ``untaught``: for each other edge in view the reason; ``notes``: what a person should know.
 
-    ``closure_px``: largest distance of the gripper from the reference when the images are measured with what was
+    ``closure_px``: largest distance of the gripper from where it stands when the images are measured with what was
     taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
-    bevels don't explain it.  ``left_out``: the images that contradict the others, by their numbers, and why.
+    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``left_out``: the
+    images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -73,6 +74,7 @@ class Taught:
     notes: tuple[str, ...]
     closure_px: float
     reference_offset: PoseOffset
+    reference_covariance: tuple[float, ...]
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -155,9 +157,9 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
         views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
     lines, untaught = _lines(viewer, views, search=True)
     check_enough(viewer, views, lines)
-    offset, doubt = check_reference(viewer, images[0].name, lines)
+    reference = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
-    notes = _notes(viewer, lines, len(images), doubt)
+    notes = _notes(viewer, lines, len(images), reference.doubt)
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
     # Repeat with the search lines centred on the real edges.
@@ -173,7 +175,8 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
-        offset,
+        reference.offset,
+        reference.covariance,
         {},
     )
 
