@@ -142,6 +142,11 @@ def _kept_lines(teaching: Teaching) -> list[str]:
     before, after = teaching.kept()
     lines = [f"the monitor over these images: {before.text()}", f"     with what was taught: {after.text()}"]
     lines += [f"     {text}" for text in (after.why(), after.help()) if text]
+    if before.median_excess < after.median_excess:
+        lines.append(
+            "note: the bound is larger than without: an absolute one includes the reference's error now, and an edge "
+            "that moves with its background counts less"
+        )
     return lines
 
 
