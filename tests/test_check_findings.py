@@ -175,6 +175,24 @@ def test_images_of_a_colour_camera_are_a_warning_until_their_response_is_said(
         assert ("response: srgb" in capsys.readouterr().err) == (level == "WARN")
 
 
+def test_openings_that_come_with_the_images_and_are_not_used_are_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["simulate", "creep", "--out", str(tmp_path / "s"), "--seconds", "0.3", "--fps", "10"]) == 0
+    config, table = tmp_path / "s" / "config.yaml", tmp_path / "s" / "timestamps.csv"
+    values = yaml.safe_load(config.read_text())
+    told_m = float(table.read_text().splitlines()[1].split(",")[2])
+    for jaw, level in (
+        ({"source": "frames"}, "OK"),
+        ({"source": "fixed", "opening_m": told_m}, "OK"),
+        ({"source": "fixed", "opening_m": told_m + 0.001}, "WARN"),
+    ):
+        config.write_text(yaml.safe_dump(values | {"jaw": jaw}))
+        capsys.readouterr()
+        _, found = checked(config, capsys)
+        assert found["source"][0] == level and ("jaw.source: frames" in found["source"][1]) == (level == "WARN")
+
+
 def test_corners_of_which_none_can_be_measured_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """As the four of a chamfered tip's front face, whose edges are a few pixels long: here it is their angle."""
     for angle_rad, level in ((0.2, "OK"), (1.5, "WARN")):

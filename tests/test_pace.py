@@ -32,6 +32,10 @@ def test_the_fastest_pace_with_a_margin_is_chosen(possible_hz: float, fps: float
     assert ("too few for a live camera" not in chosen.text()) == live
 
 
+def test_a_machine_that_renders_hardly_anything_is_not_said_to_render_nothing():
+    assert "renders and processes less than 1 frames/s, too few" in pace.pace_for(0.4).text()
+
+
 @dataclasses.dataclass
 class Slow:
     """Frames that take a while each, without load."""

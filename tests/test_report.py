@@ -147,6 +147,13 @@ def test_the_error_of_a_configured_calibration_is_no_motion():
     assert only(Run(records(off_m))).affected
 
 
+def test_a_displaced_camera_of_which_no_motion_was_reported_is_not_said_to_stand():
+    """As from the first frame on, or after a knock that the frames show but none of them proves."""
+    summary = only(Run(records(np.tile([0.0, 3e-3, 0.0], (300, 1))))).summary
+    assert "No motion of the camera of arm / wrist was reported" in summary and "did not move" not in summary
+    assert "It is displaced: when last measured" in summary and "3 mm" in summary
+
+
 def test_before_a_motion_nothing_is_affected_by_what_a_frame_cannot_tell():
     """A shift past the limit along an axis that frames know less well than that; then a knock."""
     run = stepped()

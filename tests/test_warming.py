@@ -202,3 +202,34 @@ def test_several_starts_at_once_compile_once_and_share_it(tmp_path: Path):
     assert len(first) == 1
     for text in set(texts) - set(first):
         assert int(text.rpartition("misses")[2]) <= 1
+
+
+KNOCKED = """
+import sys
+from gripmon.daemon.config import builtin_config, load_config
+from gripmon.model.geometry import from_record
+from gripmon.monitor import Monitor, warm_up
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Bump
+
+def compiled():
+    rooms = [room for name, room in sys.modules.items() if name.startswith("gripmon.")]
+    return {f: len(f.signatures) for room in rooms for f in vars(room).values() if hasattr(f, "nopython_signatures")}
+
+config = load_config(builtin_config("demo.yaml"), check_source=False)
+scenario = Scenario(name="knock", duration_s=1.0, fps=60.0, mount=(Bump(at_s=0.25, translation_m=(0.0, 1e-3, 2e-3)),))
+simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)
+frames = [simulator.frame(k) for k in range(30)]
+warm_up()
+before = compiled()
+monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
+for frame in frames:
+    monitor.process(frame)
+print(sorted(f"{f.py_func.__module__}.{f.py_func.__name__}" for f, n in compiled().items() if n != before.get(f, 0)))
+"""
+
+
+def test_after_a_start_no_frame_compiles():
+    """Neither the first frames nor a knock and what follows it, in a process that has compiled nothing else."""
+    done = subprocess.run([sys.executable, "-c", KNOCKED], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["[]"]), done.stdout + done.stderr

@@ -99,6 +99,8 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
     if not motions:
         if report.last_measured_ns is None:
             return f"Whether t{who} moved isn't known: in no frame ({when}) could it be measured."
+        if any(a.what == "old_calibration" for a in report.affected):
+            return f"No motion of t{who} was reported ({when}), yet it was not always where its calibration has it."
         return f"T{who} did not move ({when}): no motion was reported in {span(report.start_ns, report.end_ns)}."
     shown = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MAX_SHOWN]
     shown.sort(key=lambda e: e.onset.stamp_ns)
@@ -129,7 +131,8 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
         near = millimetres(off.size_m, off.sigma_m)
         return f"It has moved back: {measured}, the camera was where it began, to within {near}."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
-    text = f"It is still displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    still = "still " if motions else ""
+    text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     now = report.at_end_against_reference
     if len(report.references) < 2 or now is None:
         return f"{text}, and there is no new reference."

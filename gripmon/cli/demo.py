@@ -78,6 +78,7 @@ def demo(arguments: Arguments) -> int:
         if compiled := warm_up():
             print(compiled, file=sys.stderr)
         if arguments.fps is None:
+            print("trying for some seconds how fast this machine is …", file=sys.stderr)
             config, pace = at_own_pace(config)
             print(pace.text(), file=sys.stderr)
         demo = Demo(config)

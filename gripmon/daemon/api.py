@@ -94,6 +94,10 @@ COLOURED_LEVELS = 1.0
 """Mean difference between the largest and the smallest channel of an 8-bit image's pixels, in grey levels, above which
 it is a colour image: a codec makes less of a grey one."""
 
+ROUNDED_OPENING_M = 1e-6
+"""By how much an opening in a table differs from the same one in a configuration at most, m: both are written with six
+digits."""
+
 
 def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
     """A description of the first recorded frame, and what is odd about it (None: nothing); None for a source that isn't
@@ -121,7 +125,10 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
         first, *more = unreadable
         others = f", nor can the next {len(more)}" if more else ""
         return detail, f"its first frame can't be read ({first}){others}"
-    return detail, None if isinstance(config, SecondConfig) else unlike_light(config, frame.image)
+    if isinstance(config, SecondConfig):
+        return detail, None
+    odd = [each for each in (unlike_light(config, frame.image), _unused_opening(config, frame)) if each]
+    return detail, "; ".join(odd) or None
 
 
 def unlike_light(config: Config, image: Image) -> str | None:
@@ -133,6 +140,17 @@ def unlike_light(config: Config, image: Image) -> str | None:
         return None
     known = "monitor.corners.edges.response: srgb, unless its gamma is 1"
     return f"grey levels of a colour camera mostly aren't in proportion to the light: {known}"
+
+
+def _unused_opening(config: Config, frame: Frame) -> str | None:
+    """Whether a recorded frame tells another jaw opening than the one that is taken to be fixed."""
+    fixed_m, told_m, settings = config.jaw_opening_m, frame.jaw_opening_m, config.settings
+    if settings.jaw.source != "fixed" or fixed_m is None or told_m is None:
+        return None
+    if abs(told_m - fixed_m) <= max(settings.monitor.jaw_sigma_m, ROUNDED_OPENING_M):
+        return None
+    told = f"its frames come with jaw openings, the first with {1e3 * told_m:g} mm"
+    return f"{told}, which jaw.source: fixed doesn't use: it takes them to be {1e3 * fixed_m:g} mm; jaw.source: frames"
 
 
 def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:

@@ -47,11 +47,6 @@ YOUNG_VARIANCE_RATIO = 0.2
 would gain little, given the least variance that an average may claim.
 """
 
-LEFT_WITH_BACKGROUND, ATTACHED_SHARE = 0.3, 1e-2
-"""Share of the things that were taken for an edge that still are before another background; and of those that always
-are, being attached to the gripper: a cable, a strip of tape.  Assumed, not measured.
-"""
-
 CONFIRMING_FRAMES = 5
 """Frames after a knock, besides the first, that need the full proof of the new place."""
 
@@ -319,14 +314,9 @@ class Lasting(NamedTuple):
     prior: Array
     doubted: tuple[frozenset[int], ...]
 
-    def priors(self, misread: float, backgrounds: Array) -> Array:
-        """(g,) after so many ``backgrounds`` (e,) before which each edge stood in its place: what isn't the gripper's
-        mostly leaves with its background, unless it is attached.
-        ``misread``: of all ends, as the clearest frame has it.
-        """
-        prior = np.append(self.prior[:-1], misread)
-        seen = np.array([max((backgrounds[e] for e in doubted if e >= 0), default=0.0) for doubted in self.doubted])
-        return np.asarray(prior * np.maximum(LEFT_WITH_BACKGROUND**seen, ATTACHED_SHARE))
+    def priors(self, misread: float) -> Array:
+        """(g,) with the probability ``misread`` that no end is what it seems, as the clearest frame has it."""
+        return np.append(self.prior[:-1], misread)
 
     @classmethod
     def of(cls, every: Hypotheses) -> Lasting:
@@ -431,7 +421,7 @@ class Anchor:
     def bound(self, risk: float) -> Protection:
         """The protection level of the average itself."""
         fits = _with_origin(self.fits(), self.cam_T_grip, self._origin, np.zeros(6))
-        prior = np.append(self._lasting.prior[:-1], self.misread)
+        prior = self._lasting.priors(self.misread)
         return protection_of(Doubts.of(self._lasting.name, prior, fits, SIGMA_INFLATION), risk)
 
     def doubts(
@@ -440,11 +430,10 @@ class Anchor:
         fits: Refits,
         rows: NDArray[np.intp],
         wander: Array,
-        backgrounds: Array,
         staying: Array,
     ) -> TwoDoubts:
         """The lasting hypotheses about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of them; ``wander`` (6,):
-        variance of the motion since the anchor; ``backgrounds`` (e,) before which each edge was seen.
+        variance of the motion since the anchor.
 
         Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
         What neither shows is known as it was at the origin.
@@ -454,7 +443,7 @@ class Anchor:
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander / SIGMA_INFLATION**2, frame, rows, CONTRADICTION_SQUARE)
         absolute = _with_origin(told, cam_T_grip, self._origin, wander / SIGMA_INFLATION**2)
-        prior = self._lasting.priors(self.misread, backgrounds)
+        prior = self._lasting.priors(self.misread)
         doubts = fits.model.doubts(self._lasting.name, prior, absolute, cam_T_grip, fits.opened)
         since = fits.model.since(
             self._lasting.name, prior, told, cam_T_grip, fits.opened, np.arange(len(prior)), staying

@@ -41,7 +41,6 @@ from gripmon.track.edges import (
     edges_at_ends,
     has_lone_end,
     inner_edges,
-    own_steps,
     sides,
 )
 from gripmon.track.edges.roles import PARALLEL_COSINE
@@ -75,39 +74,11 @@ occlusion, since the average rate of knocks is too low for both (docs/integrity.
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
-ANOTHER_STEP_RATIO = 0.25
-"""Change of an edge's step, over that of all edges in common, from which it stands before another background: assumed,
-and far above the noise of an edge of forty profiles.
-"""
-
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
 
 CORNERS_WHERE_EXPECTED = 3
 """Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers."""
-
-
-class Backgrounds:
-    """Before how many different backgrounds each edge of a gripper has stood in its place: ``seen`` (e,).
-
-    A background of another brightness changes the height of the edge's step; light changes those of all edges alike.
-    """
-
-    def __init__(self, edges: int):
-        self.seen: Array = np.zeros(edges)
-        self._step = np.full(edges, np.nan)
-
-    def add(self, edges: NDArray[np.intp], step: Array) -> None:
-        """Add a frame that shows ``edges`` (v,), each with its mean ``step`` (e,) in grey levels."""
-        before, now = self._step[edges], step[edges]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = now / before
-        known = np.isfinite(ratio)
-        if known.any():
-            ratio[known] /= np.median(ratio[known])
-        another = known & (np.abs(ratio - 1.0) > ANOTHER_STEP_RATIO)
-        self.seen[edges[another]] += 1.0
-        self._step[edges[another | ~known]] = now[another | ~known]
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
@@ -149,7 +120,6 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
-        self._backgrounds = Backgrounds(len(every))
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
@@ -257,9 +227,9 @@ class Weigher:
         staying = self._staying(now_s, knocks, displaced)
         if anchor is not None and not displaced:
             rows = self._about(edges)[1]
-            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, wander, self._backgrounds.seen, staying)
+            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, wander, staying)
         ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
-        at_first = self._lasting.priors(ever, self._backgrounds.seen)
+        at_first = self._lasting.priors(ever)
         alone = None if displaced else anchored
         doubts = fits.with_first(doubts, self._lasting, at_first, cam_T_grip, alone, staying)
         both = bounds_of(doubts, risk, left_out)
@@ -357,7 +327,6 @@ class Weigher:
         proven = trust.proven
         if self.proved and not proven:
             return
-        self._backgrounds.add(trust.fits.edges, own_steps(measurement))
         rows = self._about(trust.fits.edges)[1]
         if proven:
             self._slid = trust.may_have_slid

@@ -307,3 +307,10 @@ def _larger_sigma(lens: Any, cxx: float, cxy: float, cyy: float) -> float:
     uv = a * c * cxx + (a * d + b * c) * cxy + b * d * cyy
     vv = c * c * cxx + 2.0 * c * d * cxy + d * d * cyy
     return math.sqrt(0.5 * (uu + vv + math.hypot(uu - vv, 2.0 * uv)))
+
+
+def warm_up_joint() -> None:
+    """Compile what only :meth:`Corners.joint_covariance_xy` calls from Python."""
+    line = np.ones(5)
+    _normal(line, np.ones(4))
+    _covariance(line, 1.0, 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.evidence import agreeing_shares, edge_means
-from gripmon.track.edges.lines import CornerGeometry, intersect_edges
+from gripmon.track.edges.lines import CornerGeometry, intersect_edges, warm_up_joint
 from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction
 from gripmon.track.edges.profiles import (
     Candidates,
@@ -56,6 +56,7 @@ def warm_up_geometry() -> None:
         np.zeros(1, dtype=np.bool_), 0.0,
     )  # fmt: skip
     corners = intersect_edges(edgels, fitted, np.zeros(0), geometry, CornerSettings())
+    warm_up_joint()
     prediction.moved_px(fitted.xi)
     here, edge, points_m = prediction.cam_T_grip, prediction.layout.edge, prediction.corners.cam_m
     corner_rms(corners.xy, corners.usable, points_m, here, here, prediction.corners.d_uv_d_xy)

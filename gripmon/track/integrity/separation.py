@@ -176,6 +176,9 @@ def after_jumps(
     """The fits ``fit`` (r,) of a frame joined with the pose known before, once it has made the jumps ``jump`` (r,);
     ``of_model`` (f or 1, 6) as of the pose known before.
     """
+    fit, jump = map(
+        np.ascontiguousarray, (fit, jump)
+    )  # np.nonzero gives columns of one array, or copies of one element
     return Separation(*kernel.after_jumps(*frame, at, known, of_model, jumps, fit, jump))
 
 
@@ -275,9 +278,8 @@ def warm_up() -> None:
         fits = Sums.of_kept(*of).fits()
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
-    jumped(
-        fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0
-    )
-    after_jumps(fits, none, np.eye(6), fits.of_model[0], each[:, :6, :6], np.arange(2), np.arange(2))
+    jumps = np.ascontiguousarray(each[:, :6, :6])
+    jumped(fits, none, np.eye(6), fits.of_model[0], jumps, np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0)
+    after_jumps(fits, none, np.eye(6), fits.of_model[0], jumps, *np.nonzero(np.eye(2)))
     told = telling(averages, none, none, fits, np.arange(2), 1.0)
     Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)
