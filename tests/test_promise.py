@@ -205,7 +205,7 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(arguments) == 0
     first, *_ = capsys.readouterr().err.splitlines()
     assert first.startswith(
-        f"replay: {config}: no transform of this view can be valid: valid needs alert_limit_m of at "
+        f"replay: {config}: by the forecast no transform of this view can be valid: valid needs alert_limit_m of at "
     )
     lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert {line["verdict"] for line in lines} <= {"suspect", "unknown"} and all(line["reason"] for line in lines)

@@ -61,8 +61,8 @@ class Still(msgspec.Struct, frozen=True):
 
 class Part(msgspec.Struct, frozen=True):
     """Stills that were replayed in one run, the first ``uncounted`` of them to begin with; ``proposed_m``,
-    ``proposed_rad``: the limits that ``check`` proposes from the images that it has.  ``taught``: the half that was taught from, without those
-    ``left_out``; ``refused``: why nothing could be, and nothing was replayed.
+    ``proposed_rad``: the limits that ``check`` proposes from the images that it has.  ``taught``: the half that was
+    taught from, without those ``left_out``; ``refused``: why nothing could be, and nothing was replayed.
     """
 
     names: tuple[str, ...]
