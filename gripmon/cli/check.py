@@ -87,6 +87,7 @@ def check(arguments: Arguments) -> int:
     if not arguments.sweep:
         arguments.refuse(sweep.NAMES, "applies only to a sweep; add --sweep")
     if arguments.laser is not None:
+        arguments.refuse(("images", "picture"), "not with --laser, which has spots; leave it out")
         return _check_laser(arguments)
     if arguments.sweep:
         arguments.refuse(("images",), "not with --sweep, which forecasts; leave it out")
