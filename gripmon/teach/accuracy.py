@@ -274,7 +274,9 @@ class Promise:
         good = f"good to {in_mm(bound.position_m)} mm and {in_degrees(bound.rotation_rad)} degrees"
         limits = f"{1e3 * self.alert_limit_m:g} mm, {in_degrees(self.alert_limit_rad)} degrees"
         reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
-        promise = f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+        promise = (
+            f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+        )
         return f"forecast: {promise}"
 
 
