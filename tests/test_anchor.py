@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.refits import CONFIRMING_FRAMES, Anchor, Lasting, ModelError
+from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting
+from gripmon.monitor.bounds import ModelError
 from gripmon.monitor.since import Opened
 from gripmon.track.integrity import hypotheses_of
 
@@ -91,7 +92,7 @@ def averaged(frames: list[Frame], creep: np.ndarray = STILL) -> Anchor:
 
 
 def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray = STILL) -> float:
-    return anchor.doubts(frame.cam_T_grip, frame, ROWS, wander, np.zeros(len(NAMES)), np.eye(6)).absolute.levels(risk)[
+    return anchor.doubts(frame.cam_T_grip, frame, ROWS, wander, LASTING.priors(SURE), np.eye(6)).absolute.levels(risk)[
         0
     ]
 

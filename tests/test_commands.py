@@ -25,7 +25,7 @@ def test_every_command_arrives_once_and_its_answer_comes_back(session: zenoh.Ses
     [(is_reply, reply)] = answers(session, f"{CMD}/{name.value}", b'{"argument": "p-1"}')
     told = {"name": name.value, "done": True, "text": "heard 'p-1'", "reference_id": "plate-2", "revision": 7}
     told |= {"monitor": None, "snapshot": None, "durable": True, "monitor_id": ""}
-    assert is_reply and reply == told | {"schema": "gripmon.reply/1"}
+    assert is_reply and reply == told | {"schema": "gripmon.reply/2"}
     assert loop.heard == [Command(name, "p-1")]
 
 
@@ -198,7 +198,7 @@ def test_the_client_tells_a_stopping_monitor_from_a_refusal(publisher: Published
 def test_the_client_refuses_an_answer_of_another_major_version(endpoint: str, answer: str):
     with plain_session(listen=endpoint, mode="peer") as session:
         token = session.liveliness().declare_token("gripmon/arm/wrist/alive")
-        key, payload = f"{CMD}/undo", b'{"schema": "gripmon.reply/2", "error": "gone"}'
+        key, payload = f"{CMD}/undo", b'{"schema": "gripmon.reply/3", "error": "gone"}'
 
         def tell(query: zenoh.Query) -> None:
             first = (key,) if answer == "reply" else ()
@@ -209,7 +209,7 @@ def test_the_client_refuses_an_answer_of_another_major_version(endpoint: str, an
             client.send(CommandName.UNDO)
         queryable.undeclare()
         token.undeclare()
-    assert "arm/wrist has answered, but that can't be read: its schema is 'gripmon.reply/2'" in str(caught.value)
+    assert "arm/wrist has answered, but that can't be read: its schema is 'gripmon.reply/3'" in str(caught.value)
 
 
 @pytest.mark.parametrize("stamp_ns", [10**30, -(10**30)])

@@ -105,7 +105,12 @@ def test_a_truncated_jpeg_is_refused_and_the_next_one_is_good(serve: Serve):
         (MULTIPART, part(jpeg(90)) + part(jpeg(110))),
         (MULTIPART, part(jpeg(90), length=None) + part(jpeg(110), length=None)),
         ('multipart/x-mixed-replace; boundary="--frame"', part(jpeg(90)) + part(jpeg(110))),
+        ('multipart/x-mixed-replace; boundary="--frame"', part(jpeg(90), boundary=b"----frame") + part(jpeg(110))),
         ("multipart/x-mixed-replace", part(jpeg(90)) + part(jpeg(110))),
+        (
+            "multipart/x-mixed-replace; boundary=----frame",
+            part(jpeg(90), boundary=b"------frame") + part(jpeg(110), boundary=b"------frame"),
+        ),
         (MULTIPART, b"preamble\r\n" + part(jpeg(90)).replace(b"\r\n", b"\n", 4) + part(jpeg(110)) + b"--frame--"),
         ("image/jpeg", jpeg(90) + jpeg(110)),
         ("video/x-motion-jpeg", b"junk" + jpeg(90) + b"padding" + jpeg(110)),

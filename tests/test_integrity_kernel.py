@@ -74,9 +74,11 @@ def test_fits_are_those_of_numpy(m: int, seed: int):
     anchor = shifts(rng, 1)[0], covariances(rng, 1)[0]
     for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
         agree(kernel.with_pose(*sums, *anchor, off), by_numpy.with_pose(*sums, *anchor, off), 1.0 / SIZE)
-        one, other = (by.with_and_without(*of, *anchor, off, 1.44) for by in (kernel, by_numpy))
+        one, other = (by.with_and_without(*of, *anchor, off, 1.44, True) for by in (kernel, by_numpy))
         for found, expected in zip(one[:2], other[:2], strict=True):
             agree(found, expected)
+        alone, none, squares = kernel.with_and_without(*of, *anchor, off, 1.44, False)
+        assert all(map(np.array_equal, (*alone, squares), (*one[0], one[2]))) and not any(map(len, none))
         np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
 
 
@@ -85,6 +87,11 @@ def test_averages_are_those_of_numpy(seed: int):
     rng = np.random.default_rng(seed)
     average, frame, at, wander = fits(rng), fits(rng), shifts(rng, 1)[0], rng.uniform(size=6) * SIZE[:6] ** 2
     agree(kernel.follow(*average, *frame, wander), by_numpy.follow(*average, *frame, wander))
+    known = at, covariances(rng, 1)[0]
+    agree(kernel.with_known(*frame, *known), by_numpy.with_known(*frame, *known))
+    which, (lever, turn) = rng.integers(0, HYPOTHESES, HYPOTHESES), rng.normal(size=(2, 6, 6))
+    of = *frame, which, *average, lever * SIZE[:6, None] / SIZE[:6], turn * SIZE[:6, None] / SIZE[:6], known[1]
+    agree(kernel.of_motion(*of), by_numpy.of_motion(*of))
     rows = rng.integers(-1, HYPOTHESES, HYPOTHESES)
     told = by_numpy.telling(*average, at, wander, *frame, rows, 12.0)
     agree(kernel.telling(*average, at, wander, *frame, rows, 12.0), told)
@@ -167,7 +174,7 @@ def test_what_has_no_root_is_inverted_all_the_same():
     of = *average, none, none, *Separation(frame.shift, 1e3 * frame.covariance, frame.of_model), rows, 12.0
     agree(kernel.telling(*of), by_numpy.telling(*of))
     anchor = shifts(rng, 1)[0], -covariances(rng, 1)[0], of_the_model(rng, 1)[0]
-    of = *normal_equations(rng, 7), *anchor, 1.0
+    of = *normal_equations(rng, 7), *anchor, 1.0, True
     one, other = kernel.with_and_without(*of), by_numpy.with_and_without(*of)
     for found, expected in zip(one[:2], other[:2], strict=True):
         agree(found, expected)

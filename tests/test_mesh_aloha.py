@@ -20,15 +20,21 @@ from support.meters import difference
 
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, Camera, make_camera
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience, TaughtEdges
 from gripmon.track.edges.settings import EdgeSettings
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "mesh_aloha"
 GRIPPER = Path(__file__).parent / "support" / "aloha_from_cad.yaml"
 OPENING_M, JUMP, LAST = 0.055, 25, 32
+VALID_AGAIN = 5
+"""Frames after a knock in which taught fingers are valid again; 20 are demanded."""
 SETTINGS = MeasurementSettings(edges=EdgeSettings(response="srgb"))
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/mesh_aloha is not there")
@@ -72,6 +78,16 @@ def watched() -> dict[int, FrameRecord]:
     }
 
 
+def taught(gripper: Gripper, reference: ReferenceRecord, camera: Camera) -> TaughtEdges:
+    """From every third of the stills at the opening that is watched."""
+    images = [
+        TeachingImage(cv2.imread(str(DATA / "teach" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED), OPENING_M, str(k))
+        for k in range(0, 12, 3)
+    ]
+    found = teach(Rig(camera, gripper, MonitorSettings(corners=SETTINGS)), reference, images)
+    return TaughtEdges.of(found.edges, gripper, from_record(reference.cam_T_grip), gripper.jaw_nominal_m)
+
+
 def error_m(number: int) -> float:
     record = watched()[number]
     assert record.cam_T_grip is not None
@@ -89,6 +105,20 @@ def test_no_frame_is_beyond_its_bound():
         assert record.protection is not None
         assert error_m(number) < record.protection.position_m
         assert record.verdict is not Verdict.VALID or error_m(number) < 1e-3
+
+
+def test_narrow_taught_tips_are_valid_again_soon_after_a_knock():
+    """One end of each finger is all that this view has: too few to prove a place elsewhere but for the strips."""
+    camera, gripper, reference = rig()
+    monitor = Monitor(camera, gripper, MonitorSettings(corners=SETTINGS), reference, taught(gripper, reference, camera))
+    before = -1
+    for number in (*range(15, 20), *range(JUMP, JUMP + VALID_AGAIN + 1)):
+        record = monitor.process(Frame(number, 10**18 + number * 33_333_333, image(number), OPENING_M))
+        assert record.cam_T_grip is not None and record.protection is not None
+        off_m = np.linalg.norm(np.array(record.cam_T_grip.translation_m) - truth(number)[:3, 3])
+        assert off_m < record.protection.position_m
+        before = number if record.verdict is Verdict.VALID and number < JUMP else before
+    assert before == 19 and record.verdict is Verdict.VALID
 
 
 @pytest.mark.parametrize("number", [JUMP - 1, JUMP])

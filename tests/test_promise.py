@@ -212,26 +212,28 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize(
-    ("position_sigma_m", "policy", "said"),
+    ("sigmas", "policy", "said"),
     [
-        (None, "{}", "reference.position_sigma_m isn't stated, 1 mm are assumed, but transforms are valid by"),
+        ((None, 0.002), "{}", "reference.position_sigma_m isn't stated, 1 mm are assumed, but transforms are valid by"),
+        ((0.0002, None), "{}", "reference.rotation_sigma_rad isn't stated, 0.57 degrees are assumed, but transforms"),
         (
-            "0.002",
+            (0.002, 0.002),
             "{}",
             "alert_limit_m is 0.001, below the reference's own standard deviation of 0.002 m; at least",
         ),
-        ("0.002", "{valid_by: reference}", None),
-        (None, "{valid_by: reference}", None),
-        ("0.0002", "{}", None),
+        ((0.0002, 0.05), "{}", "alert_limit_rad is 0.035, below the reference's own standard deviation of 0.05 rad"),
+        ((0.002, 0.05), "{valid_by: reference}", None),
+        ((None, None), "{valid_by: reference}", None),
+        ((0.0002, 0.002), "{}", None),
     ],
 )
 def test_an_absolute_bound_says_in_a_line_if_the_reference_is_not_known_well_enough(
-    tmp_path: Path, position_sigma_m: str | None, policy: str, said: str | None
+    tmp_path: Path, sigmas: tuple[float | None, float | None], policy: str, said: str | None
 ):
     text = DEMO.read_text().replace("gripper: grippers/", f"gripper: {DEMO.parent}/grippers/")
-    sigma = r"\n  position_sigma_m: .*\n  rotation_sigma_rad: .*"
-    stated = "" if position_sigma_m is None else f"\n  position_sigma_m: {position_sigma_m}"
-    text, count = re.subn(sigma, stated, text)
+    stated = zip(("position_sigma_m", "rotation_sigma_rad"), sigmas, strict=True)
+    new = "".join(f"\n  {key}: {sigma}" for key, sigma in stated if sigma is not None)
+    text, count = re.subn(r"\n  position_sigma_m: .*\n  rotation_sigma_rad: .*", new, text)
     assert count == 1
     path = tmp_path / "config.yaml"
     path.write_text(text.replace("\nmonitor:\n", f"\nmonitor:\n  policy: {policy}\n"))

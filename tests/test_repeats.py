@@ -16,7 +16,7 @@ from support.watched import new_monitor, rendered
 from gripmon.judge import repeats
 from gripmon.judge.repeats import TEXT, TILE_PX, repeated_edges
 from gripmon.judge.stream import StreamSettings
-from gripmon.model.records import AlertKind, Cause, Frame, FrameRecord, Verdict
+from gripmon.model.records import AlertEvent, AlertKind, Cause, Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Background, Bump, Sensor
@@ -68,6 +68,18 @@ def test_rows_that_are_left_from_before_are_never_valid(knocked: bool, buffers: 
     raised = [alert for record in records[first:until] for alert in record.alerts if alert.kind is AlertKind.STREAM]
     assert [(alert.cause, alert.text) for alert in raised] == [(Cause.CAMERA_FROZEN, TEXT)]
     assert sum(record.verdict is Verdict.VALID for record in records[until:]) >= 10
+
+
+def test_once_nothing_is_measured_a_repetition_isnt_told_on():
+    """What an earlier frame repeated says nothing about those in which the gripper isn't seen."""
+    frames, _ = rendered(scene(6.0))
+    until = 50
+    noise = np.random.default_rng(0).integers(60, 120, frames[0].image.shape, dtype=np.uint8)
+    elsewhere = [replace(frame, image=np.roll(noise, k)) for k, frame in enumerate(frames[until:])]
+    records = watched(new_monitor(), [*with_old_rows(frames[:until], 30, 0.15, 1), *elsewhere])
+    assert all(record.source.value != "update" for record in records[until:])
+    stream = [alert for record in records for alert in record.alerts if alert.kind is AlertKind.STREAM]
+    assert [alert.event for alert in stream] == [AlertEvent.RAISED, AlertEvent.CLEARED]
 
 
 def h264(frames: Sequence[Frame], path: Path, key_frame_s: float) -> list[Frame]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -132,6 +133,18 @@ def test_the_true_place_is_seen_also_in_other_light_and_no_other_is():
     for lit, way_m, here in ((image, 0.0, True), (image // 2, 0.0, True), (image, 6e-4, False), (image, 3.3e-3, False)):
         seen = strips.compare(lit, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
         assert seen.here == here, way_m
+
+
+def test_the_true_place_is_seen_where_a_third_of_what_is_seen_is_something_else():
+    """Shading that changes with the pose, or dirt: alike by 0.86 and 0.75, and nothing along the fingers by as much."""
+    simulation, strips, image = lined()
+    truth = simulation.truth(LAST)
+    spots = cv2.GaussianBlur(np.random.default_rng(36).normal(0.0, 1.0, image.shape), (0, 0), 1.0)
+    for spots_dn in (4.0, 6.0):
+        dirty = np.clip(image + spots_dn * spots / spots.std(), 0.0, 255.0).astype(np.uint8)
+        for way_m, here in ((0.0, True), (6e-4, False), (-6e-4, False)):
+            seen = strips.compare(dirty, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+            assert seen.here == here, (spots_dn, way_m)
 
 
 def test_hidden_or_of_one_shade_they_are_seen_nowhere():

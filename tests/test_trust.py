@@ -33,9 +33,9 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
+from gripmon.monitor.ends import MISREAD_PROBABILITY
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
-from gripmon.monitor.weigher import MISREAD_PROBABILITY
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
@@ -340,7 +340,7 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
     for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
         ends, seen = FingerEndsSeen(np.array(corners), np.array([3, 3])), replace(measurement, normal=sides_and)
-        assert weigher._misread(seen, ends, None) == pytest.approx(MISREAD_PROBABILITY**times)
+        assert weigher._ends.misread(seen, ends) == pytest.approx(MISREAD_PROBABILITY**times)
         trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
         assert not (trust.proven or trust.displaced)
         assert (trust.bounds.absolute.position_m < limit_m) == (times > 1)
@@ -497,6 +497,27 @@ def test_three_corners_prove_a_pose_elsewhere_where_the_fingers_are_seen_along_t
         ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
         trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along)
         assert trust.displaced and trust.proven == proven
+
+
+@pytest.mark.parametrize(
+    ("corners", "seen_along", "strictly", "proven"),
+    [([1, 1], True, 1, True), ([1, 1], True, 0, False), ([1, 1], False, 2, False), ([2, 0], True, 2, False)],
+)
+def test_one_corner_of_each_finger_proves_a_pose_elsewhere_if_it_is_too_improbable_that_they_are_something_else(
+    corners: list[int], seen_along: bool, strictly: int, proven: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """0.1 each, 0.1 for each that is seen strictly, 1e-3 for the strips: at most the risk, 1e-5."""
+    monkeypatch.setattr(Integrity, "_knocked", lambda *_: False)
+    monitor = new_monitor()
+    for frame in frames_of(scene(BEGINS + 3, mount=(along_fingers(3e-3, BEGINS_S),)))[0]:
+        monitor.process(frame)
+    measurement, weigher = monitor._newest, monitor._trust._weigher
+    assert measurement is not None and weigher.anchor is not None
+    ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
+    trust = weigher.weigh(
+        measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along, strictly=strictly
+    )
+    assert trust.displaced and trust.proven == proven
 
 
 def test_a_pose_that_stays_slid_after_it_was_measured_again_is_not_followed(monkeypatch: pytest.MonkeyPatch):

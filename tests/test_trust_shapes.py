@@ -21,9 +21,10 @@ from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import AlertKind, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
-from gripmon.monitor.refits import SIGMA_INFLATION
+from gripmon.monitor.bounds import SIGMA_INFLATION
+from gripmon.monitor.ends import MISREAD_PROBABILITY
 from gripmon.monitor.since import AtReferences
-from gripmon.monitor.weigher import MISREAD_PROBABILITY, Weigher
+from gripmon.monitor.weigher import Weigher
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, BentFinger, Bump, FingerLook, Sensor
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
@@ -163,7 +164,7 @@ def test_the_edges_of_a_fingers_root_are_no_end_of_it():
         seen = SimpleNamespace(
             normal=SimpleNamespace(edge=edges), consensus=SimpleNamespace(edge_seen=np.ones(len(across), dtype=bool))
         )
-        assert weigher._misread(seen, None, None) == pytest.approx(MISREAD_PROBABILITY**times)  # type: ignore[arg-type]
+        assert weigher._ends.misread(seen, None) == pytest.approx(MISREAD_PROBABILITY**times)  # type: ignore[arg-type]
 
 
 # --- what the file doesn't say ---

@@ -40,8 +40,14 @@ class RepeatWatch:
         self._tiles: NDArray[np.uint64] = np.zeros((RING_FRAMES + 1, 0), np.uint64)
         self._slot = 0
         self._new_s = np.full(edges, -np.inf)
-        self.fault: StreamFault | None = None
-        """What there is to say once it lasts."""
+        self._fault: StreamFault | None = None
+
+    def taken(self) -> StreamFault | None:
+        """What there is to say of the newest measured frame where it has lasted, once: a frame in which nothing is
+        measured doesn't tell.
+        """
+        fault, self._fault = self._fault, None
+        return fault
 
     def add(self, image: Image, measurement: Measurement, coded: bool, now_s: float) -> bool:
         """Whether the frame shows nothing new of an edge for longer than a stream may repeat it: one that is ``coded``
@@ -75,9 +81,9 @@ class RepeatWatch:
         longest_s = float((now_s - self._new_s[old]).max(initial=0.0))
         settings = self._settings
         late = longest_s > (settings.frozen_coded_s if coded else 0.0)
-        self.fault = None
+        self._fault = None
         if late and longest_s >= settings.frozen_s:
-            self.fault = StreamFault("repeated", Cause.CAMERA_FROZEN, TEXT)
+            self._fault = StreamFault("repeated", Cause.CAMERA_FROZEN, TEXT)
         return late
 
 

@@ -213,8 +213,8 @@ class FrameAnalysis:
         """Return the stream's faults; pass its rate to the drift test, and use the cause analyses that are due."""
         self.causes.catch_up(now_s)
         faults = self.stream.add(frame)
-        if self._repeats.fault is not None:
-            faults = (*faults, self._repeats.fault)  # known from the frame before: it takes a measurement
+        if (repeated := self._repeats.taken()) is not None:
+            faults = (*faults, repeated)  # known from the frame before: it takes a measurement
         for fault in faults:
             if fault.kind == "gap":
                 self.causes.interrupted()

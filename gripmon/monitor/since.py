@@ -36,7 +36,7 @@ from gripmon.model.records import (
     ValidBy,
 )
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Doubts, Separation, follow
+from gripmon.track.integrity import Doubts, Separation, of_motion, with_known
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -158,7 +158,7 @@ class AtReference(NamedTuple):
 
     def covariance_of(self, covariance: Array, cam_T_grip: Array, reference_T: Array) -> Array:
         """(6, 6) of exp(d) reference, of a measured pose (4, 4) with a ``covariance`` (6, 6)."""
-        turn, lever = self._jacobians(cam_T_grip, reference_T)
+        lever, turn = self._jacobians(cam_T_grip, reference_T)
         return np.asarray(lever @ (covariance + turn @ self.fits.covariance[0] @ turn.T) @ lever.T)
 
     def of_motion(
@@ -174,51 +174,31 @@ class AtReference(NamedTuple):
 
         ``lasting`` (h,): under which of the lasting hypotheses b is taken; 0: nothing was wrong then.
         """
-        turn, lever = self._jacobians(cam_T_grip, reference_T)
-        first = self.fits
-        shift = fits.shift - first.shift[lasting] @ turn.T
-        covariance = fits.covariance + (turn @ first.covariance @ turn.T)[lasting]
-        of_model = fits.of_model - (first.of_model @ turn.T)[lasting]
-        if common is not None:
-            motion = self.motion(cam_T_grip)
-            covariance = covariance + common.of_motion(motion, self.cam_T_grip)
-            travel_m = opened.jaw_opening_m - self.jaw_opening_m
-            longer = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
-            row = np.broadcast_to(common.scale_sigma * longer, (len(of_model), 1, 6))
-            of_model = np.concatenate([of_model, row], axis=1)
-        return Separation(shift @ lever.T, lever @ covariance @ lever.T, of_model @ lever.T)
-
-    def wrong_at_first(self, now: Separation, cam_T_grip: Array, reference_T: Array) -> Separation:
-        """(g - 1) differences of exp(d) reference if a lasting hypothesis held in the reference's frames, and no longer
-        does; ``now``: the fit of one hypothesis, that nothing is wrong.
-        """
-        turn, lever = self._jacobians(cam_T_grip, reference_T)
-        first = self.fits
-        shift = -first.shift[1:] @ turn.T
-        covariance = now.covariance + turn @ first.covariance[1:] @ turn.T
-        of_model = now.of_model - first.of_model[1:] @ turn.T
-        return Separation(shift @ lever.T, lever @ covariance @ lever.T, of_model @ lever.T)
+        jacobians = self._jacobians(cam_T_grip, reference_T)
+        if common is None:
+            return of_motion(fits, self.fits, lasting, *jacobians, np.zeros((6, 6)))
+        motion = self.motion(cam_T_grip)
+        made = of_motion(fits, self.fits, lasting, *jacobians, common.of_motion(motion, self.cam_T_grip))
+        travel_m = opened.jaw_opening_m - self.jaw_opening_m
+        longer = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
+        row = np.broadcast_to(common.scale_sigma * (jacobians[0] @ longer), (len(lasting), 1, 6))
+        return made._replace(of_model=np.concatenate([made.of_model, row], axis=1))
 
     def staying(self, motion: Separation, cam_T_grip: Array, reference_T: Array, covariance: Array) -> Separation:
         """Motions since the reference, as differences from that of a published pose (4, 4), joined with what is known
         of it beforehand: that the mount stays where it is but for a ``covariance`` (6, 6).
         """
-        count = len(motion.shift)
-        none = perturbation_between(self.motion(cam_T_grip) @ reference_T, reference_T)
-        prior = Separation(
-            np.tile(none, (count, 1)), np.tile(covariance, (count, 1, 1)), np.zeros_like(motion.of_model)
-        )
-        return follow(motion, prior, np.zeros(6))[0]
+        return with_known(motion, perturbation_between(self.motion(cam_T_grip) @ reference_T, reference_T), covariance)
 
     def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
-        """(6, 6) each: ``turn`` of an error of b to camera axes as they are after d, and ``lever`` from the difference
-        of the errors of x and of b to that of exp(d) reference, which is as far from x_b as the reference is wrong.
+        """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is
+        as far from x_b as the reference is wrong, and ``turn`` of an error of b to camera axes as they are after d.
         """
         rotation = cam_T_grip[:3, :3] @ self.cam_T_grip[:3, :3].T
         turn, lever = np.zeros((6, 6)), np.eye(6)
         turn[:3, :3] = turn[3:, 3:] = rotation
         lever[:3, 3:] = -skew(rotation @ (reference_T[:3, 3] - self.cam_T_grip[:3, 3]))
-        return turn, lever
+        return lever, turn
 
 
 class AtReferences:

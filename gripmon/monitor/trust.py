@@ -16,14 +16,15 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord, StripsRecord
-from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, reaching
+from gripmon.model.records import Array, Frame, Image, MonitorState, ReferenceRecord, StripsRecord
+from gripmon.monitor.bounds import reaching, unbounded
+from gripmon.monitor.ends import CORNERS_WHERE_EXPECTED, strict_fingers
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_ODDS, Weigher
-from gripmon.track.edges import Measurement
+from gripmon.monitor.weigher import LOOK_ODDS, Weigher
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
@@ -78,6 +79,7 @@ class Integrity:
         self._elsewhere = 0
         self._believed = False
         self._ends_seen = False
+        self._strict: tuple[Measurement, FingerEndsSeen] | None = None
 
     def strips_state(self) -> StripsRecord | msgspec.UnsetType:
         """The fingers' strips for the state file; unset before they are learnt."""
@@ -138,6 +140,7 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
+            self._weigher.learnt_along()
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
@@ -166,8 +169,8 @@ class Integrity:
         self._believed = standing is not None and standing.believed
         if standing is not None and self.since.current is None:
             why = "the gripper is elsewhere, since no frame has proved yet where it is"
-            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, self._policy.integrity_risk, why)
-            standing = replace(standing, bounds=standing.bounds._replace(since_reference=unbounded))
+            none = unbounded(self._policy.integrity_risk, why).since_reference
+            standing = replace(standing, bounds=standing.bounds._replace(since_reference=none))
         return standing
 
     def _past_limit(self, both: Bounds) -> bool:
@@ -175,32 +178,49 @@ class Integrity:
         return past_alert_limit(both.by(self._policy.valid_by), self._policy) is not None
 
     def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
-        weigh = self._weigher.weigh
         cam_T_grip, covariance = self._tracker.update(measurement)
         along = self._along(frame, measurement, cam_T_grip)
-        trust = weigh(measurement, cam_T_grip, None, now_s)
-        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen
-        self._frames += 1
-        if due or self._past_limit(trust.bounds) or trust.displaced or not self._weigher.proved:
-            ends, strictly = self._tracker.ends(frame, measurement), 0
-            if trust.displaced or self._weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
-                nothing_beyond = self._tracker.ends(frame, measurement, strict=True).seen
-                strictly = int(np.count_nonzero((nothing_beyond > 0) & (nothing_beyond >= ends.seen)))
-            trust = weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)
-            self._ends_seen = trust.proven
+        trust = self._trust_in(frame, measurement, cam_T_grip, along, now_s)
         here = self._slid_back(frame, _Candidate(measurement, cam_T_grip, covariance, along, trust), now_s)
         measurement, cam_T_grip, trust = here.measurement, here.cam_T_grip, here.trust
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
-            ends = self._tracker.ends(frame, measurement, strict=True)
-            fingers = int(np.count_nonzero(ends.seen))
-            again = weigh(measurement, cam_T_grip, ends, now_s, seen_along=here.along.here, strictly=fingers)
+            strict = self._strict_ends(frame, measurement)
+            fingers, seen_along = strict_fingers(strict, strict), here.along.here
+            again = self._weigher.weigh(measurement, cam_T_grip, strict, now_s, seen_along=seen_along, strictly=fingers)
             proven = again.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
             here = here._replace(trust=replace(again, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
+
+    def _trust_in(
+        self, frame: Frame, measurement: Measurement, cam_T_grip: Array, along: StripsSeen, now_s: float
+    ) -> Trust:
+        """The trust in a measured pose (4, 4); the fingers' ends are looked at now and then, and where they may matter:
+        the bound is past a limit without them, or the pose isn't where the gripper was.
+        """
+        weigher = self._weigher
+        displaced = weigher.displaced(measurement, now_s)
+        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen or displaced or not weigher.proved
+        self._frames += 1
+        if not due:
+            trust = weigher.weigh(measurement, cam_T_grip, None, now_s)
+            if not self._past_limit(trust.bounds):
+                return trust
+        ends, strictly = self._tracker.ends(frame, measurement), 0
+        if displaced or weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
+            strictly = strict_fingers(self._strict_ends(frame, measurement), ends)
+        trust = weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)
+        self._ends_seen = trust.proven
+        return trust
+
+    def _strict_ends(self, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
+        """The fingers' ends as they are seen strictly, once for each measurement."""
+        if self._strict is None or self._strict[0] is not measurement:
+            self._strict = measurement, self._tracker.ends(frame, measurement, strict=True)
+        return self._strict[1]
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
         """A candidate, corrected where the fingers' strips show that it has slid along them, because something else was

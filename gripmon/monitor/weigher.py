@@ -7,6 +7,9 @@ knocked, which is rare: the average of the proven poses is the anchor.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,45 +20,31 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
-from gripmon.monitor.refits import (
+from gripmon.monitor.anchor import Anchor, Lasting
+from gripmon.monitor.bounds import (
     UNBOUNDED_M,
     UNBOUNDED_RAD,
-    Anchor,
-    Anchored,
-    Known,
-    Lasting,
+    Cases,
     ModelError,
-    Refits,
     TwoDoubts,
     bounds_of,
     larger,
     reaching,
+    unbounded,
 )
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, within
+from gripmon.monitor.mount import KNOCK_UNSEEN_PROBABILITY, Mount
+from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds, CommonError
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import (
-    FingerEndsSeen,
-    Measurement,
-    edges_at_ends,
-    has_lone_end,
-    inner_edges,
-    sides,
-)
+from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.edges.words import Words, in_words
 from gripmon.track.integrity import Hypotheses, Knocks, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.look import ONE_EDGE_PX
-
-VIBRATION_FRAMES = 20.0
-"""Proven frames over which the mount's vibration is learnt."""
-
-MISREAD_PROBABILITY = 0.1
-"""Probability that what is seen where a finger's end is expected is something else, and that each further corner of it
-is: that of a border anywhere within the search lines' reach to lie within a tenth of it.
-"""
 
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
@@ -65,29 +54,21 @@ JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
 exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
-KNOCK_UNSEEN_PROBABILITY = 1e-3
-"""Probability that the mount was knocked where nothing has shown it: while something hides the fingers' ends, since the
-gripper touches things then, and between the reference's images and the first frame.  A policy, once for each such
-occlusion, since the average rate of knocks is too low for both (docs/integrity.md).
-"""
-
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
 
-CORNERS_WHERE_EXPECTED = 3
-"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers."""
 
-
-def swinging(swing: Array, way: Array, noise: Array) -> Array:
-    """(6,) variance of the mount's vibration after one more ``way`` (6,) between consecutive poses; ``noise`` (6,):
-    variances that the poses' own errors add to it, which is taken off.  Negative where there happens to be less.
+class About(NamedTuple):
+    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, and
+    ``rows`` (g,), which hypothesis each lasting one is.
     """
-    # A knock is not a vibration, but what rings after it is.
-    most = CONTRADICTION_SQUARE * (noise + np.maximum(swing, 0.0))
-    return np.asarray(swing + (np.minimum(np.square(way), most) - noise - swing) / VIBRATION_FRAMES)
+
+    hypotheses: Hypotheses
+    without_ends: Hypotheses
+    rows: NDArray[np.intp]
 
 
 class Weigher:
@@ -103,23 +84,19 @@ class Weigher:
     ):
         """``since``: what was measured at the reference in force."""
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
-        self._along = tracker.along  # (e,) which edges run along the fingers
-        self._at_ends = edges_at_ends(gripper)  # (e,) which are at their ends
-        self._lone = has_lone_end(gripper)
-        creep = settings.smoothing
-        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._jumps_per_s = settings.policy.mount_jumps_per_month / (30.0 * 86_400.0)
+        self._ends, self._lone = EndsEvidence(gripper, tracker.along), has_lone_end(gripper)
+        self._mount = Mount(settings)
         self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
         self._words = in_words(gripper, from_record(reference.cam_T_grip))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open, self._words))
-        self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
+        self._kept: dict[bytes, About] = {}
         self._newest: tuple[Measurement, float, Refits] | None = None
-        self._swing: Array = np.zeros(6)
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
+        self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
 
@@ -148,8 +125,8 @@ class Weigher:
 
     @property
     def swing(self) -> Array:
-        """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
-        return np.maximum(self._swing, 0.0)
+        """(6,) variance of the mount's vibration, m² and rad²."""
+        return self._mount.swing
 
     @property
     def misread_ever(self) -> float:
@@ -189,64 +166,82 @@ class Weigher:
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
         there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
         how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
+        Of narrow tips a view may have one corner each: they prove the pose, too, where all of that together leaves no
+        more than the risk that they are something else.
         """
-        risk, edges = self._policy.integrity_risk, measurement.normal.edge
+        risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
-            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, NOTHING_WRONG)
-            return Trust(Bounds(unbounded, unbounded), False)
-        wander = self._wander(now_s)
-        fits, anchored = self._refitted(measurement, now_s, wander)
-        hypotheses, anchor = fits.hypotheses, self.anchor
+            return Trust(unbounded(risk, NOTHING_WRONG), False)
+        fits = self._refitted(measurement, now_s)
+        hypotheses, anchored = fits.hypotheses, fits.anchored
         # The gate: a hypothesis that also needs a knock of the mount is excluded.
-        holds = anchored.square <= CONTRADICTION_SQUARE
-        displaced = not holds[0] and explained is None
+        displaced = not fits.stays[0] and explained is None
         # The proof: fingers' ends that can't be something else.
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
-        proven = not slid and _proven(ends, displaced and not seen_along, again)
+        proven = not slid and proves(ends, displaced and not seen_along, again)
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 1.0 if slid else self._misread(measurement, ends, kept)
+        misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
+        misread_strictly = misread * MISREAD_PROBABILITY**strictly
+        since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
+        if ends is not None and ends.at_each and not slid and (strictly or not displaced):
+            proven = proven or within(misread_strictly * since_learnt, risk)
         if proven:
-            misread *= MISREAD_PROBABILITY**strictly
-        if seen_along and not slid:
-            misread *= LOOK_ODDS
+            misread = misread_strictly
         # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread * (LOOK_ODDS if look_seen else 1.0)
+        prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
-        unseen = 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
-        knocks = Knocks.of(self._along_cam(fits, cam_T_grip))
-        jumped = unseen * float(knocks.share[knocks.along].sum()) * prior[hypotheses.ends] > risk
-        doubts, left_out, without = self._doubts_of_knocks(
-            measurement, fits, prior, holds, knocks, unseen, cam_T_grip, now_s, displaced
-        )
-        doubts = fits.doubts(cam_T_grip, prior, anchored).among(holds) + doubts
+        odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
+        knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
+        without = self._without_ends(measurement, fits, besides, displaced)
+        wrong, left_out = self._knocked_cases(fits, without, cam_T_grip, prior, knocks, odds)
+        cases = Cases.together([fits.cases(cam_T_grip, prior, anchored).among(fits.stays), *wrong])
+        doubts = fits.model.doubts(cases, cam_T_grip, fits.opened)
+        doubts = self._with_lasting(doubts, fits, cam_T_grip, now_s, knocks, displaced)
+        both = self._with_questions(bounds_of(doubts, risk, left_out), cam_T_grip, displaced)
+        # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
-        staying = self._staying(now_s, knocks, displaced)
-        if anchor is not None and not displaced:
-            rows = self._about(edges)[1]
-            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, wander, staying)
-        ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
-        at_first = self._lasting.priors(ever)
-        alone = None if displaced else anchored
-        doubts = fits.with_first(doubts, self._lasting, at_first, cam_T_grip, alone, staying)
-        both = bounds_of(doubts, risk, left_out)
-        if anchor is None and displaced:
-            away = perturbation_between(self._expected[0], cam_T_grip)
-            both = both._replace(absolute=larger(both.absolute, self._not_as_expected(away)))
-        both = self._with_question(both)
+        # What was taken for the ends when the strips were learnt looks right ever after.
+        misread = min(misread, misread * since_learnt + self._along_misread)
+        trust = Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         if anchor is None:
-            return Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
-        # The most probable hypothesis since the anchor.
-        possible = holds * prior
-        if proven:
+            return trust
+        along_unseen = besides * float(knocks.share[knocks.along].sum()) > risk
+        return self._explained(trust, measurement, cam_T_grip, prior, fits, along_unseen)
+
+    def learnt_along(self) -> None:
+        """The fingers' strips were learnt at the anchor."""
+        self._along_misread = self.misread_ever
+
+    def displaced(self, measurement: Measurement, now_s: float) -> bool:
+        """Whether a measured pose isn't where the gripper is expected."""
+        return len(measurement.normal.edge) > 0 and not self._refitted(measurement, now_s).stays[0]
+
+    def _explained(
+        self,
+        trust: Trust,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        prior: Array,
+        fits: Refits,
+        along_unseen: bool,
+    ) -> Trust:
+        """The trust in a pose (4, 4) with the most probable hypothesis since the anchor, and with what else than a
+        knock may explain a displaced one.  ``prior`` (h,): of the hypotheses of ``fits``; ``along_unseen``: a knock
+        along the fingers that only the ends would show is more probable than the risk.
+        """
+        hypotheses, displaced = fits.hypotheses, trust.displaced
+        possible = fits.stays * prior
+        if trust.proven:
             possible[hypotheses.ends] = 0.0
-        number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
-        most_probable = (anchored, number) if possible[number] > 0.0 else None
+        number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if along_unseen else 0
+        most_probable = (fits.anchored, number) if possible[number] > 0.0 else None
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
+        both = trust.bounds
         opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
         if displaced and not ambiguous and opened:
             # A knock doesn't move the jaw: flexing fingers and shadows beside them look like both at once.
@@ -254,68 +249,89 @@ class Weigher:
             why = "edges belong to something else, which looks like another opening and distance"
             away = perturbation_between(self.expected[0], cam_T_grip)
             both = Bounds(*(reaching(each, away, why) for each in both))
-        return Trust(both, proven, displaced, ambiguous, grasped, may_have_slid, most_probable, ends, made_of, misread)
+        return replace(trust, bounds=both, ambiguous=ambiguous, grasped=grasped, most_probable=most_probable)
 
-    def _with_question(self, both: Bounds) -> Bounds:
-        """The bounds while it is open why the first frames differed from the reference: no motion since them."""
-        if self.unexplained is None:
-            return both
-        return both._replace(absolute=larger(both.absolute, self._not_as_expected(self.unexplained)))
+    def _with_questions(self, both: Bounds, cam_T_grip: Array, displaced: bool) -> Bounds:
+        """The bounds while it is open why the first frames differ from the reference: no motion since them."""
+        absolute = both.absolute
+        if self.anchor is None and displaced:
+            absolute = larger(absolute, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
+        if self.unexplained is not None:
+            absolute = larger(absolute, self._not_as_expected(self.unexplained))
+        return both._replace(absolute=absolute)
 
-    def _along_cam(self, fits: Refits, cam_T_grip: Array) -> Array:
-        """(3,) the way along the fingers, camera frame, that their sides don't show: tapered ones have one of their own
-        beside that of the fingers.  Zero for fingers without a direction.
+    def _with_lasting(
+        self, doubts: TwoDoubts, fits: Refits, cam_T_grip: Array, now_s: float, knocks: Knocks, displaced: bool
+    ) -> TwoDoubts:
+        """The doubts with those of what may have been wrong all along, or in the reference's frames."""
+        anchor, name = self.anchor, self._lasting.name
+        ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
+        prior = self._lasting.priors(ever)
+        staying = self._staying(now_s, knocks, displaced)
+        if anchor is not None and not displaced:
+            rows = self._about(fits.edges).rows
+            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, self._wander(now_s), prior, staying)
+        if fits.model.first[0] is None:
+            return doubts
+        anchored = None if displaced else fits.anchored
+        at_first = fits.wrong_at_first(name, prior, cam_T_grip, anchored, staying)
+        return replace(doubts, since=doubts.since + at_first)
+
+    def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
+        """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
+        ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
         axis = cam_T_grip[:3, :3] @ self._tracker.finger_axis
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
-        return least_known if abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis) else axis
+        near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
+        return Knocks.of(least_known if near else axis)
 
     def _staying(self, now_s: float, knocks: Knocks, displaced: bool) -> Array:
         """(6, 6) covariance of the motion since the first proven frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
         """
-        elapsed_s = 0.0 if self.anchor is None else max(now_s - self.anchor.began_s, 0.0)
-        covariance = np.diag(self._creep * elapsed_s + self.swing) + self._tracker.floor
+        elapsed_s = 0.0 if self.anchor is None else now_s - self.anchor.began_s
+        covariance = np.diag(self._mount.creep(elapsed_s) + self.swing) + self._tracker.floor
         knocked = displaced or (self.anchor is not None and self.anchor.knocked)
         return covariance + knocks.spread if knocked else covariance
 
-    def _doubts_of_knocks(
-        self,
-        measurement: Measurement,
-        fits: Refits,
-        prior: Array,
-        holds: NDArray[np.bool_],
-        knocks: Knocks,
-        unseen: float,
-        cam_T_grip: Array,
-        now_s: float,
-        displaced: bool,
-    ) -> tuple[TwoDoubts, float, Refits | None]:
-        """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
-
-        ``prior`` (h,) of the hypotheses, ``holds`` (h,) those under which it may have stayed; ``unseen``: probability
-        of a knock that only the ends would show.  Also returns the fits without any of them, if they count.
+    def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
+        """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
+        probability ``besides``, doesn't count.
         """
-        hypotheses, edges = fits.hypotheses, fits.edges
-        least = LEAST_WEIGHT_RATIO * self._policy.integrity_risk
-        across = ~self._along[edges]
-        endless = (hypotheses.keep[:, across] == 0.0).all(axis=1)
-        probable = np.where(endless, unseen, self._knocked(now_s, hidden=False))
-        if not across.any():
-            probable[hypotheses.ends] = 0.0  # the same as that nothing is wrong
-        doubts, left_out = fits.knocked(cam_T_grip, prior, knocks, probable, holds, endless, least)
-        besides = unseen * prior[hypotheses.ends]
-        without = None if across.any() else fits
-        if across.any() and (displaced or not self.proved or besides * WRONG_EDGE > least):
-            endless_too, more = hypotheses.without_ends()
-            without = Refits(measurement, endless_too, self._tracker.floor, fits.model, fits.known)
-            both = prior[hypotheses.ends] * hypotheses.prior * more
-            stays = without.anchored.square <= CONTRADICTION_SQUARE
-            of_both, more_out = without.knocked(
-                cam_T_grip, both, knocks, np.full(len(both), unseen), stays, np.ones_like(stays), least
-            )
-            doubts, left_out = doubts + of_both, left_out + more_out
-        return doubts, left_out, without
+        if not fits.hypotheses.across.any():
+            return fits
+        if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
+            return None
+        hypotheses = self._about(fits.edges).without_ends
+        return Refits(measurement, hypotheses, self._tracker.floor, fits.model, fits.known, together=False)
+
+    def _knocked_cases(
+        self,
+        fits: Refits,
+        without: Refits | None,
+        cam_T_grip: Array,
+        prior: Array,
+        knocks: Knocks,
+        odds: tuple[float, float],
+    ) -> tuple[list[Cases], float]:
+        """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
+        ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
+        """
+        ends = fits.hypotheses.ends
+        if without is fits:  # then that of the ends is the same as that nothing is wrong
+            prior = prior * (np.arange(len(prior)) != ends)
+        cases, left_out = fits.knocked(cam_T_grip, prior, knocks, odds, self._least)
+        if without is None or without is fits:
+            return [cases], left_out
+        both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
+        more, more_out = without.knocked(cam_T_grip, both, knocks, odds, self._least)
+        return [cases, more], left_out + more_out
+
+    @property
+    def _least(self) -> float:
+        """Probability below which a knock under a hypothesis isn't solved."""
+        return LEAST_WEIGHT_RATIO * self._policy.integrity_risk
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
@@ -327,13 +343,13 @@ class Weigher:
         proven = trust.proven
         if self.proved and not proven:
             return
-        rows = self._about(trust.fits.edges)[1]
+        rows = self._about(trust.fits.edges).rows
         if proven:
             self._slid = trust.may_have_slid
         if self.proved:
             assert self.anchor is not None
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
-            self._swing = swinging(self._swing, way, self.anchor.covariance.diagonal() + covariance.diagonal())
+            self._mount.learn(way, self.anchor.covariance.diagonal() + covariance.diagonal())
         elif trust.displaced:
             # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
             self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
@@ -341,7 +357,7 @@ class Weigher:
         if self.anchor is None or trust.displaced or proven > self.anchor.proven:
             origin_T, known = self.expected if self.proved else self._expected
             if trust.displaced:
-                known = known + Knocks.of(cam_T_grip[:3, :3] @ self._tracker.finger_axis).spread
+                known = known + self._knocks(trust.fits, cam_T_grip).spread
             misread = trust.misread
             beside_px = measurement.prediction.moved_px(perturbation_between(origin_T, cam_T_grip))
             if self.proved and beside_px < ONE_EDGE_PX:
@@ -350,7 +366,7 @@ class Weigher:
             self.anchor = Anchor(self._lasting, *at, misread, proven, trust.displaced)
         else:
             self._in_place = proven
-            self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s, trust.misread)
+            self.anchor.add(trust.fits, rows, self._mount.creep(now_s - self.anchor.now_s), now_s, trust.misread)
 
     def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
         """Whether a lone finger may have slid along itself though corners are seen: they may belong to a mark on it or
@@ -372,10 +388,8 @@ class Weigher:
         ``growth``.  ``hidden``: the image is good, but the gripper isn't seen in it.
         """
         risk = self._policy.integrity_risk
-        if max(self._jumps_per_s * unseen_s, KNOCK_UNSEEN_PROBABILITY if hidden else 0.0) > risk:
-            why = "the mount was knocked while nothing is seen of the gripper"
-            unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, why)
-            return Bounds(unbounded, unbounded)
+        if self._mount.knocked(unseen_s, hidden) > risk:
+            return unbounded(risk, "the mount was knocked while nothing is seen of the gripper")
         position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
         return Bounds(
             *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
@@ -387,52 +401,25 @@ class Weigher:
         """
         if self.anchor is None:
             return KNOCK_UNSEEN_PROBABILITY
-        return max(self._jumps_per_s * (now_s - self.anchor.now_s), KNOCK_UNSEEN_PROBABILITY if hidden else 0.0)
+        return self._mount.knocked(now_s - self.anchor.now_s, hidden)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
-        """How many times the fingers' ends are seen where the pose has them: once for each finger by its edges, and
-        once more for each further corner.
-        """
-        return self._times(self._across(measurement), ends)
-
-    def _across(self, measurement: Measurement) -> NDArray[np.intp]:
-        """The edges that are seen and don't run along the fingers."""
-        edge = measurement.normal.edge
-        return edge[measurement.consensus.edge_seen[edge] & ~self._along[edge]]
-
-    def _times(self, edges: NDArray[np.intp], ends: FingerEndsSeen | None) -> int:
-        by_edge = set(self._gripper.edge_finger[edges].tolist())
-        return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
-
-    def _misread(self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None) -> float:
-        """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
-        measured edges that count.  A finger's root isn't an end, and edges on one line count once, of whichever
-        fingers: a single straight border may show them all.
-        """
-        edges = self._across(measurement)
-        edges = edges[self._at_ends[edges]]
-        if kept is not None:
-            edges = edges[np.isin(edges, measurement.normal.edge[kept])]
-        times = self._times(edges, ends)
-        if ends is not None and not ends.seen.any() and _on_one_line(measurement, edges):
-            times = min(times, 1)
-        return MISREAD_PROBABILITY**times
+        """See :meth:`EndsEvidence.confirmations`."""
+        return self._ends.confirmations(measurement, ends)
 
     def held_across(self, measurement: Measurement, now_s: float) -> bool:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
-        proven (before anything is proven: just now).  The edges at the ends don't show such a knock; each side may be
-        misread with the same probability as an end.
+        proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
-        edge = measurement.normal.edge
-        sides = int((measurement.consensus.edge_seen[edge] & self._along[edge]).sum())
-        excluded = self._knocked(now_s, hidden=True) * MISREAD_PROBABILITY**sides
-        return excluded <= (1.0 + 1e-9) * self._policy.integrity_risk  # powers of ten are equal but for rounding
+        excluded = self._knocked(now_s, hidden=True) * self._ends.sides_misread(measurement)
+        return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        both = bounds_of(fits.doubts(cam_T_grip, fits.hypotheses.prior), self._policy.integrity_risk)
+        cases = fits.cases(cam_T_grip, fits.hypotheses.prior)
+        both = bounds_of(fits.model.doubts(cases, cam_T_grip, fits.opened), self._policy.integrity_risk)
         return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
@@ -445,56 +432,30 @@ class Weigher:
 
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the motion since the anchor: creep and vibration."""
-        if self.anchor is None:
-            return self.swing
-        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
+        return self.swing if self.anchor is None else self._mount.creep(now_s - self.anchor.now_s) + self.swing
 
-    def _refitted(self, measurement: Measurement, now_s: float, wander: Array) -> tuple[Refits, Anchored]:
-        """The fits of a measurement, alone and with the anchor after a motion of variances ``wander`` (6,).  They are
-        kept while the same measurement is weighed again: with its ends checked, or for another pose.
+    def _refitted(self, measurement: Measurement, now_s: float) -> Refits:
+        """The fits of a measurement, alone and with what is known of the pose.  They are kept while the same
+        measurement is weighed again: with its ends checked, or for another pose.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
             of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
-            covariance = covariance.copy()
-            covariance.flat[::7] += wander
-            known = Known(expected_T, covariance, of_model)
+            known = Known(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
             model = self._model._replace(first=self._since.published_by)
-            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._tracker.floor, model, known)
-            self._newest = measurement, now_s, fits
-        fits = self._newest[2]
-        assert fits.anchored is not None
-        return fits, fits.anchored
+            hypotheses = self._about(measurement.normal.edge).hypotheses
+            self._newest = measurement, now_s, Refits(measurement, hypotheses, self._tracker.floor, model, known)
+        return self._newest[2]
 
-    def _about(self, edges: NDArray[np.intp]) -> tuple[Hypotheses, NDArray[np.intp]]:
-        """The hypotheses about a fit of ``edges`` (v,), and which of them each lasting hypothesis is."""
+    def _about(self, edges: NDArray[np.intp]) -> About:
+        """What may be wrong with a fit of ``edges`` (v,)."""
         key = edges.tobytes()
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
             hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open, self._words)
-            self._kept[key] = hypotheses, self._lasting.rows(hypotheses, edges)
+            self._kept[key] = About(hypotheses, hypotheses.without_ends(), self._lasting.rows(hypotheses, edges))
         return self._kept[key]
-
-
-def _proven(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
-    """Whether the fingers' ends are seen as ends.  Not ``elsewhere`` than expected fewer corners suffice; where the
-    innovation is within noise (``again``), one of each finger.
-    """
-    if ends is None:
-        return False
-    expected = not elsewhere and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
-    return ends.sure or expected or (again and ends.at_each)
-
-
-def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:
-    """Whether some edges lie on one straight line of the image."""
-    prediction = measurement.prediction
-    uv_px = prediction.uv_px[np.isin(prediction.layout.edge, edges) & prediction.ok]
-    if len(uv_px) == 0:
-        return True
-    off_px = uv_px - uv_px.mean(axis=0)
-    return bool(np.abs(off_px @ np.linalg.svd(off_px, full_matrices=False)[2][-1]).max() < ONE_EDGE_PX)
 
 
 def _hypotheses_about(
@@ -516,13 +477,12 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     the reference show no more.
     """
     if not len(measurement.normal.edge):
-        unbounded = Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, NOTHING_WRONG)
-        return Bounds(unbounded, unbounded)
+        return unbounded(settings.policy.integrity_risk, NOTHING_WRONG)
     may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0
     words = in_words(gripper, measurement.prediction.cam_T_grip)
     hypotheses = _hypotheses_about(measurement.normal.edge, gripper, tracker, may_open, words)
     model = _model_error(tracker, gripper)
     nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
-    doubts = fits.doubts(measurement.cam_T_grip, hypotheses.prior)
-    return bounds_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
+    cases = fits.cases(measurement.cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
+    return bounds_of(model.doubts(cases, measurement.cam_T_grip, fits.opened), settings.policy.integrity_risk)

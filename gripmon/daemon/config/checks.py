@@ -100,18 +100,28 @@ def reference_doubt(settings: Settings) -> str | None:
     reference, policy = settings.reference, settings.monitor.policy
     if policy.valid_by is not ValidBy.ABSOLUTE:
         return None
-    sigma_m = float(np.sqrt(np.reshape(covariance_of(reference), (6, 6)).diagonal()[:3].max()))
+    sigmas = np.sqrt(np.reshape(covariance_of(reference), (6, 6)).diagonal())
+    sigma_m, sigma_rad = float(sigmas[:3].max()), float(sigmas[3:].max())
     right = "or monitor.policy.valid_by: reference, if only motion since the reference matters"
-    if reference.covariance is None and reference.position_sigma_m is None:
-        return (
-            f"reference.position_sigma_m isn't stated, {1e3 * sigma_m:g} mm are assumed, but transforms are valid by "
-            f"their absolute error; state what the reference is good to, {right}"
-        )
-    if policy.alert_limit_m < sigma_m:
-        return (
-            f"monitor.policy.alert_limit_m is {policy.alert_limit_m:g}, below the reference's own standard deviation "
-            f"of {sigma_m:.2g} m; at least that, a reference that is known better, {right}"
-        )
+    unstated = reference.covariance is None
+    for key, is_unstated, assumed in (
+        ("position_sigma_m", unstated and reference.position_sigma_m is None, f"{1e3 * sigma_m:g} mm"),
+        ("rotation_sigma_rad", unstated and not reference.rotation_sigma_rad, f"{np.degrees(sigma_rad):.2g} degrees"),
+    ):
+        if is_unstated:
+            return (
+                f"reference.{key} isn't stated, {assumed} are assumed, but transforms are valid by their absolute "
+                f"error; state what the reference is good to, {right}"
+            )
+    for key, limit, sigma, unit in (
+        ("alert_limit_m", policy.alert_limit_m, sigma_m, "m"),
+        ("alert_limit_rad", policy.alert_limit_rad, sigma_rad, "rad"),
+    ):
+        if limit < sigma:
+            return (
+                f"monitor.policy.{key} is {limit:g}, below the reference's own standard deviation of {sigma:.2g} "
+                f"{unit}; at least that, a reference that is known better, {right}"
+            )
     return None
 
 

@@ -33,8 +33,9 @@ class HttpJpegs:
     def __init__(self, answer: http.client.HTTPResponse) -> None:
         self._answer = answer
         self._multipart = answer.headers.get_content_maintype() == "multipart"
+        boundary = str(answer.headers.get_param("boundary", "")).encode("latin-1", "replace")
         # Some cameras state the dashes that come before a boundary as part of it.
-        self._boundary = b"--" + str(answer.headers.get_param("boundary", "")).strip("-").encode("latin-1", "replace")
+        self._boundary = (b"--" + boundary, boundary) if boundary.startswith(b"--") else (b"--" + boundary,)
         self._at_headers = False
         self._rest = b""
         self._data = b""

@@ -107,7 +107,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     ] = ()
 
 
-class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reply/1"):
+class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reply/2"):
     """The monitor's answer to a command."""
 
     name: CommandName
@@ -141,7 +141,7 @@ class Snapshot1(Snapshot, frozen=True):
 
 
 class CommandReply1(CommandReply, frozen=True, tag_field="schema", tag="gripmon.reply/1"):
-    """A reply with a snapshot of an earlier version."""
+    """A reply of an earlier version, whose snapshot has a transform of that."""
 
     snapshot: Snapshot1 | None = None
 

@@ -47,11 +47,13 @@ CONTINUATION_STEP_RATIO = 0.4
 @dataclass(frozen=True, slots=True)
 class FingerEndsSeen:
     """(f,) corners at the end of each finger, or places where its sides turn into a curve: ``seen`` with nothing that
-    goes on beyond them, and those that ``might`` be seen in this view.
+    goes on beyond them, and those that ``might`` be seen in this view.  ``past``: the edges at the ends that go on
+    beyond one of their corners: borders of something longer, which a finger's side may cross in a second corner.
     """
 
     seen: NDArray[np.intp]
     might: NDArray[np.intp]
+    past: frozenset[int] = frozenset()
 
     @property
     def sure(self) -> bool:
@@ -137,6 +139,7 @@ class FingerEnds:
         self.axis, self.along = along_fingers(gripper)
         self._roundings = Roundings(gripper, self.along, float(PROBES_PX[-1]), PARALLEL_COSINE)
         self._places = _Places.of(gripper, self.along, self._roundings.point)
+        self._at_corner = [gripper.edges_at_corner(number) for number in range(len(gripper.corner_points))]
         self._kept: tuple[Prediction, _Probes] | None = None
         self._kept_roundings: tuple[Prediction, dict[int, Rounding]] | None = None
 
@@ -151,13 +154,16 @@ class FingerEnds:
         return self._places.finger
 
     def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """How many of each finger's ends are seen; takes a quarter of a measurement's time.  ``strict``: see
-        :meth:`at_places`.
+        """How many of each finger's ends are seen; takes a quarter of a measurement's time.
+
+        ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
         fingers = len(self._gripper.finger_ids)
+        places, past = self._at_places(image, measurement, strict)
         return FingerEndsSeen(
-            np.bincount(self.finger[self.at_places(image, measurement, strict)], minlength=fingers),
+            np.bincount(self.finger[places], minlength=fingers),
             np.bincount(self.finger[self.in_view(measurement.prediction)], minlength=fingers),
+            past,
         )
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
@@ -167,10 +173,11 @@ class FingerEnds:
         curved[np.isin(places.rounding, list(self._rounded(prediction)))] = True
         return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
-    def at_places(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
-        """(s,) the measured places that are ends: no edge goes on beyond them.
-
-        ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
+    def _at_places(
+        self, image: Image, measurement: Measurement, strict: bool
+    ) -> tuple[NDArray[np.bool_], frozenset[int]]:
+        """(s,) the measured places that are ends: no edge goes on beyond them, nor an edge across the finger beyond its
+        other corner.  And which edges across go on.
         """
         prediction, places = measurement.prediction, self._places
         if self._kept is None or self._kept[0] is not prediction:
@@ -185,13 +192,20 @@ class FingerEnds:
                 usual[0] = consensus.edge_share[places.side[number]]
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
             measured[number] = seen and (shown >= SHOWN_BESIDE * usual).all()
-        goes_on = np.zeros(len(measured), dtype=bool)
-        if len(probes.place) and measured.any():
-            goes_on[probes.place[self._going_on(image, measurement, probes, strict)]] = True
-        return measured & ~goes_on
+        if not len(probes.place) or not measured.any():
+            return measured, frozenset()
+        goes_on, by_a_few_px = self._going_on(image, measurement, probes)
+        extended = edge[probes.sample]
+        past = frozenset(extended[goes_on & ~self.along[extended]].tolist())
+        measured[probes.place[goes_on | by_a_few_px if strict else goes_on]] = False
+        for number in np.flatnonzero(measured & (places.corner >= 0)).tolist():
+            measured[number] = past.isdisjoint(self._at_corner[places.corner[number]])
+        return measured, past
 
-    def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
-        """(c,) which of the extended edges have a continuation."""
+    def _going_on(
+        self, image: Image, measurement: Measurement, probes: _Probes
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(c,) which of the extended edges have a continuation, and which one of a few pixels."""
         prediction, candidates = measurement.prediction, measurement.candidates
         # Where the measurement has them: the edge filter sees less far than the search lines reach.
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
@@ -209,7 +223,7 @@ class FingerEnds:
         shown.ravel()[found.sample[near]] = True
         well_shown.ravel()[found.sample[strong]] = True
         goes_on = well_shown[:, PROBES_SKIPPED:].mean(axis=1) > SHOWN_BESIDE
-        return np.asarray(goes_on | shown[:, :PROBES_AT_CORNER].all(axis=1) if strict else goes_on)
+        return np.asarray(goes_on), np.asarray(shown[:, :PROBES_AT_CORNER].all(axis=1))
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
         places, points = self._places, self._gripper.edge_points

@@ -10,9 +10,11 @@ from gripmon.track.integrity.separation import (
     bounds,
     follow,
     jumped,
+    of_motion,
     telling,
     warm_up,
     with_and_without,
+    with_known,
 )
 
 __all__ = [
@@ -26,7 +28,9 @@ __all__ = [
     "follow",
     "hypotheses_of",
     "jumped",
+    "of_motion",
     "telling",
     "warm_up",
     "with_and_without",
+    "with_known",
 ]

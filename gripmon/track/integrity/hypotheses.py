@@ -37,12 +37,25 @@ class Hypotheses:
     ends: int
     grasp: tuple[int, ...] = ()
 
-    def without_ends(self) -> tuple[Hypotheses, NDArray[np.bool_]]:
-        """The same where no end of a finger is what it seems besides; (h,) which doubt more than that then."""
+    @property
+    def across(self) -> NDArray[np.bool_]:
+        """(v,) the edges that don't run along the fingers: their ends."""
+        return self.keep[self.ends] == 0.0
+
+    @property
+    def endless(self) -> NDArray[np.bool_]:
+        """(h,) which leave no end of a finger."""
+        return np.asarray((self.keep[:, self.across] == 0.0).all(axis=1))
+
+    @property
+    def more_than_ends(self) -> NDArray[np.bool_]:
+        """(h,) which doubt something else than the ends."""
+        return np.asarray((self.keep[:, ~self.across] == 0.0).any(axis=1) | self.opening)
+
+    def without_ends(self) -> Hypotheses:
+        """The same where no end of a finger is what it seems besides."""
         name = tuple(f"{name}, and what looks like ends" for name in self.name)
-        keep = self.keep * self.keep[self.ends]
-        more = (keep != self.keep[self.ends]).any(axis=1) | self.opening
-        return replace(self, name=name, keep=keep), more
+        return replace(self, name=name, keep=self.keep * self.keep[self.ends])
 
 
 def hypotheses_of(

@@ -220,17 +220,72 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
+    together: bool,
 ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
     """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
-    besides, and the normalised squares (h,) of the former's distance from that.
+    besides, none of these if they aren't asked for ``together``, and the normalised squares (h,) of the former's
+    distance from that.
     """
     sums, normal, spread, of_model = add_up(
         pull, information, middle, model, part, parts, keep, known, known_pull
     )  # fmt: skip
     alone = separate(sums, normal, spread, of_model, 6)
-    sums, normal, spread, of_model = with_pose(sums, normal, spread, of_model, at, covariance, off)
-    together = separate(sums, normal, spread, of_model, 6)
-    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+    asked = len(sums) if together else 0
+    sums, normal, spread, of_model = with_pose(
+        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, covariance, off
+    )  # fmt: skip
+    with_it = separate(sums, normal, spread, of_model, 6)
+    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+
+
+@compiled
+def _join(
+    mean: Array,
+    before: Array,
+    off: Array,
+    measured: tuple[Array, Array, Array],
+    out: tuple[Array, Array, Array],
+    work: Array,
+) -> float:
+    """One more measurement of a pose, as in a Kalman filter; the trace of its gain.  With P = ``before`` (6, 6), the
+    covariance R of what was ``measured`` and the gain K = P (P + R)^-1, ``out`` is mean + K (shift - mean) (6,), the
+    covariance K R (6, 6) and the errors by the model off + K (of_model - off) (f, 6), ``off`` (f or 1, 6).
+    ``work`` (4, 6, 6) is overwritten.
+    """
+    shift, covariance, of_model = measured
+    new_mean, new_covariance, new_off = out
+    both, inverse, root, gain = work[0], work[1], work[2], work[3]
+    for i in range(6):
+        for j in range(6):
+            both[i, j] = before[i, j] + covariance[i, j]
+    _inverse(both, inverse, root, gain)
+    taken = 0.0
+    for i in range(6):
+        new_mean[i] = mean[i]
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += before[i, k] * inverse[k, j]
+            gain[i, j] = total
+            new_mean[i] += total * (shift[j] - mean[j])
+        taken += gain[i, i]
+    for f in range(len(new_off)):
+        g = min(f, len(off) - 1)
+        for i in range(6):
+            new_off[f, i] = off[g, i]
+            for j in range(6):
+                new_off[f, i] += gain[i, j] * (of_model[f, j] - off[g, j])
+    for i in range(6):
+        for j in range(6):
+            # K R is (1 - K) P, which cancels where what was known before leaves a direction open.
+            total = 0.0
+            for k in range(6):
+                total += gain[i, k] * covariance[k, j]
+            both[i, j] = total
+    for i in range(6):
+        for j in range(6):
+            new_covariance[i, j] = 0.5 * (both[i, j] + both[j, i])
+    return taken
 
 
 @compiled
@@ -255,18 +310,17 @@ def jumped(
     over the sum of these and of having stayed.
     """
     count, kinds = prior.shape
-    root, white, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    root, white, apart, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     log_density, out = np.empty(kinds + 1), np.zeros((count, kinds))
     for h in range(count):
         highest, stay = -math.inf, 1.0
+        between(covariance[h], off[h], known, known_off, times, apart)
         for c in range(kinds + 1):
             log_density[c] = -math.inf
             if stays[h] if c == kinds else prior[h, c] > 0.0:
-                between(covariance[h], off[h], known, known_off, times, both)
-                if c < kinds:
-                    for i in range(6):
-                        for j in range(6):
-                            both[i, j] += jumps[c, i, j]
+                for i in range(6):
+                    for j in range(6):
+                        both[i, j] = apart[i, j] + (jumps[c, i, j] if c < kinds else 0.0)
                 log_density[c] = -0.5 * _square(both, shift[h] - at, root, white)
                 for i in range(6):
                     log_density[c] += math.log(root[i, i])
@@ -296,43 +350,20 @@ def after_jumps(
     fit: Ints,
     jump: Ints,
 ) -> tuple[Array, Array, Array]:
-    """The poses after r of the jumps of :func:`jumped`, by the fits and what was known: with P = C + J and the gain
-    K = P (P + R)^-1 the shift at + K (shift - at) (r, 6), covariance P - K P (r, 6, 6), and errors by the model
-    known_off + K (off - known_off) (r, f, 6), ``off`` (h, f, 6) and ``known_off`` (f or 1, 6).  ``fit`` and ``jump``
-    (r,): the number of each.
+    """The poses after r of the jumps of :func:`jumped`, by the fits and what was known: :func:`_join` of the latter,
+    with C + J, and the former, shift (r, 6), covariance (r, 6, 6), and errors by the model (r, f, 6), ``off`` (h, f, 6)
+    and ``known_off`` (f or 1, 6).  ``fit`` and ``jump`` (r,): the number of each.
     """
-    count, fingers = len(fit), off.shape[1]
-    shifts, covariances, offs = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, fingers, 6))
-    before, both, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    root, between, gain = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    count, parts = len(fit), off.shape[1]
+    shifts, covariances, offs = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, parts, 6))
+    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
     for r in range(count):
         h, c = fit[r], jump[r]
         for i in range(6):
             for j in range(6):
                 before[i, j] = known[i, j] + jumps[c, i, j]
-                both[i, j] = before[i, j] + covariance[h, i, j]
-        _inverse(both, inverse, root, between)
-        for i in range(6):
-            shifts[r, i] = at[i]
-            for f in range(fingers):
-                offs[r, f, i] = known_off[min(f, len(known_off) - 1), i]
-            for j in range(6):
-                total = 0.0
-                for k in range(6):
-                    total += before[i, k] * inverse[k, j]
-                gain[i, j] = total
-                shifts[r, i] += total * (shift[h, j] - at[j])
-                for f in range(fingers):
-                    offs[r, f, i] += total * (off[h, f, j] - known_off[min(f, len(known_off) - 1), j])
-        for i in range(6):
-            for j in range(6):
-                total = before[i, j]
-                for k in range(6):
-                    total -= gain[i, k] * before[k, j]
-                between[i, j] = total
-        for i in range(6):
-            for j in range(6):
-                covariances[r, i, j] = 0.5 * (between[i, j] + between[j, i])
+        of = shift[h], covariance[h], off[h]
+        _join(at, before, known_off, of, (shifts[r], covariances[r], offs[r]), work)
     return shifts, covariances, offs
 
 
@@ -488,42 +519,99 @@ def levels(
 def follow(
     mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """One more measurement for each of g Kalman filters: their means (g, 6), covariances (g, 6, 6) and errors by the
-    model (g, f, 6) after it, and the traces of their gains (g,).  With P = covariance + creep and K = P (P + R)^-1
-    these are mean + K (shift - mean), K R and off + K (of_model - off); R is ``of_frame``, ``creep`` (6,)
-    variances.
+    """One more measurement for each of g Kalman filters, :func:`_join`: their means (g, 6), covariances (g, 6, 6) and
+    errors by the model (g, f, 6) after it, and the traces of their gains (g,).  ``creep`` (6,): variances that the
+    filters' covariances have grown by.
     """
     count = len(mean)
-    new_mean, new_covariance, new_off, taken = mean.copy(), np.empty((count, 6, 6)), off.copy(), np.zeros(count)
-    both, root, between, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    before, gain = np.empty((6, 6)), np.empty((6, 6))
+    new_mean, new_covariance, new_off, taken = mean.copy(), covariance.copy(), off.copy(), np.empty(count)
+    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
     for g in range(count):
         for i in range(6):
             for j in range(6):
                 before[i, j] = covariance[g, i, j] + (creep[i] if i == j else 0.0)
-                both[i, j] = before[i, j] + of_frame[g, i, j]
-        _inverse(both, inverse, root, between)
-        for i in range(6):
-            for j in range(6):
-                total = 0.0
-                for k in range(6):
-                    total += before[i, k] * inverse[k, j]
-                gain[i, j] = total
-                new_mean[g, i] += total * (shift[g, j] - mean[g, j])
-                for f in range(off.shape[1]):
-                    new_off[g, f, i] += total * (of_model[g, f, j] - off[g, f, j])
-            taken[g] += gain[i, i]
-        for i in range(6):
-            for j in range(6):
-                # K R is (1 - K) P, which cancels where what was known before leaves a direction open.
-                total = 0.0
-                for k in range(6):
-                    total += gain[i, k] * of_frame[g, k, j]
-                between[i, j] = total
-        for i in range(6):
-            for j in range(6):
-                new_covariance[g, i, j] = 0.5 * (between[i, j] + between[j, i])
+        of, out = (shift[g], of_frame[g], of_model[g]), (new_mean[g], new_covariance[g], new_off[g])
+        taken[g] = _join(mean[g], before, off[g], of, out, work)
     return new_mean, new_covariance, new_off, taken
+
+
+@compiled
+def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Array) -> tuple[Array, Array, Array]:
+    """Poses (h, 6) with their covariances (h, 6, 6) and errors by the model (h, f, 6), each joined with what is known
+    of all of them besides: ``at`` (6,) but for a covariance ``known`` (6, 6).
+    """
+    new_shift, new_covariance, new_off = shift.copy(), covariance.copy(), off.copy()
+    none, work = np.zeros((off.shape[1], 6)), np.empty((4, 6, 6))
+    for h in range(len(shift)):
+        out = new_shift[h], new_covariance[h], new_off[h]
+        _join(shift[h], covariance[h], off[h], (at, known, none), out, work)
+    return new_shift, new_covariance, new_off
+
+
+@compiled
+def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> None:
+    """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
+    for i in range(6):
+        for j in range(6):
+            half[i, j] = 0.0
+            for k in range(6):
+                half[i, j] += jacobian[i, k] * covariance[k, j]
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(6):
+                total += half[i, k] * jacobian[j, k]
+            out[i, j] += total
+            if j < i:
+                out[j, i] += total
+
+
+@compiled
+def of_motion(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    first: Ints,
+    first_shift: Array,
+    first_covariance: Array,
+    first_off: Array,
+    lever: Array,
+    turn: Array,
+    more: Array,
+) -> tuple[Array, Array, Array]:
+    """Fits x (h, 6) with their covariances (h, 6, 6) and errors by the model (h, f, 6), made those of the motion since
+    the ``first`` (h,) of g fits b: the differences L (x - T b), with the Jacobians ``lever`` L and ``turn`` T (6, 6),
+    covariances L (C_x + T C_b T' + M) L', M = ``more`` (6, 6), and differences of the errors by the model.
+    """
+    count, parts = len(first), off.shape[1]
+    shifts, covariances, offs = np.empty((count, 6)), np.zeros((count, 6, 6)), np.empty((count, parts, 6))
+    half, turned = np.empty((6, 6)), lever @ turn
+    begun, begun_off = np.zeros((len(first_shift), 7, 6)), np.empty((len(first_shift), parts, 6))
+    for g in range(len(first_shift)):
+        _seen_from(first_covariance[g], turned, half, begun[g, :6])
+        _seen_from(more, lever, half, begun[g, :6])
+        for i in range(6):
+            for k in range(6):
+                begun[g, 6, i] += turned[i, k] * first_shift[g, k]
+            for f in range(parts):
+                begun_off[g, f, i] = 0.0
+                for k in range(6):
+                    begun_off[g, f, i] += turned[i, k] * first_off[g, f, k]
+    for h in range(count):
+        g = first[h]
+        _seen_from(covariance[h], lever, half, covariances[h])
+        for i in range(6):
+            shifts[h, i] = -begun[g, 6, i]
+            for k in range(6):
+                covariances[h, i, k] += begun[g, i, k]
+                shifts[h, i] += lever[i, k] * shift[h, k]
+        for f in range(parts):
+            for i in range(6):
+                total = -begun_off[g, f, i]
+                for k in range(6):
+                    total += lever[i, k] * off[h, f, k]
+                offs[h, f, i] = total
+    return shifts, covariances, offs
 
 
 @compiled

@@ -117,15 +117,17 @@ def with_and_without(
     covariance: Array,
     of_model: Array,
     times: float,
+    together: bool = True,
 ) -> tuple[Separation, Separation, Array]:
     """The fits of six unknowns by what :meth:`Sums.of_kept` is made of, and the same with these known to be ``at`` (6,)
     but for a ``covariance`` (6, 6), and off by ``of_model`` (f, 6), or (1, 6) of zeros.  And the normalised squares
-    (h,) of the former's distances from there, by ``times`` their own covariances and that one.
+    (h,) of the former's distances from there, by ``times`` their own covariances and that one.  Not ``together``:
+    without the second ones, of which there are none then.
     """
     pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
     of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
-    alone, together, squares = kernel.with_and_without(*of)
-    return Separation(*alone), Separation(*together), squares
+    alone, with_pose, squares = kernel.with_and_without(*of, together)
+    return Separation(*alone), Separation(*with_pose), squares
 
 
 def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:
@@ -134,6 +136,20 @@ def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separ
     """
     *after, gains = kernel.follow(*averages, *frame, creep)
     return Separation(*after), gains
+
+
+def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
+    """The fits, each joined with what is known of all of them besides: ``at`` (6,) but for a ``covariance`` (6, 6)."""
+    return Separation(*kernel.with_known(*fits, at, covariance))
+
+
+def of_motion(
+    fits: Separation, first: Separation, which: NDArray[np.intp], lever: Array, turn: Array, more: Array
+) -> Separation:
+    """Fits x made those of the motion since the ones of ``first`` b that are their ``which`` (h,): L (x - T b) with the
+    Jacobians ``lever`` L and ``turn`` T (6, 6), and covariances L (C_x + T C_b T' + M) L', M = ``more`` (6, 6).
+    """
+    return Separation(*kernel.of_motion(*fits, which, *first, lever, turn, more))
 
 
 def telling(
@@ -278,6 +294,7 @@ def warm_up() -> None:
         fits = Sums.of_kept(*of).fits()
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
+    with_known(of_motion(fits, fits, np.arange(2), np.eye(6), np.eye(6), np.eye(6)), none, np.eye(6))
     jumps = np.ascontiguousarray(each[:, :6, :6])
     jumped(fits, none, np.eye(6), fits.of_model[0], jumps, np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0)
     after_jumps(fits, none, np.eye(6), fits.of_model[0], jumps, *np.nonzero(np.eye(2)))

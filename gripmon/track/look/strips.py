@@ -189,9 +189,8 @@ class FingerStrips:
         farther = self._farther
         alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - float(farther.max()) ** 2
         most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
-        if alone and beyond_chance * (1.0 - most_alike**2) >= _unexplained(alike_here, most_alike):
-            # Usually: no slide could be so much better.
-            return StripsSeen(here=alike_here >= most_alike)
+        if alone and alike_here >= most_alike:
+            return StripsSeen(here=True)  # usually: no slide could be better
         unexplained = _unexplained(self._alike(layout, image, cam_T_grip, jaw_opening_m), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
@@ -204,10 +203,13 @@ class FingerStrips:
                 return StripsSeen()
             return StripsSeen(slide_px * layout.step_m.mean(axis=0))
         if alone:
-            return StripsSeen()
-        # Odds of ten to one for this slide: what hides a part of them leaves less.
-        undecided = independent >= FEWEST_POINTS and math.exp(2.0 / independent * math.log(10.0)) * here >= best
-        return StripsSeen(here=beyond_chance * here <= best, undecided=undecided)
+            return StripsSeen(here=beyond_chance * here <= best)
+        # Where something looks alike farther on, a rib or a thread, strips never confirm a place.  Odds of ten to one
+        # for this slide; what hides a part of them leaves less.  One of the places that look alike is seen no better
+        # than they are from the place itself, whichever of them is the best now.
+        rival = min(best, float(_unexplained(farther.max(), most_alike)))
+        as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= rival
+        return StripsSeen(undecided=independent >= FEWEST_POINTS and as_well)
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
         """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""

@@ -67,11 +67,12 @@ def with_and_without(
     covariance: Array,
     off: Array,
     times: float,
+    together: bool,
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
     sums = add_up(pull, information, middle, model, part, parts, keep, known, known_pull)
     alone = separate(*sums, 6)
-    together = separate(*with_pose(*sums, at, covariance, off), 6)
-    return alone, together, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+    with_it = separate(*with_pose(*(each[: len(each) * together] for each in sums), at, covariance, off), 6)
+    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
 
 
 def jumped(
@@ -98,6 +99,21 @@ def jumped(
     return np.asarray((weight / weight.sum(axis=1, keepdims=True))[:, :-1])
 
 
+def joined(
+    mean: Array, before: Array, off: Array, shift: Array, covariance: Array, of_model: Array
+) -> tuple[Array, Array, Array]:
+    """In the information form, as the product's isn't."""
+    information, other = np.linalg.inv(before), np.linalg.inv(covariance)
+    after = np.linalg.inv(information + other)
+    kept, taken = after @ information, after @ other
+    off, of_model = np.broadcast_arrays(off, of_model)
+    return (
+        np.einsum("rij,rj->ri", kept, mean) + np.einsum("rij,rj->ri", taken, shift),
+        after,
+        np.einsum("rij,rfj->rfi", kept, off) + np.einsum("rij,rfj->rfi", taken, of_model),
+    )
+
+
 def after_jumps(
     shift: Array,
     covariance: Array,
@@ -109,16 +125,8 @@ def after_jumps(
     fit: Ints,
     jump: Ints,
 ) -> tuple[Array, Array, Array]:
-    before = known + jumps[jump]
-    inverse, information = np.linalg.inv(covariance[fit]), np.linalg.inv(before)
-    after = np.linalg.inv(inverse + information)
-    own, other = after @ inverse, after @ information
-    known_off = np.broadcast_to(known_off, off[fit].shape)
-    return (
-        np.einsum("rij,rj->ri", own, shift[fit]) + other @ at,
-        after,
-        np.einsum("rij,rfj->rfi", own, off[fit]) + np.einsum("rij,rfj->rfi", other, known_off),
-    )
+    before, count = known + jumps[jump], len(fit)
+    return joined(np.tile(at, (count, 1)), before, known_off, shift[fit], covariance[fit], off[fit])
 
 
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
@@ -163,11 +171,31 @@ def follow(
     mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
 ) -> tuple[Array, Array, Array, Array]:
     before = covariance + np.diag(creep)
-    gain = np.linalg.solve(before + of_frame, before).transpose(0, 2, 1)
-    mean = mean + np.einsum("gij,gj->gi", gain, shift - mean)
-    off = off + np.einsum("gij,gfj->gfi", gain, of_model - off)
-    left = before - gain @ before
-    return mean, 0.5 * (left + left.transpose(0, 2, 1)), off, np.einsum("gii->g", gain)
+    gain = np.einsum("gii->g", before @ np.linalg.inv(before + of_frame))
+    return *joined(mean, before, off, shift, of_frame, of_model), gain
+
+
+def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Array) -> tuple[Array, Array, Array]:
+    every = np.ones((len(shift), 1))
+    return joined(shift, covariance, off, every * at, every[:, None] * known, np.zeros_like(off))
+
+
+def of_motion(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    first: Ints,
+    first_shift: Array,
+    first_covariance: Array,
+    first_off: Array,
+    lever: Array,
+    turn: Array,
+    more: Array,
+) -> tuple[Array, Array, Array]:
+    shift = shift - first_shift[first] @ turn.T
+    covariance = covariance + turn @ first_covariance[first] @ turn.T + more
+    off = off - first_off[first] @ turn.T
+    return shift @ lever.T, lever @ covariance @ lever.T, off @ lever.T
 
 
 def telling(

@@ -1,0 +1,197 @@
+"""The anchor: the average of the proven poses, kept once under each hypothesis that may have held all along.
+
+An edge that has belonged to something else since the first frame biases the average, too, so that the average is also
+kept without it: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
+time).  In front of a background that stands still all frames have the same error: what their scatter doesn't show stays
+in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
+from gripmon.model.poses import perturb, perturbation_between
+from gripmon.model.records import Array, Protection
+from gripmon.monitor.bounds import SIGMA_INFLATION, Cases, TwoDoubts, protection_of
+from gripmon.monitor.refits import Refits
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, telling, with_known
+
+PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
+"""Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
+
+YOUNG_VARIANCE_RATIO = 0.2
+"""Least variance of the average over that of a frame: it has to follow a creep, and averaging more than five frames
+would gain little, given the least variance that an average may claim.
+"""
+
+CONFIRMING_FRAMES = 5
+"""Frames after a knock, besides the first, that need the full proof of the new place."""
+
+NO_FIT, UNKNOWN_VARIANCE_RATIO = -1, 1e12
+"""Number of a missing fit; and the factor on the covariance of the fit in its place that removes its information."""
+
+
+class Lasting(NamedTuple):
+    """Hypotheses that may have held since the first frame: g of them about all of a gripper's edges, with ``name`` and
+    ``prior`` (g,), and ``doubts`` (g, e), whether each leaves out an edge, and ``opening`` (g,), the jaw's opening.
+    """
+
+    name: tuple[str, ...]
+    prior: Array
+    doubts: NDArray[np.bool_]
+    opening: NDArray[np.bool_]
+
+    def priors(self, misread: float) -> Array:
+        """(g,) with the probability ``misread`` that no end is what it seems, as the clearest frame has it."""
+        prior = self.prior.copy()
+        prior[-1] = misread
+        return prior
+
+    @classmethod
+    def of(cls, every: Hypotheses) -> Lasting:
+        """Those of the hypotheses about all edges that aren't sudden, and last that no end is what it seems."""
+        rows = np.append(np.flatnonzero(~every.sudden), every.ends)
+        return cls(tuple(every.name[k] for k in rows), every.prior[rows], *(each[rows] for each in _doubted(every)))
+
+    def rows(self, hypotheses: Hypotheses, edges: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(g,) which of the ``hypotheses`` about the seen ``edges`` (v,) each lasting one is; -1 where it leaves no
+        seen edge.
+        """
+        doubts, opening = _doubted(hypotheses)
+        # Of edges that no hypothesis doubts nothing can be told.
+        known, may_open = doubts.any(axis=0), opening.any()
+        number = {key: k for k, key in reversed([*enumerate(_keys(doubts, opening))])}
+        wanted = _keys(self.doubts[:, edges] & known, self.opening & may_open)
+        return np.array([number.get(key, NO_FIT) for key in wanted], dtype=np.intp)
+
+
+def _doubted(hypotheses: Hypotheses) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of v edges each of h hypotheses leaves out (h, v), and whether the opening (h,)."""
+    return hypotheses.keep == 0.0, hypotheses.opening
+
+
+def _keys(doubts: NDArray[np.bool_], opening: NDArray[np.bool_]) -> list[bytes]:
+    return [row.tobytes() for row in np.column_stack([doubts, opening])]
+
+
+class Anchor:
+    """The average of the proven poses, from the first one on; before one is ``proven``, of what edges show without the
+    fingers' ends.  ``origin``: what was known of the pose before, (4, 4) and its covariance (6, 6): it stays the prior
+    of what the frames don't show.
+    """
+
+    def __init__(
+        self,
+        lasting: Lasting,
+        base_T: Array,
+        fits: Refits,
+        rows: NDArray[np.intp],
+        now_s: float,
+        origin: tuple[Array, Array],
+        misread: float,
+        proven: bool = True,
+        knocked: bool = False,
+    ):
+        """``knocked``: the first pose differs from the one expected before; ``misread``: probability that what looked
+        like the fingers' ends there was something else.
+        """
+        self.misread, self.proven = misread, proven
+        self._lasting, self._base_T, self._origin = lasting, base_T, origin
+        self.began_s, self.now_s, self.frames, self.knocked = now_s, now_s, 1, knocked
+        self._to_confirm = CONFIRMING_FRAMES if knocked else 0
+        self._filters = _chosen(fits, rows, base_T)
+        self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
+        self._scatter = np.zeros((len(rows), 6))
+        self._weight = PRIOR_FRAMES
+        self._conclude()
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether enough frames have proven the place since a knock; later ones need a weaker proof."""
+        return self._to_confirm <= 0
+
+    def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float, misread: float) -> None:
+        """Add a proven pose, given by its frame's fits, ``rows`` (g,) of them; ``creep`` (6,): variances of the motion
+        since the last one; ``misread`` as at first.
+        """
+        self.now_s = now_s
+        self.misread = min(self.misread, misread)
+        self.frames += 1
+        self._to_confirm -= 1
+        frame = _chosen(fits, rows, self._base_T)
+        innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
+        self._filters, gains = follow(self._filters, frame, creep)
+        share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
+        self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
+        self._scatter += (share - self._scatter) / self._weight
+        # A frame that leaves a direction open isn't typical of the frames' variance.
+        worth = np.minimum((self._frames_variance / variance).min(axis=1), 1.0)
+        usual = worth**2 * gains / 6.0
+        self._frames_variance += usual[:, None] * (variance - self._frames_variance)
+        self._conclude()
+
+    def _conclude(self) -> None:
+        young = np.einsum("hii->hi", self._filters.covariance) / self._frames_variance
+        # The filters' own covariances, which this changes.
+        scale = np.sqrt(np.maximum(YOUNG_VARIANCE_RATIO / young, 1.0))
+        self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
+        young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
+        # Averaging reduces persistent errors less than independent ones.
+        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT_RATIO * self._scatter)
+        scale = np.sqrt(kept / young)
+        self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
+        whole = Separation(self._filters.shift[:1], self._claimed[:1], self._filters.of_model[:1])
+        (shift,), (covariance,), (of_model,) = self._with_origin(whole, self._base_T)
+        self.cam_T_grip = perturb(self._base_T, shift)
+        self.covariance: Array = covariance
+        self.of_model: Array = of_model
+
+    def fits(self) -> Separation:
+        """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
+        shift = self._filters.shift - perturbation_between(self._base_T, self.cam_T_grip)
+        return Separation(shift, self._claimed, self._filters.of_model)
+
+    def bound(self, risk: float) -> Protection:
+        """The protection level of the average itself."""
+        fits = self._with_origin(self.fits(), self.cam_T_grip)
+        prior = self._lasting.priors(self.misread)
+        return protection_of(Doubts.of(self._lasting.name, prior, fits, SIGMA_INFLATION), risk)
+
+    def _with_origin(self, fits: Separation, at_T: Array, wander: Array | None = None) -> Separation:
+        """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before, a motion of variances
+        ``wander`` (6,) ago.
+        """
+        origin_T, covariance = self._origin
+        covariance = covariance if wander is None else covariance + np.diag(wander)
+        return with_known(fits, perturbation_between(at_T, origin_T), covariance)
+
+    def doubts(
+        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, prior: Array, staying: Array
+    ) -> TwoDoubts:
+        """The lasting hypotheses, of a ``prior`` (g,), about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of
+        them; ``wander`` (6,): variance of the motion since the anchor; ``staying`` as for :meth:`ModelError.since`.
+
+        Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
+        What neither shows is known as it was at the origin.
+        """
+        at, wander = perturbation_between(self._base_T, cam_T_grip), wander / SIGMA_INFLATION**2
+        frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
+        average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
+        told = telling(average, at, wander, frame, rows, CONTRADICTION_SQUARE)
+        name, model = self._lasting.name, fits.model
+        absolute = model.absolute(Cases(name, prior, self._with_origin(told, cam_T_grip, wander)), cam_T_grip)
+        lasting = np.arange(len(prior))
+        return TwoDoubts(absolute, model.since(Cases(name, prior, told), cam_T_grip, fits.opened, lasting, staying))
+
+
+def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:
+    """The fits ``rows`` (g,), as shifts from a pose (4, 4)."""
+    covariance, unknown = fits.covariance[rows], rows == NO_FIT
+    if unknown.any():
+        covariance[unknown] *= UNKNOWN_VARIANCE_RATIO
+    return Separation(fits.shifts(base_T)[rows], covariance, fits.of_model[rows])
