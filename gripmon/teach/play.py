@@ -51,7 +51,7 @@ def with_play(viewer: Viewer, views: Sequence[View]) -> list[TeachingImage]:
     """
     images = [replace(view.image, play=None) for view in views]
     places_px, rows = _places(viewer, views)
-    seen = np.isfinite(places_px).all(axis=2)
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(places_px).all(axis=2))
     enough = seen.sum(axis=1) >= _FEWEST_SHARED
     if len(views) < 2 or not enough.any():
         return images
