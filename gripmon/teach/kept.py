@@ -21,6 +21,7 @@ from gripmon.monitor import Monitor
 from gripmon.teach.accuracy import as_if_measured, rounded_up
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig
+from gripmon.track.edges import VAGUE_M, VAGUE_RAD
 from gripmon.track.edges.words import in_words
 
 APART_S = 1.0
@@ -196,6 +197,8 @@ def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
             since[k] = record.since_reference.position_m, record.since_reference.rotation_rad
         if record.measured and record.absolute is not None:
             absolute[k] = record.absolute.position_m, record.absolute.rotation_rad
+    for bounds in (since, absolute):  # what a frame's reason calls undetermined
+        bounds[(bounds > (VAGUE_M, VAGUE_RAD)).any(axis=1)] = np.inf
     measured = [record for record in counted if record.measured]
     named = Counter(r.protection.hypothesis for r in measured if r.protection is not None)
     hypothesis, often = named.most_common(1)[0] if named else ("", 0)
