@@ -10,7 +10,6 @@ import pytest
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting
 from gripmon.monitor.bounds import ModelError
-from gripmon.monitor.since import Opened
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -43,8 +42,6 @@ class Frame:
     away: np.ndarray
     covariance: np.ndarray
     longer: float = 0.0
-    model: ModelError = NOTHING_COMMON
-    opened = Opened(0.03, np.zeros(6))
 
     @property
     def cam_T_grip(self) -> np.ndarray:
@@ -92,9 +89,8 @@ def averaged(frames: list[Frame], creep: np.ndarray = STILL) -> Anchor:
 
 
 def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray = STILL) -> float:
-    return anchor.doubts(frame.cam_T_grip, frame, ROWS, wander, LASTING.priors(SURE), np.eye(6)).absolute.levels(risk)[
-        0
-    ]
+    cases, _ = anchor.cases(frame.cam_T_grip, frame, ROWS, wander, LASTING.priors(SURE))
+    return NOTHING_COMMON.absolute(cases, frame.cam_T_grip).levels(risk)[0]
 
 
 def error_m(frame: Frame, truth: np.ndarray = STILL) -> float:

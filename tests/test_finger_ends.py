@@ -161,7 +161,7 @@ def test_before_a_background_full_of_lines_most_corners_at_the_ends_count():
         image = picture(scenario, index)
         found = measure(image, using=using)
         counted.append(using.ends(image, found).seen.sum())
-    assert np.mean(counted) > 3.3
+    assert np.mean(counted) > 3.1
 
 
 # --- counting ---
@@ -169,7 +169,7 @@ def test_before_a_background_full_of_lines_most_corners_at_the_ends_count():
 
 def test_ends_are_sure_when_two_fingers_show_four_corners_or_the_only_one_two():
     def sure(seen: list[int], might: list[int]) -> bool:
-        return FingerEndsSeen(np.array(seen), np.array(might)).sure
+        return FingerEndsSeen(np.array(seen), np.array(might), np.array(seen)).sure
 
     assert sure([2, 2], [3, 3]) and sure([3, 1], [3, 3]) and sure([2, 2, 0], [3, 3, 3]) and sure([2, 1, 1], [3, 3, 3])
     assert not sure([2, 1], [3, 3]) and not sure([1, 1], [3, 3]) and not sure([4, 0], [4, 4]), "one finger may be bent"

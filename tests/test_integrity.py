@@ -393,7 +393,8 @@ def test_hypotheses_know_what_kind_they_are():
 
 def test_without_ends_each_hypothesis_doubts_them_besides():
     every = of_two_fingers(has_opening=True)
-    without, more = every.without_ends()
+    without = every.without_ends()
+    more = without.more_than_ends
     np.testing.assert_array_equal(without.keep, every.keep * ALONG)
     np.testing.assert_array_equal(without.prior, every.prior)
     on_the_sides = [f"edge {name} belongs to something else" for name in ("a_out", "a_in", "b_out", "b_in")]
@@ -408,7 +409,8 @@ def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
     what looks like the ends, what reckons with one thing at a time states far too little.
     """
     every, risk, trials = of_two_fingers(), 1e-3, 100
-    without, more = every.without_ends()
+    without = every.without_ends()
+    more = without.more_than_ends
     both = Hypotheses(
         every.name + tuple(without.name[k] for k in np.flatnonzero(more)),
         *(

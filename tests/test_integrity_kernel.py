@@ -112,6 +112,14 @@ def test_jumps_are_those_of_numpy(seed: int):
         fit, jump = rng.integers(0, HYPOTHESES, 9), rng.integers(0, 4, 9)
         after = *frame, at, known, off, jumps, fit, jump
         agree(kernel.after_jumps(*after), by_numpy.after_jumps(*after))
+        share, along = np.array([0.4, 0.3, 0.2, 0.1]), np.array([False, False, True, True])
+        weights, endless = 10.0 ** rng.uniform(-4.0, 0.0, (2, HYPOTHESES)), rng.uniform(size=HYPOTHESES) < 0.5
+        weights[0, 2] = 0.0
+        of = *frame, at, known, off, jumps, share, along, *weights, stays, endless, 1e-3, 1.44
+        (fit, weight, left, *poses), (numbers, expected, rest, *others) = kernel.knocked(*of), by_numpy.knocked(*of)
+        assert 0 < len(fit) < 4 * HYPOTHESES and fit.tolist() == numbers.tolist()
+        np.testing.assert_allclose(np.append(weight, left), np.append(expected, rest), rtol=1e-8)
+        agree(tuple(poses), tuple(others))
 
 
 def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:

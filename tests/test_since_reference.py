@@ -173,7 +173,7 @@ def test_its_covariance_and_its_differences_are_those_of_the_published_pose():
     of_x, of_b = 1e-4 * rng.normal(size=(2, 6)), 1e-4 * rng.normal(size=(3, 6))
     at = at._replace(fits=at.fits._replace(shift=of_b))
     fits = Separation(of_x, np.tile(root @ root.T, (2, 1, 1)), np.zeros((2, 1, 6)))
-    made = at.of_motion(fits, x_T, reference_T, np.array([0, 2]), Opened(0.03, none), None)
+    made = at.differences(x_T, reference_T, Opened(0.03, none), None).of(fits, np.array([0, 2]))
     for row, (x, b) in enumerate(zip(of_x, of_b[[0, 2]], strict=True)):
         np.testing.assert_allclose(made.shift[row], jacobian[0] @ x + jacobian[1] @ b, rtol=1e-4, atol=1e-9)
         np.testing.assert_allclose(made.covariance[row], expected, rtol=1e-5, atol=1e-16)
@@ -193,8 +193,8 @@ def test_a_wrong_scale_counts_by_the_motion_and_the_jaws_travel():
     at = at_reference(reference_T)
 
     def of_scale(opening_m: float) -> np.ndarray:
-        made = at.of_motion(fits, x_T, reference_T, np.zeros(1, dtype=np.intp), Opened(opening_m, rate), common)
-        return made.of_model[0, -1]
+        made = at.differences(x_T, reference_T, Opened(opening_m, rate), common)
+        return made.of(fits, np.zeros(1, dtype=np.intp)).of_model[0, -1]
 
     np.testing.assert_allclose(-of_scale(0.03), way, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(of_scale(0.05) - of_scale(0.03), s * 0.02 * rate, rtol=1e-9, atol=1e-12)

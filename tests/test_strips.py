@@ -167,7 +167,9 @@ def test_what_lies_behind_the_fingers_ends_is_no_part_of_them(level_dn: float):
 
 @pytest.mark.parametrize("pitch_m", [1e-3, 1.5e-3, 2e-3, 4e-3])
 def test_ribs_are_not_seen_where_they_look_alike_a_rib_farther_on(pitch_m: float):
-    """At poses slid by a pitch or two: they are seen some pitches away, or nothing is decided."""
+    """At poses slid by a pitch or two: they are seen some pitches away, or nothing is decided.  Nor do they confirm
+    where they are: light changes ribs by as much as one more or less does.
+    """
     ribs = [
         FingerMark(from_tip_m=(k * pitch_m, (k + 0.5) * pitch_m), across=(-2.0, 2.0), gain=0.5)
         for k in range(1, round(0.03 / pitch_m))
@@ -179,7 +181,7 @@ def test_ribs_are_not_seen_where_they_look_alike_a_rib_farther_on(pitch_m: float
         seen = strips.compare(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
         assert not seen.here and (seen.undecided or seen.slide_m is not None)
     at_home = strips.compare(image, truth.cam_T_grip, truth.jaw_opening_m, RISK)
-    assert at_home.slide_m is None and at_home.here != at_home.undecided
+    assert at_home.slide_m is None and not at_home.here
 
 
 def test_they_go_on_after_a_restart():

@@ -309,7 +309,7 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
     """With one finger's end and the other's edge seen: at once a month it holds for long; at a hundred thousand times
     it doesn't outlast a second.
     """
-    half = FingerEndsSeen(np.array([1, 0]), np.array([3, 3]))
+    half = FingerEndsSeen(np.array([1, 0]), np.array([3, 3]), np.array([1, 0]))
     bound_m = {}
     for rate in (1.0, 1e5):
         monitor = new_monitor(MonitorSettings(policy=PolicySettings(mount_jumps_per_month=rate)))
@@ -339,7 +339,7 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     on_one_line = replace(normal, **{part.name: getattr(normal, part.name)[near] for part in fields(normal)})
     limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
     for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
-        ends, seen = FingerEndsSeen(np.array(corners), np.array([3, 3])), replace(measurement, normal=sides_and)
+        ends, seen = FingerEndsSeen(*map(np.array, (corners, [3, 3], corners))), replace(measurement, normal=sides_and)
         assert weigher._ends.misread(seen, ends) == pytest.approx(MISREAD_PROBABILITY**times)
         trust = weigher.weigh(seen, monitor._cam_T_grip, ends, at_s)
         assert not (trust.proven or trust.displaced)
@@ -349,10 +349,10 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
 def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pytest.MonkeyPatch):
     ends, looked, hidden = Tracker.ends, [], set(range(BEGINS, BEGINS + 6))
 
-    def counted(tracker: Tracker, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+    def counted(tracker: Tracker, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
         looked.append(frame.seq)
-        seen = ends(tracker, frame, measurement, strict)
-        return replace(seen, seen=np.array([1, 0])) if frame.seq in hidden else seen
+        seen = ends(tracker, frame, measurement)
+        return replace(seen, seen=np.array([1, 0]), strictly=np.array([1, 0])) if frame.seq in hidden else seen
 
     monkeypatch.setattr(Tracker, "ends", counted)
     watched(scene(BEGINS + 12))
@@ -473,7 +473,7 @@ def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
     assert measurement is not None and weigher.anchor is not None
-    every = FingerEndsSeen(np.array([3, 3]), np.array([3, 3]))
+    every = FingerEndsSeen(*3 * [np.array([3, 3])])
     proven, slid = (
         weigher.weigh(measurement, monitor._cam_T_grip, every, weigher.anchor.now_s, slid=slid)
         for slid in (False, True)
@@ -493,18 +493,24 @@ def test_three_corners_prove_a_pose_elsewhere_where_the_fingers_are_seen_along_t
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
     assert measurement is not None and weigher.anchor is not None
-    for corners, proven in (([2, 1], seen_along), ([2, 2], True), ([1, 1], False)):
-        ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
+    cases = (([2, 1], [1, 0], seen_along), ([2, 1], [0, 0], False), ([2, 2], [0, 0], True), ([1, 1], [0, 0], False))
+    for corners, strictly, proven in cases:
+        ends = FingerEndsSeen(np.array(corners), np.array([3, 3]), np.array(strictly))
         trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along)
         assert trust.displaced and trust.proven == proven
 
 
 @pytest.mark.parametrize(
     ("corners", "seen_along", "strictly", "proven"),
-    [([1, 1], True, 1, True), ([1, 1], True, 0, False), ([1, 1], False, 2, False), ([2, 0], True, 2, False)],
+    [
+        ([1, 1], True, [1, 1], True),
+        ([1, 1], True, [0, 0], False),
+        ([1, 1], False, [1, 1], False),
+        ([2, 0], True, [2, 0], False),
+    ],
 )
 def test_one_corner_of_each_finger_proves_a_pose_elsewhere_if_it_is_too_improbable_that_they_are_something_else(
-    corners: list[int], seen_along: bool, strictly: int, proven: bool, monkeypatch: pytest.MonkeyPatch
+    corners: list[int], seen_along: bool, strictly: list[int], proven: bool, monkeypatch: pytest.MonkeyPatch
 ):
     """0.1 each, 0.1 for each that is seen strictly, 1e-3 for the strips: at most the risk, 1e-5."""
     monkeypatch.setattr(Integrity, "_knocked", lambda *_: False)
@@ -513,10 +519,8 @@ def test_one_corner_of_each_finger_proves_a_pose_elsewhere_if_it_is_too_improbab
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
     assert measurement is not None and weigher.anchor is not None
-    ends = FingerEndsSeen(np.array(corners), np.array([3, 3]))
-    trust = weigher.weigh(
-        measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along, strictly=strictly
-    )
+    ends = FingerEndsSeen(np.array(corners), np.array([3, 3]), np.array(strictly))
+    trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along)
     assert trust.displaced and trust.proven == proven
 
 
@@ -545,9 +549,9 @@ def test_a_knock_has_to_prove_itself_strictly(monkeypatch: pytest.MonkeyPatch):
     """Ends that show only while a step on the finger isn't looked for are none."""
     ends = Tracker.ends
 
-    def but_for_steps(tracker: Tracker, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        seen = ends(tracker, frame, measurement, strict)
-        return replace(seen, seen=0 * seen.seen) if strict else seen
+    def but_for_steps(tracker: Tracker, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
+        seen = ends(tracker, frame, measurement)
+        return replace(seen, strictly=0 * seen.strictly)
 
     monkeypatch.setattr(Tracker, "ends", but_for_steps)
     assert not knock_followed(monkeypatch)

@@ -87,7 +87,7 @@ def sigma_m_of(measurement: Measurement, chosen: np.ndarray) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
 
-NO_END = FingerEndsSeen(np.array([0, 0]), np.array([3, 3]))
+NO_END = FingerEndsSeen(np.array([0, 0]), np.array([3, 3]), np.array([0, 0]))
 
 
 def test_tapered_fingers_need_ends_where_one_more_wrong_edge_leaves_too_little():

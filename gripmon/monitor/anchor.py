@@ -17,7 +17,7 @@ from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.bounds import SIGMA_INFLATION, Cases, TwoDoubts, protection_of
+from gripmon.monitor.bounds import SIGMA_INFLATION, Cases, protection_of
 from gripmon.monitor.refits import Refits
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, telling, with_known
 
@@ -170,11 +170,12 @@ class Anchor:
         covariance = covariance if wander is None else covariance + np.diag(wander)
         return with_known(fits, perturbation_between(at_T, origin_T), covariance)
 
-    def doubts(
-        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, prior: Array, staying: Array
-    ) -> TwoDoubts:
+    def cases(
+        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, prior: Array
+    ) -> tuple[Cases, Cases]:
         """The lasting hypotheses, of a ``prior`` (g,), about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of
-        them; ``wander`` (6,): variance of the motion since the anchor; ``staying`` as for :meth:`ModelError.since`.
+        them, and the same by what is known without the origin; ``wander`` (6,): variance of the motion since the
+        anchor.
 
         Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
         What neither shows is known as it was at the origin.
@@ -183,10 +184,8 @@ class Anchor:
         frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander, frame, rows, CONTRADICTION_SQUARE)
-        name, model = self._lasting.name, fits.model
-        absolute = model.absolute(Cases(name, prior, self._with_origin(told, cam_T_grip, wander)), cam_T_grip)
-        lasting = np.arange(len(prior))
-        return TwoDoubts(absolute, model.since(Cases(name, prior, told), cam_T_grip, fits.opened, lasting, staying))
+        name, with_origin = self._lasting.name, self._with_origin(told, cam_T_grip, wander)
+        return Cases(name, prior, with_origin), Cases(name, prior, told)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

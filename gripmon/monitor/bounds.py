@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.since import AtReference, Bounds, CommonError, Opened
+from gripmon.monitor.since import AtReference, Bounds, CommonError, Differences, Opened
 from gripmon.track.integrity import Doubts, Separation
 
 SIGMA_INFLATION = 1.2
@@ -39,6 +39,8 @@ class Cases(NamedTuple):
     @classmethod
     def together(cls, cases: list[Cases]) -> Cases:
         """All of them; at least one set."""
+        if len(cases) == 1:
+            return cases[0]
         name, prior, fits = zip(*cases, strict=True)
         joined = Separation(*(np.concatenate(each) for each in zip(*fits, strict=True)))
         return cls(tuple(chain.from_iterable(name)), np.concatenate(prior), joined)
@@ -73,39 +75,40 @@ class ModelError(NamedTuple):
         """Number of the gripper's parts that may be off: its fingers, and its edges each by itself."""
         return self.fingers + len(self.finger)
 
-    def doubts(self, cases: Cases, cam_T_grip: Array, opened: Opened) -> TwoDoubts:
-        """The doubts about a pose (4, 4), with what is common to all of them."""
-        return TwoDoubts(self.absolute(cases, cam_T_grip), self.since(cases, cam_T_grip, opened))
+    def differences(self, cam_T_grip: Array, opened: Opened) -> Differences | None:
+        """What makes fits near a pose (4, 4) fits of the motion since the reference; None while nothing was measured
+        there.
+        """
+        first, reference_T = self.first
+        return None if first is None else first.differences(cam_T_grip, reference_T, opened, self.common)
 
     def absolute(self, cases: Cases, cam_T_grip: Array) -> Doubts:
-        """Those about the pose itself."""
+        """The doubts about a pose (4, 4), with what is common to all of them."""
         common, (name, prior, fits) = self.common, cases
         if common is None:
             return Doubts.of(name, prior, fits, SIGMA_INFLATION)
         return common.reaching(Doubts.of(name, prior, common.on(fits, cam_T_grip), SIGMA_INFLATION))
 
-    def since(
-        self,
-        cases: Cases,
-        cam_T_grip: Array,
-        opened: Opened,
-        lasting: NDArray[np.intp] | None = None,
-        staying: Array | None = None,
-    ) -> Doubts:
-        """Those about the motion since the reference.  ``lasting`` (r,): which of the lasting hypotheses each is, that
-        held in the reference's frames, too; 0 or None: nothing was wrong then.  ``staying`` (6, 6): covariance of the
-        motion that a mount makes, where the fits don't contain that.
-        """
-        (name, prior, fits), (first, reference_T) = cases, self.first
-        if first is None:
-            # This frame is the first one: as uncertain again.
-            motion = fits._replace(covariance=2.0 * fits.covariance, of_model=np.zeros_like(fits.of_model))
-        else:
-            lasting = np.zeros(len(prior), dtype=np.intp) if lasting is None else lasting
-            motion = first.of_motion(fits, cam_T_grip, reference_T, lasting, opened, self.common)
-            if staying is not None:
-                motion = first.staying(motion, cam_T_grip, reference_T, staying)
+
+def doubts_since(
+    cases: Cases,
+    differences: Differences | None,
+    lasting: NDArray[np.intp] | None = None,
+    staying: Array | None = None,
+) -> Doubts:
+    """The doubts about the motion since the reference; without ``differences`` this frame is the first one.
+
+    ``lasting`` (r,): which of the lasting hypotheses each is, that held in the reference's frames, too; None: nothing
+    was wrong then.  ``staying`` (6, 6): covariance of the motion that a mount makes, where the fits don't contain that.
+    """
+    name, prior, fits = cases
+    if differences is None:  # as uncertain again
+        motion = fits._replace(covariance=2.0 * fits.covariance, of_model=np.zeros_like(fits.of_model))
         return Doubts.of(name, prior, motion, SIGMA_INFLATION)
+    motion = differences.of(fits, np.zeros(len(prior), dtype=np.intp) if lasting is None else lasting)
+    if staying is not None:
+        motion = differences.staying(motion, staying)
+    return Doubts.of(name, prior, motion, SIGMA_INFLATION)
 
 
 def unbounded(risk: float, why: str) -> Bounds:

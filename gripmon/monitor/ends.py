@@ -39,7 +39,9 @@ class EndsEvidence:
     ) -> float:
         """Probability that what is seen where the fingers' ends are expected is something else; ``kept`` (v,): the
         measured edges that count, None for all.  A finger's root isn't an end, nor is an edge that goes on beyond a
-        corner, and edges on one line count once, of whichever fingers: a single straight border may show them all.
+        corner, and edges on one line count once, of whichever fingers: a single straight border may show them all.  A
+        finger counts once less where something goes on by a few pixels beyond each of its corners: that is what a slide
+        by a few pixels looks like.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]
@@ -50,7 +52,10 @@ class EndsEvidence:
         times = self._times(edges, ends)
         if ends is not None and not ends.seen.any() and _on_one_line(measurement, edges):
             times = min(times, 1)
-        return MISREAD_PROBABILITY**times
+        if ends is not None:
+            fingers = list(set(self._finger[edges].tolist()))
+            times -= int(np.count_nonzero((ends.seen[fingers] > 0) & (ends.strictly[fingers] == 0)))
+        return MISREAD_PROBABILITY ** max(times, 0)
 
     def sides_misread(self, measurement: Measurement) -> float:
         """Probability that all sides of fingers that are seen are something else, each as probably as an end."""
@@ -67,11 +72,9 @@ class EndsEvidence:
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
 
-def strict_fingers(strict: FingerEndsSeen, ends: FingerEndsSeen) -> int:
-    """At how many fingers no edge goes on beyond the ``ends`` even by a few pixels: looked at strictly, none of their
-    corners is lost.
-    """
-    return int(np.count_nonzero((strict.seen > 0) & (strict.seen >= ends.seen)))
+def strict_fingers(ends: FingerEndsSeen) -> int:
+    """At how many fingers nothing goes on beyond any of the corners seen, even by a few pixels."""
+    return int(np.count_nonzero((ends.seen > 0) & (ends.strictly >= ends.seen)))
 
 
 def within(probability: float, risk: float) -> bool:
@@ -81,12 +84,13 @@ def within(probability: float, risk: float) -> bool:
 
 def proves(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
     """Whether the fingers' ends are seen as ends.  Not ``elsewhere`` than expected fewer corners suffice; where the
-    innovation is within noise (``again``), one of each finger.
+    innovation is within noise (``again``), one of each finger; but one of these strictly, since a slide by a few pixels
+    shows everywhere that something goes on.
     """
     if ends is None:
         return False
     expected = not elsewhere and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
-    return ends.sure or expected or (again and ends.at_each)
+    return ends.sure or ((expected or (again and ends.at_each)) and bool(ends.strictly.any()))
 
 
 def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:

@@ -42,7 +42,7 @@ class Mount:
         return np.maximum(self._swing, 0.0)
 
     def learn(self, way: Array, noise: Array) -> None:
-        """Learn the vibration from the ``way`` (6,) between proven poses; ``noise`` (6,): variances of their errors."""
+        """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
         self._swing = swinging(self._swing, way, noise)
 
     def creep(self, elapsed_s: float) -> Array:

@@ -14,7 +14,7 @@ from gripmon.model.records import Array
 from gripmon.monitor.bounds import SIGMA_INFLATION, Cases, ModelError
 from gripmon.monitor.since import Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
-from gripmon.track.integrity import Doubts, Hypotheses, Knocks, Separation, after_jumps, jumped, with_and_without
+from gripmon.track.integrity import Hypotheses, Knocks, Separation, knocked, with_and_without
 
 
 @cache
@@ -128,34 +128,26 @@ class Refits:
         others.  Those less probable than ``least``, given the fits, are left out; also returns their probability
         together.
         """
-        (at, covariance, of_model), endless = self._known, self.hypotheses.endless
-        share = (np.where(endless, odds[1], odds[0]) * (prior > 0.0))[:, None] * knocks.share
-        given = jumped(self._free, at, covariance, of_model, knocks.covariance, share, self.stays, SIGMA_INFLATION**2)
-        # Without an end nothing shows a knock along the fingers; that it is exactly along them isn't held against it.
-        given = np.where(endless[:, None] & knocks.along, np.maximum(given, share), given)
-        weight = prior[:, None] * given
-        counts = weight > least
-        fit, jump = np.nonzero(counts)
-        fits = after_jumps(self._free, at, covariance, of_model, knocks.covariance, fit, jump)
+        endless, known = self.hypotheses.endless, self._known
+        probable = np.where(endless, odds[1], odds[0])
+        fit, weight, fits, left_out = knocked(
+            self._free, *known, knocks, prior, probable, self.stays, endless, least, SIGMA_INFLATION**2
+        )
         name = tuple(self.hypotheses.name[k] for k in fit.tolist())
-        return Cases(name, weight[counts], self._beside(fits, cam_T_grip)), float(weight[~counts].sum())
+        return Cases(name, weight, self._beside(fits, cam_T_grip)), left_out
 
-    def wrong_at_first(
-        self, name: tuple[str, ...], prior: Array, cam_T_grip: Array, anchored: Anchored | None, staying: Array
-    ) -> Doubts:
-        """The doubts about the motion since the reference's frames that one of the lasting hypotheses, ``name`` and
-        ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the pose (4, 4) rests on the frame
-        alone; ``staying`` as for :meth:`ModelError.since`.
+    def wrong_at_first(self, lasting: tuple[str, ...], prior: Array, anchored: Anchored | None) -> Cases:
+        """Of the motion since the reference's frames: one of the lasting hypotheses but the first, by name and of a
+        ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the pose rests on the frame alone.
         """
-        lasting = np.arange(1, len(prior))
+        name = _in_the_references_frames(lasting)
         covariance, of_model = (self._free if anchored is None else anchored.fits)[1:]
         now = Separation(
-            np.zeros((len(lasting), 6)),
-            np.broadcast_to(covariance[0] + self._floor, (len(lasting), 6, 6)),
-            np.broadcast_to(of_model[0], (len(lasting), *of_model.shape[1:])),
+            np.zeros((len(name), 6)),
+            np.tile(covariance[0] + self._floor, (len(name), 1, 1)),
+            np.tile(of_model[0], (len(name), 1, 1)),
         )
-        cases = Cases(_in_the_references_frames(name), prior[1:], now)
-        return self.model.since(cases, cam_T_grip, self.opened, lasting, staying)
+        return Cases(name, prior[1:], now)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

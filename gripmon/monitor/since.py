@@ -140,6 +140,34 @@ class Average(Protocol):
         """The protection level of the average itself."""
 
 
+class Differences(NamedTuple):
+    """What makes fits of a pose fits of exp(d) reference, as differences from the published ones: the ``first`` fits
+    b, under g lasting hypotheses, the Jacobians and covariance of :func:`of_motion`, the errors by the model that all
+    have besides, ``longer`` (k, 6), and the pose of a mount that hasn't moved (6,).
+    """
+
+    first: Separation
+    lever: Array
+    turn: Array
+    more: Array
+    longer: Array
+    unmoved: Array
+
+    def of(self, fits: Separation, lasting: NDArray[np.intp]) -> Separation:
+        """Of h hypotheses; ``lasting`` (h,): under which of the lasting ones b is taken; 0: nothing was wrong then."""
+        made = of_motion(fits, self.first, lasting, self.lever, self.turn, self.more)
+        if not len(self.longer):
+            return made
+        rows = np.broadcast_to(self.longer, (len(lasting), *self.longer.shape))
+        return made._replace(of_model=np.concatenate([made.of_model, rows], axis=1))
+
+    def staying(self, motion: Separation, covariance: Array) -> Separation:
+        """These joined with what is known of the motion beforehand: that the mount stays where it is but for a
+        ``covariance`` (6, 6).
+        """
+        return with_known(motion, self.unmoved, covariance)
+
+
 class AtReference(NamedTuple):
     """What the monitor measured at the reference: ``fits`` under each of g lasting hypotheses as shifts from
     ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
@@ -161,34 +189,20 @@ class AtReference(NamedTuple):
         lever, turn = self._jacobians(cam_T_grip, reference_T)
         return np.asarray(lever @ (covariance + turn @ self.fits.covariance[0] @ turn.T) @ lever.T)
 
-    def of_motion(
-        self,
-        fits: Separation,
-        cam_T_grip: Array,
-        reference_T: Array,
-        lasting: NDArray[np.intp],
-        opened: Opened,
-        common: CommonError | None,
-    ) -> Separation:
-        """Fits of h hypotheses, as differences from a published pose (4, 4), made differences of exp(d) reference.
-
-        ``lasting`` (h,): under which of the lasting hypotheses b is taken; 0: nothing was wrong then.
-        """
-        jacobians = self._jacobians(cam_T_grip, reference_T)
-        if common is None:
-            return of_motion(fits, self.fits, lasting, *jacobians, np.zeros((6, 6)))
+    def differences(
+        self, cam_T_grip: Array, reference_T: Array, opened: Opened, common: CommonError | None
+    ) -> Differences:
+        """How fits near a published pose (4, 4) differ from that of exp(d) reference."""
+        lever, turn = self._jacobians(cam_T_grip, reference_T)
         motion = self.motion(cam_T_grip)
-        made = of_motion(fits, self.fits, lasting, *jacobians, common.of_motion(motion, self.cam_T_grip))
-        travel_m = opened.jaw_opening_m - self.jaw_opening_m
-        longer = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
-        row = np.broadcast_to(common.scale_sigma * (jacobians[0] @ longer), (len(lasting), 1, 6))
-        return made._replace(of_model=np.concatenate([made.of_model, row], axis=1))
-
-    def staying(self, motion: Separation, cam_T_grip: Array, reference_T: Array, covariance: Array) -> Separation:
-        """Motions since the reference, as differences from that of a published pose (4, 4), joined with what is known
-        of it beforehand: that the mount stays where it is but for a ``covariance`` (6, 6).
-        """
-        return with_known(motion, perturbation_between(self.motion(cam_T_grip) @ reference_T, reference_T), covariance)
+        more: Array = np.zeros((6, 6))
+        longer: Array = np.zeros((0, 6))
+        if common is not None:
+            more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
+            off = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
+            longer = common.scale_sigma * (lever @ off)[None]
+        unmoved = perturbation_between(motion @ reference_T, reference_T)
+        return Differences(self.fits, lever, turn, more, longer, unmoved)
 
     def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
         """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is

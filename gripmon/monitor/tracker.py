@@ -193,10 +193,10 @@ class Tracker:
         if opening and measurement.jaw_seen is not None:
             self._jaw.learn(measurement.jaw_seen)
 
-    def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+    def ends(self, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as ends; takes a quarter of a measurement's time."""
         assert frame.image is not None
-        return self._meter.ends(frame.image, measurement, strict)
+        return self._meter.ends(frame.image, measurement)
 
     @property
     def finger_axis(self) -> Array:

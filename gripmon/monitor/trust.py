@@ -18,23 +18,17 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, Image, MonitorState, ReferenceRecord, StripsRecord
 from gripmon.monitor.bounds import reaching, unbounded
-from gripmon.monitor.ends import CORNERS_WHERE_EXPECTED, strict_fingers
+from gripmon.monitor.ends import CORNERS_WHERE_EXPECTED
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import LOOK_ODDS, Weigher
-from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges import Measurement
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
-
-
-STRICT_FROM_RATIO = 0.1
-"""Probability over the integrity risk that what looked like the ends was something else in every frame so far, from
-which ends are also checked strictly: below it is lost in the bound's other parts.
-"""
 
 
 class _Candidate(NamedTuple):
@@ -79,7 +73,6 @@ class Integrity:
         self._elsewhere = 0
         self._believed = False
         self._ends_seen = False
-        self._strict: tuple[Measurement, FingerEndsSeen] | None = None
 
     def strips_state(self) -> StripsRecord | msgspec.UnsetType:
         """The fingers' strips for the state file; unset before they are learnt."""
@@ -186,9 +179,9 @@ class Integrity:
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
-            strict = self._strict_ends(frame, measurement)
-            fingers, seen_along = strict_fingers(strict, strict), here.along.here
-            again = self._weigher.weigh(measurement, cam_T_grip, strict, now_s, seen_along=seen_along, strictly=fingers)
+            assert trust.ends is not None
+            strict, seen_along = trust.ends.only_strictly, here.along.here
+            again = self._weigher.weigh(measurement, cam_T_grip, strict, now_s, seen_along=seen_along)
             proven = again.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
@@ -209,18 +202,10 @@ class Integrity:
             trust = weigher.weigh(measurement, cam_T_grip, None, now_s)
             if not self._past_limit(trust.bounds):
                 return trust
-        ends, strictly = self._tracker.ends(frame, measurement), 0
-        if displaced or weigher.misread_ever > STRICT_FROM_RATIO * self._policy.integrity_risk:
-            strictly = strict_fingers(self._strict_ends(frame, measurement), ends)
-        trust = weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here, strictly=strictly)
+        ends = self._tracker.ends(frame, measurement)
+        trust = weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
         self._ends_seen = trust.proven
         return trust
-
-    def _strict_ends(self, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
-        """The fingers' ends as they are seen strictly, once for each measurement."""
-        if self._strict is None or self._strict[0] is not measurement:
-            self._strict = measurement, self._tracker.ends(frame, measurement, strict=True)
-        return self._strict[1]
 
     def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
         """A candidate, corrected where the fingers' strips show that it has slid along them, because something else was

@@ -28,15 +28,16 @@ from gripmon.monitor.bounds import (
     ModelError,
     TwoDoubts,
     bounds_of,
+    doubts_since,
     larger,
     reaching,
     unbounded,
 )
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, within
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.mount import KNOCK_UNSEEN_PROBABILITY, Mount
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import AtReferences, Bounds, CommonError
+from gripmon.monitor.since import AtReferences, Bounds, CommonError, Differences
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
@@ -157,17 +158,16 @@ class Weigher:
         look_seen: bool = False,
         slid: bool = False,
         seen_along: bool = False,
-        strictly: int = 0,
     ) -> Trust:
         """Bound the error of ``cam_T_grip`` (4, 4), which the measurement gave.
 
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
-        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  ``strictly``: at
-        how many fingers no edge goes on beyond the ends even by a few pixels; each is worth as much as one more corner.
-        Of narrow tips a view may have one corner each: they prove the pose, too, where all of that together leaves no
-        more than the risk that they are something else.
+        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  Each finger beyond
+        whose ends nothing goes on even by a few pixels is worth as much as one more corner.  Of narrow tips a view may
+        have one corner each: they prove the pose, too, where all of that together leaves no more than the risk that
+        they are something else.
         """
         risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
@@ -182,6 +182,7 @@ class Weigher:
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
+        strictly = 0 if ends is None else strict_fingers(ends)
         misread_strictly = misread * MISREAD_PROBABILITY**strictly
         since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
         if ends is not None and ends.at_each and not slid and (strictly or not displaced):
@@ -197,8 +198,9 @@ class Weigher:
         without = self._without_ends(measurement, fits, besides, displaced)
         wrong, left_out = self._knocked_cases(fits, without, cam_T_grip, prior, knocks, odds)
         cases = Cases.together([fits.cases(cam_T_grip, prior, anchored).among(fits.stays), *wrong])
-        doubts = fits.model.doubts(cases, cam_T_grip, fits.opened)
-        doubts = self._with_lasting(doubts, fits, cam_T_grip, now_s, knocks, displaced)
+        differences = fits.model.differences(cam_T_grip, fits.opened)
+        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), doubts_since(cases, differences))
+        doubts = self._with_lasting(doubts, fits, differences, cam_T_grip, displaced, now_s, knocks)
         both = self._with_questions(bounds_of(doubts, risk, left_out), cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = fits if proven or without is None else without
@@ -261,21 +263,34 @@ class Weigher:
         return both._replace(absolute=absolute)
 
     def _with_lasting(
-        self, doubts: TwoDoubts, fits: Refits, cam_T_grip: Array, now_s: float, knocks: Knocks, displaced: bool
+        self,
+        doubts: TwoDoubts,
+        fits: Refits,
+        differences: Differences | None,
+        cam_T_grip: Array,
+        displaced: bool,
+        now_s: float,
+        knocks: Knocks,
     ) -> TwoDoubts:
         """The doubts with those of what may have been wrong all along, or in the reference's frames."""
-        anchor, name = self.anchor, self._lasting.name
+        anchor, since, lasting = self.anchor, list[Cases](), list[NDArray[np.intp]]()
         ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
         prior = self._lasting.priors(ever)
-        staying = self._staying(now_s, knocks, displaced)
+        every = np.arange(len(prior))
         if anchor is not None and not displaced:
-            rows = self._about(fits.edges).rows
-            doubts = doubts + anchor.doubts(cam_T_grip, fits, rows, self._wander(now_s), prior, staying)
-        if fits.model.first[0] is None:
+            rows, wander = self._about(fits.edges).rows, self._wander(now_s)
+            absolute, told = anchor.cases(cam_T_grip, fits, rows, wander, prior)
+            doubts = replace(doubts, absolute=doubts.absolute + fits.model.absolute(absolute, cam_T_grip))
+            since, lasting = [told], [every]
+        if differences is not None:
+            anchored = None if displaced else fits.anchored
+            since.append(fits.wrong_at_first(self._lasting.name, prior, anchored))
+            lasting.append(every[1:])
+        if not since:
             return doubts
-        anchored = None if displaced else fits.anchored
-        at_first = fits.wrong_at_first(name, prior, cam_T_grip, anchored, staying)
-        return replace(doubts, since=doubts.since + at_first)
+        staying = self._staying(now_s, knocks, displaced)
+        more = doubts_since(Cases.together(since), differences, np.concatenate(lasting), staying)
+        return replace(doubts, since=doubts.since + more)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
@@ -419,7 +434,9 @@ class Weigher:
         fingers show a motion along themselves even without their ends.
         """
         cases = fits.cases(cam_T_grip, fits.hypotheses.prior)
-        both = bounds_of(fits.model.doubts(cases, cam_T_grip, fits.opened), self._policy.integrity_risk)
+        since = doubts_since(cases, fits.model.differences(cam_T_grip, fits.opened))
+        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), since)
+        both = bounds_of(doubts, self._policy.integrity_risk)
         return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
@@ -485,4 +502,5 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
     cases = fits.cases(measurement.cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
-    return bounds_of(model.doubts(cases, measurement.cam_T_grip, fits.opened), settings.policy.integrity_risk)
+    doubts = TwoDoubts(model.absolute(cases, measurement.cam_T_grip), doubts_since(cases, None))
+    return bounds_of(doubts, settings.policy.integrity_risk)

@@ -8,7 +8,7 @@ Where little shows of a rounding it is like a corner, at which neither of its tw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,12 +47,15 @@ CONTINUATION_STEP_RATIO = 0.4
 @dataclass(frozen=True, slots=True)
 class FingerEndsSeen:
     """(f,) corners at the end of each finger, or places where its sides turn into a curve: ``seen`` with nothing that
-    goes on beyond them, and those that ``might`` be seen in this view.  ``past``: the edges at the ends that go on
-    beyond one of their corners: borders of something longer, which a finger's side may cross in a second corner.
+    goes on beyond them, and those that ``might`` be seen in this view; ``strictly`` those seen beyond which nothing
+    goes on by a few pixels either, as beyond a step on the finger; clutter does, too.  ``past``: the edges at the ends
+    that go on beyond one of their corners: borders of something longer, which a finger's side may cross in a second
+    corner.
     """
 
     seen: NDArray[np.intp]
     might: NDArray[np.intp]
+    strictly: NDArray[np.intp]
     past: frozenset[int] = frozenset()
 
     @property
@@ -70,6 +73,11 @@ class FingerEndsSeen:
         """Whether one is seen on each of the fingers whose ends the view has, which are two or more."""
         in_view = self.might > 0
         return bool(np.count_nonzero(in_view) >= 2 and (self.seen[in_view] > 0).all())
+
+    @property
+    def only_strictly(self) -> FingerEndsSeen:
+        """With those alone that are seen strictly."""
+        return replace(self, seen=self.strictly)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,17 +161,13 @@ class FingerEnds:
         """(s,) the finger of each place at which one ends."""
         return self._places.finger
 
-    def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """How many of each finger's ends are seen; takes a quarter of a measurement's time.
-
-        ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
-        """
+    def seen(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
+        """How many of each finger's ends are seen; takes a quarter of a measurement's time."""
         fingers = len(self._gripper.finger_ids)
-        places, past = self._at_places(image, measurement, strict)
+        places, strictly, past = self._at_places(image, measurement)
+        in_view = self.in_view(measurement.prediction)
         return FingerEndsSeen(
-            np.bincount(self.finger[places], minlength=fingers),
-            np.bincount(self.finger[self.in_view(measurement.prediction)], minlength=fingers),
-            past,
+            *(np.bincount(self.finger[each], minlength=fingers) for each in (places, in_view, strictly)), past
         )
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
@@ -174,10 +178,10 @@ class FingerEnds:
         return places.at_end & np.where(places.corner < 0, curved, _of_corners(prediction.corners.visible, places))
 
     def _at_places(
-        self, image: Image, measurement: Measurement, strict: bool
-    ) -> tuple[NDArray[np.bool_], frozenset[int]]:
+        self, image: Image, measurement: Measurement
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], frozenset[int]]:
         """(s,) the measured places that are ends: no edge goes on beyond them, nor an edge across the finger beyond its
-        other corner.  And which edges across go on.
+        other corner; (s,) those of them that are ends strictly.  And which edges across go on.
         """
         prediction, places = measurement.prediction, self._places
         if self._kept is None or self._kept[0] is not prediction:
@@ -193,14 +197,16 @@ class FingerEnds:
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
             measured[number] = seen and (shown >= SHOWN_BESIDE * usual).all()
         if not len(probes.place) or not measured.any():
-            return measured, frozenset()
+            return measured, measured, frozenset()
         goes_on, by_a_few_px = self._going_on(image, measurement, probes)
         extended = edge[probes.sample]
         past = frozenset(extended[goes_on & ~self.along[extended]].tolist())
-        measured[probes.place[goes_on | by_a_few_px if strict else goes_on]] = False
+        measured[probes.place[goes_on]] = False
         for number in np.flatnonzero(measured & (places.corner >= 0)).tolist():
             measured[number] = past.isdisjoint(self._at_corner[places.corner[number]])
-        return measured, past
+        strictly = measured.copy()
+        strictly[probes.place[by_a_few_px]] = False
+        return measured, strictly, past
 
     def _going_on(
         self, image: Image, measurement: Measurement, probes: _Probes

@@ -211,7 +211,7 @@ class FingertipMeter(FingerMeter):
             for place in places:
                 other = replace(self._settle(image, place), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
-                if best.trusted and not self.ends(image, other, strict=True).sure:
+                if best.trusted and not self.ends(image, other).only_strictly.sure:
                     continue
                 if other.consensus.share > beat and other.trusted >= best.trusted:
                     best, beat = other, other.consensus.share
@@ -233,9 +233,9 @@ class FingertipMeter(FingerMeter):
         """An opening within the jaw's range: encoders report a little beyond its ends."""
         return min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
 
-    def ends(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+    def ends(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as ends where they were measured."""
-        return self._ends.seen(image, measurement, strict)
+        return self._ends.seen(image, measurement)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
         """The best of the zooms: the image may have lost, or regained, its focus.  Once the gripper is lost, one other

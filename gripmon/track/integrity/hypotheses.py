@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ exchanged, or the jaw opening off by more than the report's standard deviation a
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
@@ -37,17 +38,17 @@ class Hypotheses:
     ends: int
     grasp: tuple[int, ...] = ()
 
-    @property
+    @cached_property
     def across(self) -> NDArray[np.bool_]:
         """(v,) the edges that don't run along the fingers: their ends."""
         return self.keep[self.ends] == 0.0
 
-    @property
+    @cached_property
     def endless(self) -> NDArray[np.bool_]:
         """(h,) which leave no end of a finger."""
         return np.asarray((self.keep[:, self.across] == 0.0).all(axis=1))
 
-    @property
+    @cached_property
     def more_than_ends(self) -> NDArray[np.bool_]:
         """(h,) which doubt something else than the ends."""
         return np.asarray((self.keep[:, ~self.across] == 0.0).any(axis=1) | self.opening)

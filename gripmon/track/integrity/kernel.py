@@ -368,6 +368,56 @@ def after_jumps(
 
 
 @compiled
+def knocked(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    share: Array,
+    along: Bools,
+    prior: Array,
+    probable: Array,
+    stays: Bools,
+    endless: Bools,
+    least: float,
+    times: float,
+) -> tuple[Ints, Array, float, Array, Array, Array]:
+    """The r fits and jumps that are more probable together than ``least``: numbers of the fits (r,), probabilities
+    (r,), that of all others, and the poses then as by :func:`after_jumps`.
+
+    ``share`` (c,): how probable each of the ``jumps`` (c, 6, 6) is once there is one, ``along`` (c,): those that an
+    ``endless`` (h,) fit doesn't show, so that nothing is held against them; ``prior`` (h,): of the fits; ``probable``
+    (h,): of a jump under each.  The others as for :func:`jumped`.
+    """
+    count, kinds = len(prior), len(share)
+    weight, total, before = np.zeros((count, kinds)), 0, np.zeros((count, kinds))
+    for h in range(count):
+        for c in range(kinds):
+            before[h, c] = probable[h] * share[c] if prior[h] > 0.0 else 0.0
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    left_out = 0.0
+    for h in range(count):
+        for c in range(kinds):
+            most = max(given[h, c], before[h, c]) if endless[h] and along[c] else given[h, c]
+            weight[h, c] = prior[h] * most
+            if weight[h, c] > least:
+                total += 1
+            else:
+                left_out += weight[h, c]
+    fit, jump, probability, r = np.empty(total, np.intp), np.empty(total, np.intp), np.empty(total), 0
+    for h in range(count):
+        for c in range(kinds):
+            if weight[h, c] > least:
+                fit[r], jump[r], probability[r] = h, c, weight[h, c]
+                r += 1
+    shifts, covariances, offs = after_jumps(shift, covariance, off, at, known, known_off, jumps, fit, jump)
+    return fit, probability, left_out, shifts, covariances, offs
+
+
+@compiled
 def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
     """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
 

@@ -23,6 +23,7 @@ from scipy.special import chdtri
 
 from gripmon.model.records import Array
 from gripmon.track.integrity import kernel
+from gripmon.track.integrity.knocks import Knocks
 
 LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
@@ -162,40 +163,32 @@ def telling(
     return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
 
 
-def jumped(
+def knocked(
     frame: Separation,
     at: Array,
     known: Array,
     of_model: Array,
-    jumps: Array,
+    knocks: Knocks,
     prior: Array,
+    probable: Array,
     stays: NDArray[np.bool_],
+    endless: NDArray[np.bool_],
+    least: float,
     times: float,
-) -> Array:
-    """Probabilities (h, c) that under each hypothesis the pose, known to have been ``at`` (6,) but for a covariance
-    ``known`` (6, 6) and ``of_model`` (f or 1, 6), made each of c ``jumps`` (c, 6, 6) of the probabilities ``prior``
-    (h, c), given the frame's fits; ``stays`` (h,): whether it may as well have stayed.  ``times``: factor on the fits'
-    covariances for their tails.
-    """
-    return kernel.jumped(*frame, at, known, of_model, jumps, prior, stays, times)
+) -> tuple[NDArray[np.intp], Array, Separation, float]:
+    """Under which hypotheses (r,) the pose, known to have been ``at`` (6,) but for a covariance ``known`` (6, 6) and
+    ``of_model`` (f or 1, 6), was knocked, with which probability (r,), and where it is then, given the frame's fits.
+    And the probability of what is less probable than ``least``, together, which is left out.
 
-
-def after_jumps(
-    frame: Separation,
-    at: Array,
-    known: Array,
-    of_model: Array,
-    jumps: Array,
-    fit: NDArray[np.intp],
-    jump: NDArray[np.intp],
-) -> Separation:
-    """The fits ``fit`` (r,) of a frame joined with the pose known before, once it has made the jumps ``jump`` (r,);
-    ``of_model`` (f or 1, 6) as of the pose known before.
+    ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether it may as well
+    have stayed; ``endless`` (h,): whether no end of a finger is left, which alone show a knock along the fingers: that
+    it is exactly along them isn't held against it then.  ``times``: factor on the fits' covariances for their tails.
     """
-    fit, jump = map(
-        np.ascontiguousarray, (fit, jump)
-    )  # np.nonzero gives columns of one array, or copies of one element
-    return Separation(*kernel.after_jumps(*frame, at, known, of_model, jumps, fit, jump))
+    known_before, of = (at, known, of_model), (knocks.covariance, knocks.share, knocks.along)
+    fit, weight, left_out, *fits = kernel.knocked(
+        *frame, *known_before, *of, prior, probable, stays, endless, least, times
+    )
+    return fit, weight, Separation(*fits), left_out
 
 
 class Tails(NamedTuple):
@@ -295,8 +288,7 @@ def warm_up() -> None:
         with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
     averages, _ = follow(fits, fits, none)
     with_known(of_motion(fits, fits, np.arange(2), np.eye(6), np.eye(6), np.eye(6)), none, np.eye(6))
-    jumps = np.ascontiguousarray(each[:, :6, :6])
-    jumped(fits, none, np.eye(6), fits.of_model[0], jumps, np.full((2, 2), 0.1), np.ones(2, dtype=np.bool_), 1.0)
-    after_jumps(fits, none, np.eye(6), fits.of_model[0], jumps, *np.nonzero(np.eye(2)))
+    some, yes = np.full(2, 0.1), np.ones(2, dtype=np.bool_)
+    knocked(fits, none, np.eye(6), fits.of_model[0], Knocks.of(none[:3]), some, some, yes, yes, 1e-9, 1.0)
     told = telling(averages, none, none, fits, np.arange(2), 1.0)
     Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)

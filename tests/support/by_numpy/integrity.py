@@ -129,6 +129,32 @@ def after_jumps(
     return joined(np.tile(at, (count, 1)), before, known_off, shift[fit], covariance[fit], off[fit])
 
 
+def knocked(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    share: Array,
+    along: Array,
+    prior: Array,
+    probable: Array,
+    stays: Array,
+    endless: Array,
+    least: float,
+    times: float,
+) -> tuple[Ints, Array, float, Array, Array, Array]:
+    before = np.outer(probable, share)
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    weight = prior[:, None] * np.where(np.outer(endless, along), np.maximum(given, before), given)
+    counts = weight > least
+    fit, jump = np.nonzero(counts)
+    poses = after_jumps(shift, covariance, off, at, known, known_off, jumps, fit, jump)
+    return fit, weight[counts], float(weight[~counts].sum()), *poses
+
+
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
     parts = shift.reshape(-1, 2, 3)
     covariance = inflation**2 * covariance + np.einsum("hfi,hfj->hij", of_model, of_model)
