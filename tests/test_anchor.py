@@ -13,10 +13,12 @@ from gripmon.monitor.bounds import ModelError
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
+SAID = tuple(f"edge {name}" for name in NAMES)
+FINGERS = ("finger a", "finger b")
 FINGER = np.array([0, 0, 0, 0, 1, 1, 1, 1])
 ALONG = np.array([True, True, False, False, True, True, False, False])
 INNER = np.array(["_in" in name for name in NAMES])
-EVERY = hypotheses_of(NAMES, FINGER, ("a", "b"), ALONG, INNER, True)
+EVERY = hypotheses_of(SAID, FINGER, FINGERS, ALONG, INNER, True)
 LASTING = Lasting.of(EVERY)
 NOTHING_COMMON = ModelError(0.0, np.zeros(3), np.zeros(0, dtype=np.intp), 2, common=None)
 ROWS = np.arange(len(LASTING.name))
@@ -104,7 +106,7 @@ def test_what_lasts_is_all_that_may_have_been_wrong_from_the_first_frame_on():
 
 def test_with_hidden_edges_hypotheses_doubt_the_same_of_what_is_left():
     edges = np.array([0, 1, 3, 4, 5])  # a_tip, b_tip and b_side are hidden
-    seen = hypotheses_of(tuple(NAMES[e] for e in edges), FINGER[edges], ("a", "b"), ALONG[edges], INNER[edges], True)
+    seen = hypotheses_of(tuple(SAID[e] for e in edges), FINGER[edges], FINGERS, ALONG[edges], INNER[edges], True)
     rows = LASTING.rows(seen, edges)
     told = {name: seen.name[row] for name, row in zip(LASTING.name, rows, strict=True)}
     assert told["edge a_out belongs to something else"] == "edge a_out belongs to something else"

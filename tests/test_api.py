@@ -122,7 +122,7 @@ def test_the_forecast_is_what_check_prints(sequence: Path, capsys: pytest.Captur
     printed = json.loads(capsys.readouterr().out)
     assert {key: printed[key] for key in found.__struct_fields__} == json.loads(msgspec.json.encode(found))
     assert set(printed) - set(found.__struct_fields__) == {
-        "findings", "keys", "recording", "metrics", "zenoh", "source",
+        "findings", "kept", "kept_over", "keys", "recording", "metrics", "zenoh", "source",
     }  # fmt: skip
     assert found.reachable and found.in_view.enough and found.accuracy.expected is not None
     assert 0.0 < max(found.accuracy.expected.tcp_m) < 1e-4

@@ -258,6 +258,8 @@ def test_doubts_add_up_and_are_chosen_from():
 # --- the promise ---
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side", "b_back")
+SAID = tuple(f"edge {name}" for name in NAMES)
+FINGERS = ("finger a", "finger b")
 FINGER_OF = np.array([0, 0, 0, 0, 1, 1, 1, 1, 1])
 ALONG = np.array([True, True, False, False, True, True, False, False, False])
 INNER = np.array(["_in" in name for name in NAMES])
@@ -265,7 +267,7 @@ NO_EDGE = np.zeros(9, dtype=bool)
 
 
 def of_two_fingers(has_opening: bool = False) -> Hypotheses:
-    return hypotheses_of(NAMES, FINGER_OF, ("a", "b"), ALONG, INNER, has_opening)
+    return hypotheses_of(SAID, FINGER_OF, FINGERS, ALONG, INNER, has_opening)
 
 
 def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
@@ -333,7 +335,7 @@ def test_where_edges_err_as_often_as_their_prior_says_the_bound_holds_as_stated(
 
 def test_an_edge_that_errs_is_beyond_a_bound_that_reckons_with_nothing():
     """What the one before must be able to see."""
-    blind = hypotheses_of(NAMES, np.zeros(9, dtype=int), ("a",), np.ones(9, bool), NO_EDGE, False)
+    blind = hypotheses_of(SAID, np.zeros(9, dtype=int), ("finger a",), np.ones(9, bool), NO_EDGE, False)
     hypotheses = of_two_fingers()
     blind = Hypotheses(blind.name[:1], blind.prior[:1], blind.keep[:1], blind.opening[:1], blind.sudden[:1], 0)
     bias = np.zeros((9, 12))
@@ -425,19 +427,19 @@ def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
 
 
 def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():
-    one = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a", "b"), ALONG[:3], INNER[:3], False)
+    one = hypotheses_of(SAID[:3], np.zeros(3, dtype=int), FINGERS, ALONG[:3], INNER[:3], False)
     assert not any(name.startswith(("finger", "the ends of")) for name in one.name), "one finger, one edge at its end"
     assert len(one.name) == 1 + 3 + 1 and one.keep.shape == (5, 3)
-    every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), NO_EDGE, False)
+    every = hypotheses_of(SAID, FINGER_OF, FINGERS, np.ones(9, dtype=bool), NO_EDGE, False)
     np.testing.assert_array_equal(every.keep[every.ends], 1.0)
 
 
 def test_that_a_lone_fingers_ends_are_something_else_is_one_hypothesis():
     """That of all ends, which isn't where their corners are seen and something is known of where it was."""
-    hypotheses = hypotheses_of(NAMES[:4], np.zeros(4, dtype=int), ("a",), ALONG[:4], INNER[:4], False)
+    hypotheses = hypotheses_of(SAID[:4], np.zeros(4, dtype=int), ("finger a",), ALONG[:4], INNER[:4], False)
     doubting_all = [k for k, keep in enumerate(hypotheses.keep) if not keep[~ALONG[:4]].any()]
     assert doubting_all == [hypotheses.ends] and hypotheses.sudden[hypotheses.ends]
     assert {f"edge {name} belongs to something else" for name in NAMES[:4]} <= set(hypotheses.name)
-    tip = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a",), ALONG[:3], INNER[:3], False)
+    tip = hypotheses_of(SAID[:3], np.zeros(3, dtype=int), ("finger a",), ALONG[:3], INNER[:3], False)
     doubting_all = [k for k, keep in enumerate(tip.keep) if not keep[~ALONG[:3]].any()]
     assert doubting_all == [tip.ends], "of one edge at its end, too"

@@ -88,7 +88,7 @@ def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
     assert values["reachable"] and (values["alert_limit_m"], values["alert_limit_rad"]) == (1e-3, 0.035)
     assert set(found) == {"position_m", "rotation_rad", "risk"} and found["risk"] == 1e-5
     (line,) = re.findall(r"^promise    (.*)$", text, re.MULTILINE)
-    assert line.startswith(f"a transform of this view is good to {1e3 * found['position_m']:.2g} mm and ")
+    assert line.startswith(f"forecast: a transform of this view is good to {1e3 * found['position_m']:.2g} mm and ")
     assert line.endswith("(risk 1e-05 a frame); alert limit 1 mm, 2 degrees: reachable")
 
 
@@ -205,7 +205,7 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(arguments) == 0
     first, *_ = capsys.readouterr().err.splitlines()
     assert first.startswith(
-        f"replay: {config}: no transform of this view can be valid: valid needs alert_limit_m of at "
+        f"replay: {config}: by the forecast no transform of this view can be valid: valid needs alert_limit_m of at "
     )
     lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert {line["verdict"] for line in lines} <= {"suspect", "unknown"} and all(line["reason"] for line in lines)

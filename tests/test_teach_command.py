@@ -135,7 +135,12 @@ def test_taught_edges_carry_the_error_of_the_reference_they_were_taught_at(rig: 
     for each in (config, dataclasses.replace(config, reference=sure)):
         assert each.taught_edges is not None
         error = each.taught_edges.reference_error
-        np.testing.assert_allclose(error.T @ error, np.reshape(config.reference.covariance, (6, 6)), atol=1e-16)
+        stated = np.reshape(config.reference.covariance, (6, 6))
+        shown = np.reshape(to_settings(read_yaml(taught), TaughtModel).reference.images_covariance, (6, 6))
+        # Two independent measurements of one pose: their information adds up.
+        expected = np.linalg.inv(np.linalg.inv(stated) + np.linalg.inv(shown))
+        np.testing.assert_allclose(error.T @ error, expected, atol=1e-16, rtol=1e-6)
+        assert (np.linalg.eigvalsh(shown) > 0.0).all()
 
 
 def test_an_image_that_is_left_out_is_named_and_not_in_the_file(rig: Path, tmp_path: Path, capsys):

@@ -80,7 +80,7 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
         assert 0.0 < float(row[1]) < SNAPPED_PX and row[-1] == "%"
         assert "hidden by its own finger" in visitor.text("#corners tr[data-corner=L_out_far]")
         accuracy = visitor.text("#accuracy")
-        assert "A transform of this view is good to" in visitor.text("#promise")
+        assert "Forecast: a transform of this view is good to" in visitor.text("#promise")
         assert "one frame" in accuracy and "smallest drift" in accuracy and "reference" in accuracy
 
         visitor.keys("z", control=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import check_laser, check_text, sweep
 from gripmon.cli.common import Arguments, Command, arm_noise, positive_number, progress_bar
-from gripmon.model.errors import InputError
+from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
@@ -16,8 +16,11 @@ if TYPE_CHECKING:
 
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
---json       one JSON object instead of text; metres, radians, px
---verbose    the forecast in numbers
+--json          one JSON object instead of text; metres, radians, px
+--verbose       the forecast in numbers
+--images INPUT  images of the gripper at the reference, a folder or a video, to run the monitor over (default: the
+                recorded source, else those that were taught from)
+--picture FILE  draw the first image with the edges that make the bounds as large; with --sweep the sweep (.png, .jpg)
 """
 
 _LASER = """\
@@ -36,6 +39,7 @@ _LASER_OPTIONS = """
 _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
   gripmon check configs/demo.yaml --verbose
+  gripmon check mine/arm1.yaml --images mine/first --picture doubts.png
   gripmon check configs/demo.yaml --json | python3 -m json.tool
   gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6 --picture sweep.png
   gripmon check configs/folder.yaml --sweep --fov 40,60,80 --roll 0,90 --at 384,288
@@ -51,13 +55,19 @@ _MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
 @Command(
-    "check", "validate a configuration and forecast its performance", _OPTIONS, _EXAMPLES,
+    "check", "validate a configuration and say what it will keep", _OPTIONS, _EXAMPLES,
     {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
     arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
 )  # fmt: skip
 def check(arguments: Arguments) -> int:
     """Validate a configuration, its gripper file and its source, and rate each aspect: OK, WARN (the monitor
     runs, with limitations) or FAIL (it can't work).
+
+    The promise is what the monitor itself says over images that are there: those of a recorded source, those
+    that were taught from, or --images; at most the first hundred.  It names the edge or the end of a finger
+    that makes the bounds as large, alert limits that nine of ten such frames would keep, and what would help
+    most.  Without images it is a forecast from the geometry, and says so: what stands behind the fingers isn't
+    in it.
 
     With --verbose, also the forecast: where the fingertip corners are in the image (px), which of them and
     which edges are visible, the gripper's distance (mm), the accuracy of one frame along each axis, what the
@@ -77,7 +87,10 @@ def check(arguments: Arguments) -> int:
     if not arguments.sweep:
         arguments.refuse(sweep.NAMES, "applies only to a sweep; add --sweep")
     if arguments.laser is not None:
+        arguments.refuse(("images", "picture"), "not with --laser, which has spots; leave it out")
         return _check_laser(arguments)
+    if arguments.sweep:
+        arguments.refuse(("images",), "not with --sweep, which forecasts; leave it out")
     names, why = ("arm_noise", *_MOST), "applies only to a laser calibration; add --laser LASER.yaml"
     arguments.refuse(names, why)
     if len(arguments.config) != 1:
@@ -88,7 +101,8 @@ def check(arguments: Arguments) -> int:
 def _check(arguments: Arguments) -> int:
     from gripmon.daemon.findings import check_file
 
-    found = check_file(arguments.config[0])
+    arguments.check_outputs("picture")
+    found = check_file(arguments.config[0], arguments.images)
     if arguments.json:
         _print_json({"findings": [each._asdict() for each in found.findings], **found.values()})
     else:
@@ -98,6 +112,13 @@ def _check(arguments: Arguments) -> int:
             lines += [] if found.second is None else check_laser.details(found.second)
             lines += check_text.surrounding_lines(found.around)
         print("\n".join(lines))
+    if arguments.picture is not None:
+        drawn = found.picture(arguments.picture.suffix)
+        if drawn is None:
+            raise NoResultError("--picture: no image of the gripper to draw in; --images FOLDER")
+        arguments.save("picture", drawn)
+        if not arguments.json:
+            print(f"picture: {arguments.picture}")
     return EXIT_FAILED if any(each.level == "FAIL" for each in found.findings) else EXIT_DONE
 
 

@@ -31,10 +31,9 @@ OPTIONS = """
 | --lens FILE...  a calibrated one, by gripmon calibrate intrinsics; may be repeated
 --at U,V          position of the TCP in the present camera's image (px; default: as now)
 --jaw MIN:MAX     openings at which the mount has to work (m; default: all)
---picture FILE    draw the sweep (.png, .jpg)
 """
 _RANGES = ("distance", "tilt", "side", "roll", "focal", "fov")
-NAMES = (*_RANGES, "lens", "at", "jaw", "picture")
+NAMES = (*_RANGES, "lens", "at", "jaw")
 
 
 def run(arguments: Arguments) -> int:

@@ -14,6 +14,7 @@ from gripmon.model.images import image_paths
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
+    from gripmon.teach.api import Teaching
     from gripmon.teach.measure import Taught
     from gripmon.teach.messages import Saved
     from gripmon.teach.page_server import OutlineSession
@@ -120,11 +121,11 @@ def teach(arguments: Arguments) -> None:
     arguments.save("out", taught.text().encode())
     if arguments.into_config:
         config = name_taught(config, out)
-    print(_summary(config, taught.taught, out))
+    print("\n".join([*_summary(config, taught.taught), *_kept_lines(taught), *_written(config, out)]))
     arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
-def _summary(config: Config, taught: Taught, out: Path) -> str:
+def _summary(config: Config, taught: Taught) -> list[str]:
     px_per_m = config.camera.fx_px / float(config.cam_T_grip[2, 3])
     width = max(map(len, [*taught.edges, *taught.untaught]))
     lines = [f"{'edge':<{width}}          offset                 +-         seen  brighter"]
@@ -133,11 +134,28 @@ def _summary(config: Config, taught: Taught, out: Path) -> str:
     lines += [f"left out: {why}" for why in taught.left_out.values()]
     lines += [f"note: {note}" for note in taught.notes]
     lines.append(f"measured again with this, the gripper is at most {taught.closure_px:.2f} px from the reference")
-    lines.append(f"written: {out}")
+    return lines
+
+
+def _kept_lines(teaching: Teaching) -> list[str]:
+    """What frames like the images keep, without what was taught and with it, and what makes the bounds as large."""
+    before, after = teaching.kept()
+    lines = [f"the monitor over these images: {before.text()}", f"     with what was taught: {after.text()}"]
+    lines += [f"     {text}" for text in (after.why(), after.help()) if text]
+    if before.median_excess < after.median_excess:
+        lines.append(
+            "note: the bound is larger than without: an absolute one includes the reference's error now, and an edge "
+            "that moves with its background counts less"
+        )
+    return lines
+
+
+def _written(config: Config, out: Path) -> list[str]:
+    lines = [f"written: {out}"]
     if config.taught_path is None or config.taught_path.resolve() != out.resolve():
         name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
         lines.append(f"next: add the line `taught: {name}` to {config.path} (or use --into-config --force)")
-    return "\n".join(lines)
+    return lines
 
 
 def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:

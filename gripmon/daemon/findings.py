@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import math
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -27,17 +29,14 @@ from gripmon.daemon.forecast_values import (
     RecalibrationForecast,
     ReferenceValues,
 )
+from gripmon.daemon.promised import Level, by_forecast, images_of, kept_of, over_images, picture_of
 from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Joining, Keys
 from gripmon.laser.report import expectation
-from gripmon.model.gripper import UNTOLD_BEVEL_M
-from gripmon.model.units import in_degrees, in_mm
+from gripmon.model.errors import InputError
+from gripmon.teach.kept import Kept
 
-Level = Literal["OK", "WARN", "FAIL"]
-
-_USUAL_SPREAD = 2.0
-"""Ratio of the bound to the predicted one that one frame in twenty reaches (no unit; docs/integrity.md)."""
 _NOT_SQUARE = 0.02
 """Largest difference of fx / fy from 1 in a calibration of a sensor with square pixels (no unit)."""
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
@@ -76,35 +75,56 @@ class Surroundings(msgspec.Struct, frozen=True):
 @dataclass(frozen=True)
 class CheckResult:
     """A checked configuration: for a wrist camera a ``forecast``, for a second camera plain values (m, rad, px, ns),
-    and the surroundings.
+    and the surroundings; ``kept``: what the monitor says over the ``images``, None where there are none.
     """
 
     forecast: Forecast | None
     second: dict[str, Any] | None
     around: Surroundings
+    kept: Kept | None = None
+    images: str = ""
+    draw: Callable[[str], bytes | None] | None = None
+
+    def picture(self, ending: str) -> bytes | None:
+        """The first image with what costs most drawn in it, in the format of an ``ending``; None where there is no
+        image.
+        """
+        return None if self.draw is None else self.draw(ending)
 
     def values(self) -> dict[str, Any]:
         """Everything as plain values for JSON."""
-        expected = self.second if self.second is not None else msgspec.to_builtins(self.forecast)
-        return {**expected, **msgspec.to_builtins(self.around)}
+        around = msgspec.to_builtins(self.around)
+        if self.second is not None:
+            return {**self.second, **around}
+        kept = {"kept": msgspec.to_builtins(self.kept), "kept_over": self.images}
+        return {**msgspec.to_builtins(self.forecast), **kept, **around}
 
     @property
     def findings(self) -> list[Finding]:
         """What to know about the configuration before it runs."""
-        about = _of_wrist(self.forecast) if self.forecast is not None else _of_second(self.second or {})
+        about = (
+            _of_second(self.second or {}) if self.forecast is None else _of_wrist(self.forecast, self.kept, self.images)
+        )
         keys = self.around.keys
         network = Finding("OK", "network", "off" if keys is None else f"Zenoh keys {keys}…")
         found = [_source(self.around.source), *about, network]
         return [each for each in found if each is not None]
 
 
-def check_file(path: Path) -> CheckResult:
-    """Check a configuration file of a wrist camera or a second camera.  Raises :class:`ConfigError`, and
-    :class:`NoResultError` if a laser calibration or recorded frames can't be used.
+def check_file(path: Path, images: Path | None = None) -> CheckResult:
+    """Check a configuration file of a wrist camera or a second camera.  ``images``: of the gripper at the reference,
+    to judge by instead of the configuration's own.  Raises :class:`ConfigError`, and :class:`NoResultError` if a laser
+    calibration or recorded frames can't be used.
     """
     if not is_second(path):
         config = load_config(path)
-        return CheckResult(forecast(config), None, _look_around(config))
+        around, foreseen, found = _look_around(config), forecast(config), images_of(config, images)
+        if found is None or not foreseen.in_view.enough:
+            return CheckResult(foreseen, None, around)
+        said = kept_of(config, found)
+        return CheckResult(foreseen, None, around, said, found.what, partial(picture_of, config, found, said))
+    if images is not None:
+        raise InputError("is for wrist cameras; leave it out", "images")
     second = load_second(path)
     around, watch = _look_around(second), second.settings.laser.watch
     expected = expectation(str(second.calibration_path), second.calibration, watch)
@@ -159,13 +179,13 @@ def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
     return None, f"{shown_name(device)}; only running it shows whether it delivers"
 
 
-def _of_wrist(forecast: Forecast) -> list[Finding | None]:
+def _of_wrist(forecast: Forecast, kept: Kept | None, images: str) -> list[Finding | None]:
     return [
         _camera(forecast.camera),
         _jaw_motion(forecast.gripper),
         _mount(forecast.reference),
         _view(forecast.in_view, forecast.gripper, forecast.accuracy.corners),
-        _promise(forecast),
+        _promise(forecast, kept, images),
         None if forecast.doubt is None else Finding("WARN", "reference", forecast.doubt),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
@@ -254,33 +274,9 @@ def _view(in_view: InView, gripper: GripperValues, measured: int) -> Finding:
     return Finding("OK", "view", text)
 
 
-def _promise(report: Forecast) -> Finding | None:
-    found = report.protection
-    if found is None:
-        return None  # the line about the view says why
-    limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
-    share = max(found.position_m / limit_m, found.rotation_rad / limit_rad)
-    good = f"{_millimetres(found.position_m)} and {_degrees(found.rotation_rad)}"
-    subject = "the motion since the reference is " if report.valid_by == "reference" else ""
-    limit = f"the alert limit of {_millimetres(limit_m)} and {_degrees(limit_rad)}"
-    if share > 1.0:
-        text = f"no transform can be valid: {subject}good to {good}, beyond {limit}; valid needs {report.needed}"
-        return Finding("WARN", "promise", text)
-    close = _USUAL_SPREAD * share > 1.0
-    level: Level = "WARN" if close else "OK"
-    if close:
-        text = f"{subject}good to {good}, close to {limit}"
-    else:
-        text = f"{subject or 'a transform is '}good to {good}, within {limit}"
-    bevelled = report.protection_if_bevelled
-    if bevelled is not None and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
-        level = "WARN"
-        may = f"{_millimetres(bevelled.position_m)} and {_degrees(bevelled.rotation_rad)}"
-        text += f", if all edges are as sharp as the gripper file says; to {may} with bevels of "
-        text += f"{_millimetres(UNTOLD_BEVEL_M)}: teach them (gripmon teach), or state them (bevel_m)"
-    if close:
-        text += "; one frame in twenty is twice as uncertain: some will be suspect"
-    return Finding(level, "promise", text)
+def _promise(report: Forecast, found: Kept | None, what: str) -> Finding | None:
+    said = by_forecast(report) if found is None else over_images(found, what)
+    return None if said is None else Finding(said[0], "promise", said[1])
 
 
 def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:
@@ -326,14 +322,6 @@ def _recalibration(values: RecalibrationForecast) -> Finding:
         text = f"the reference can't be measured again from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
     return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
-
-
-def _millimetres(value_m: float) -> str:
-    return f"{in_mm(value_m)} mm"
-
-
-def _degrees(value_rad: float) -> str:
-    return f"{in_degrees(value_rad)}°"
 
 
 def _second_values(config: SecondConfig) -> dict[str, Any]:

@@ -163,7 +163,8 @@ def limits_warning(config: Config) -> str | None:
     found = promise_of(config)
     if found is None or found.reachable:
         return None
-    return f"{config.path}: no transform of this view can be valid: valid needs {found.needed} (monitor.policy)"
+    told = f"by the forecast no transform of this view can be valid: valid needs {found.needed}"
+    return f"{config.path}: {told} (monitor.policy)"
 
 
 def _if_bevelled(config: Config) -> Bounds | None:

@@ -41,6 +41,7 @@ from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
 from gripmon.track.edges.roles import PARALLEL_COSINE
+from gripmon.track.edges.words import Words, in_words
 from gripmon.track.integrity import Hypotheses, Knocks, Mount, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
@@ -91,7 +92,8 @@ class Weigher:
         self._model, self._since = _model_error(tracker, gripper), since
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         every = np.arange(len(gripper.edge_ids))
-        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
+        self._words = in_words(gripper, from_record(reference.cam_T_grip))
+        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open, self._words))
         self._kept: dict[bytes, About] = {}
         self._newest: tuple[Measurement, float, Refits] | None = None
         self.anchor: Anchor | None = None
@@ -469,14 +471,16 @@ class Weigher:
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
-            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open)
+            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open, self._words)
             self._kept[key] = About(hypotheses, hypotheses.without_ends(), self._lasting.rows(hypotheses, edges))
         return self._kept[key]
 
 
-def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
-    names = tuple(gripper.edge_ids[edge] for edge in edges)
-    of_each = gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], inner_edges(gripper)[edges]
+def _hypotheses_about(
+    edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool, words: Words
+) -> Hypotheses:
+    names = tuple(words.edges[edge] for edge in edges)
+    of_each = gripper.edge_finger[edges], words.fingers, tracker.along[edges], inner_edges(gripper)[edges]
     return hypotheses_of(names, *of_each, may_open, tuple(side[edges] for side in sides(gripper)))
 
 
@@ -492,9 +496,9 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     """
     if not len(measurement.normal.edge):
         return unbounded(settings.policy.integrity_risk, NOTHING_WRONG)
-    hypotheses = _hypotheses_about(
-        measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
-    )
+    may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0
+    words = in_words(gripper, measurement.prediction.cam_T_grip)
+    hypotheses = _hypotheses_about(measurement.normal.edge, gripper, tracker, may_open, words)
     model = _model_error(tracker, gripper)
     nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)

@@ -256,10 +256,10 @@ class Promise:
         if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
             return "more of the fingers in view: no limit would do"
         if bound.position_m > self.alert_limit_m:
-            needed_m = _rounded_up(bound.position_m)
+            needed_m = rounded_up(bound.position_m)
             parts.append(f"alert_limit_m of at least {needed_m:g} ({1e3 * needed_m:g} mm)")
         if bound.rotation_rad > self.alert_limit_rad:
-            needed_rad = _rounded_up(bound.rotation_rad)
+            needed_rad = rounded_up(bound.rotation_rad)
             parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
         return ", or ".join([*self.remedies, " and ".join(parts)])
 
@@ -274,10 +274,13 @@ class Promise:
         good = f"good to {in_mm(bound.position_m)} mm and {in_degrees(bound.rotation_rad)} degrees"
         limits = f"{1e3 * self.alert_limit_m:g} mm, {in_degrees(self.alert_limit_rad)} degrees"
         reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
-        return f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+        promise = (
+            f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+        )
+        return f"forecast: {promise}"
 
 
-def _rounded_up(value: float) -> float:
+def rounded_up(value: float) -> float:
     """Round up to two significant digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.ceil(value / unit - 1e-9) * unit

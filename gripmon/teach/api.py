@@ -26,6 +26,7 @@ from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.drawing import draw_taught
+from gripmon.teach.kept import Kept, as_frames, kept, with_help
 from gripmon.teach.measure import Taught
 from gripmon.teach.measure import teach as teach_images
 from gripmon.teach.views import TeachingImage, TeachingRefused
@@ -67,12 +68,27 @@ class Configured(Protocol):
 
 @dataclass(frozen=True)
 class Teaching:
-    """How every edge looks in the images (``taught``), and the ``model`` that a configuration names."""
+    """How every edge looks in the images (``taught``), and the ``model`` that a configuration names; ``images``: those
+    that were taught from.
+    """
 
     taught: Taught
     model: TaughtModel
     config: Configured
-    first: TeachingImage
+    images: tuple[TeachingImage, ...]
+
+    @property
+    def edges(self) -> TaughtEdges:
+        """What was taught, as the monitor uses it."""
+        return TaughtEdges.of_model(self.model, self.config.gripper, self.config.reference.covariance)
+
+    def kept(self) -> tuple[Kept, Kept]:
+        """What a monitor says over the images without what was taught, and with it."""
+        config, frames = self.config, as_frames(self.images)
+        untaught = Rig(config.camera, config.gripper, config.settings.monitor)
+        taught = untaught._replace(taught=self.edges)
+        before, after = (kept(rig, config.reference, frames) for rig in (untaught, taught))
+        return before, with_help(after, taught, config.reference, lambda: frames)
 
     def text(self) -> str:
         """The taught model's file (YAML)."""
@@ -82,7 +98,7 @@ class Teaching:
         """The first image used, with what was taught drawn, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
         config = self.config
         edges = TaughtEdges.of_model(self.model, config.gripper)
-        drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.first, edges, self.model)
+        drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.images[0], edges, self.model)
         return bytes(cv2.imencode(ending, drawn)[1].tobytes())
 
 
@@ -127,7 +143,7 @@ def teach(
     except TeachingRefused as refused:
         raise NoResultError(f"teach: {refused}") from None
     model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)
-    return Teaching(taught, model, config, taught.used(shown)[0])
+    return Teaching(taught, model, config, tuple(taught.used(shown)))
 
 
 def _check_different(pictures: Sequence[Picture]) -> None:
@@ -207,7 +223,9 @@ def taught_model(
         ),
         camera=lens,
         gripper=model,
-        reference=msgspec.structs.replace(stated_reference, offset=taught.reference_offset),
+        reference=msgspec.structs.replace(
+            stated_reference, offset=taught.reference_offset, images_covariance=taught.reference_covariance
+        ),
         edge_settings=settings.corners.edges,
         edges=taught.edges,
         corners=taught.corners,
@@ -219,6 +237,8 @@ _HEADER = """\
 # It belongs to exactly this camera, gripper file, reference and edge settings, and is refused with any others.
 #   reference.offset    how far off the reference the gripper appeared in the images, as far as bevels don't explain it:
 #                       along and about the camera's axes (m, rad); every bound includes it
+#   reference.images_covariance  how well the images show where the gripper was, 6 x 6 row by row; with the covariance
+#                       of the configured reference it is what absolute bounds include of the reference's error
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
 #                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its

@@ -8,6 +8,7 @@ import itertools
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.calibrate.plane import Coincidence
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -75,7 +76,7 @@ def enlargement(largest_px: float, to_px: float) -> int:
 
 _ENLARGED_TO_PX = 12.0  # length at which the largest offset is drawn, at most
 _SHARP_BGR, OUTLINE_BGR, CREASE_BGR, CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
-_TEXT_BGR = (255, 255, 255)
+_DOUBTED_BGR, _TEXT_BGR = (70, 70, 250), (255, 255, 255)
 _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
 _MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
 _ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # rows above and below its point in which a label may be placed
@@ -110,6 +111,31 @@ def draw_taught(
     for edge, (uv_px, shift_px) in lines.items():
         text = f"{gripper.edge_ids[edge]} {np.linalg.norm(shift_px[len(uv_px) // 2]):.2f}"
         labels.put(text, canvas.pixel(uv_px[len(uv_px) // 2]), CREASE_BGR if taught.crease[edge] else OUTLINE_BGR)
+    return canvas.picture
+
+
+def draw_doubted(
+    camera: Camera,
+    gripper: Gripper,
+    cam_T_grip: Array,
+    image: TeachingImage,
+    doubted: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
+    why: str,
+) -> Image:
+    """The image, BGR, with the gripper's ``visible`` (e,) edges at the reference, and those that make the bound as
+    large, ``doubted`` (e,), in red; ``why`` in words above.
+    """
+    zoom = max(1, -(-_SMALLEST_PX // camera.width_px))
+    canvas = Canvas(image.image, zoom)
+    points_grip_m = gripper.points_grip_m(image.jaw_opening_m if gripper.has_jaw else None)
+    edges = np.flatnonzero(visible)
+    outlines = gripper.outlines_m(points_grip_m, edges, 33) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+    for edge, uv_px in zip(edges.tolist(), map(camera.project, outlines), strict=True):
+        uv_px = uv_px[np.isfinite(uv_px).all(axis=1)]
+        if len(uv_px) > 1:
+            canvas.line(uv_px, _DOUBTED_BGR if doubted[edge] else _SHARP_BGR, 3 if doubted[edge] else 1)
+    Labels(canvas.picture).title("gripper at the reference (blue); what costs most (red)", why)
     return canvas.picture
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,9 @@ from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 from gripmon.teach.inset import INSET_SIGMA_M
-from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, find_line, pool, slopes
-from gripmon.teach.views import ImageRefused, SampledEdge, TeachingRefused, View, Viewer, sampled
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
+from gripmon.teach.views import SampledEdge, TeachingRefused, View, Viewer
+from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
@@ -254,11 +256,6 @@ TAUGHT_SHARE = 0.5
 LOST_SHARE = 0.25
 """Part below which the gripper, or a finger, counts as absent."""
 
-AGREEING_PX = 0.5
-"""Largest median distance of an image's edges from where all images show them; above it something has moved."""
-
-_FEWEST_SHARED = 4
-
 
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
     """Refuse if too little of the gripper, or of one finger, is seen."""
@@ -277,42 +274,22 @@ def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
             raise TeachingRefused(f"finger {name} isn't seen; images in focus, all fingers free")
 
 
-def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
-    """Refuse the image whose gripper is farthest from where the others show it: most of its ``edges``, each searched
-    for in every image separately, are then displaced.  A few displaced edges are clutter, or bevels in front of another
-    background.
+class ReferenceSeen(NamedTuple):
+    """Where the images show the gripper: its ``offset`` (6,) from the reference, which bounds have to include, with the
+    ``covariance`` (36,) of where the images alone show it, sharp edges but for plausible bevels, a file exact but for
+    its fingers' lengths; ``doubt``: a text if the offset is above a pixel.
     """
-    if len(views) < 2:
-        return
-    places_px = np.full((len(views), len(edges)), np.nan)
-    for number, view in enumerate(views):
-        for k, edge in enumerate(edges):
-            seen = sampled([view], edge)
-            line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
-            if line is not None:
-                places_px[number, k] = line.ends_px.mean()
-    # Use edges that most images show.
-    places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
-    enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
-    if not enough.any():
-        return
-    off_px = np.zeros(len(views))
-    off_px[enough] = np.nanmedian(np.abs(places_px[enough] - np.nanmedian(places_px, axis=0)), axis=1)
-    worst = int(off_px.argmax())
-    if off_px[worst] > AGREEING_PX:
-        raise ImageRefused(
-            views[worst].image,
-            f"the gripper appears {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
-            "px: images without motion of the camera, each with its own jaw opening",
-        )
+
+    offset: PoseOffset
+    covariance: tuple[float, ...]
+    doubt: str | None
 
 
-def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> tuple[PoseOffset, str | None]:
+def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> ReferenceSeen:
     """Refuse a gripper whose pose or jaw opening differs by more than the stated standard deviations allow.
 
     Each is tested with the other one taken as stated, since both together can hardly be separated; the one that leaves
-    smaller own offsets to the edges is named first.  Returns the gripper's offset (6,) from the reference, which bounds
-    have to include, and a text if it is above a pixel.
+    smaller own offsets to the edges is named first.
     """
     stated = viewer.prior_covariance
     free_jaw = stated.copy()
@@ -345,13 +322,17 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         turn = np.zeros(3)  # a turn within its noise says nothing of the reference
     x, y, z, about_x, about_y, about_z = (round(v, 9) for v in (*pose[:3].tolist(), *turn.tolist()))
     offset = (x, y, z, about_x, about_y, about_z)
+    longer = np.zeros(6)
+    longer[:3] = viewer.rig.settings.model_sigma_m * viewer.ref_cam_T_grip[:3, :3] @ along_fingers(viewer.gripper)[0]
+    shown = tuple(float(f"{v:.6e}") for v in (covariance + np.outer(longer, longer)).ravel().tolist())
     if away_px <= NOTED_PX:
-        return offset, None
-    return offset, (
+        return ReferenceSeen(offset, shown, None)
+    doubt = (
         f"the gripper appears up to {away_px:.1f} px off the reference, {viewer.distance(pose)}, and every bound is "
         f"larger by as much: calibrate again, or take the measured pose with its standard deviations as "
         f"{viewer.pose(pose, covariance)}"
     )
+    return ReferenceSeen(offset, shown, doubt)
 
 
 def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:

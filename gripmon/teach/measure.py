@@ -28,11 +28,11 @@ from gripmon.teach.estimate import (
     check_edges,
     check_enough,
     check_reference,
-    check_standing,
     estimate_edges,
     found_off,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
+from gripmon.teach.play import with_play
 from gripmon.teach.views import (
     REMEDIES,
     ImageRefused,
@@ -62,9 +62,10 @@ passes only if that measurement's covariance explains it."""
 class Taught:
     """What was learnt.  ``untaught``: for each other edge in view the reason; ``notes``: what a person should know.
 
-    ``closure_px``: largest distance of the gripper from the reference when the images are measured with what was
+    ``closure_px``: largest distance of the gripper from where it stands when the images are measured with what was
     taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
-    bevels don't explain it.  ``left_out``: the images that contradict the others, by their numbers, and why.
+    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``left_out``: the
+    images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -73,6 +74,7 @@ class Taught:
     notes: tuple[str, ...]
     closure_px: float
     reference_offset: PoseOffset
+    reference_covariance: tuple[float, ...]
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -97,7 +99,7 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
             viewer = Viewer(rig, reference, used)
             return replace(_teach_or_locate(viewer, used, list(fits.values())), left_out=left_out)
         except ImageRefused as refused:
-            number = next(n for n in fits if images[n] is refused.image)
+            number = next(n for n in fits if images[n].image is refused.image.image)
             if 2 * (len(fits) - 1) <= len(images):
                 raise _with_reasons(refused, left_out) from None
             del fits[number]
@@ -116,7 +118,7 @@ def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> Teac
 def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
     """Teach from these images; if that fails, an image that shows the gripper displaced is the more likely reason."""
     try:
-        return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
+        return _teach(viewer, images, fits)
     except ImageRefused:
         raise
     except TeachingRefused:
@@ -147,14 +149,17 @@ def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
     )
 
 
-def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
-    gripper, images = viewer.gripper, [view.image for view in views]
+def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
+    gripper = viewer.gripper
+    views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
+    images = with_play(viewer, views)
+    if any(image.play is not None for image in images):
+        views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
     lines, untaught = _lines(viewer, views, search=True)
-    check_standing(views, list(lines))
     check_enough(viewer, views, lines)
-    offset, doubt = check_reference(viewer, images[0].name, lines)
+    reference = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
-    notes = _notes(viewer, lines, len(images), doubt)
+    notes = _notes(viewer, lines, len(images), reference.doubt)
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
     # Repeat with the search lines centred on the real edges.
@@ -170,7 +175,8 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
-        offset,
+        reference.offset,
+        reference.covariance,
         {},
     )
 
@@ -212,12 +218,12 @@ def _lines_of(seen: SampledEdge, images: int, search: bool) -> EdgeLines | str:
 
 
 def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
-    """Largest distance (px) of the gripper from the reference in images measured with what they taught."""
+    """Largest distance (px) of the gripper from where it stands in images measured with what they taught."""
     worst_px, refused_px = 0.0, 0.0
     refused: ImageRefused | None = None
     for image in images:
         found = viewer.measured(image, arrays)
-        xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
+        xi = perturbation_between(found.cam_T_grip, viewer.stands(image))
         away_px = found.prediction.moved_px(xi) if found.trusted else math.inf
         explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE_SQUARE
         worst_px = max(worst_px, away_px)

@@ -51,11 +51,14 @@ class ImageRefused(TeachingRefused):
 
 @dataclass(frozen=True, slots=True)
 class TeachingImage:
-    """An image at the reference, and the jaw opening reported for it (the nominal one without a jaw)."""
+    """An image at the reference, and the jaw opening reported for it (the nominal one without a jaw); ``play`` (6,):
+    the motion from there to where it shows the gripper, m and rad, None for none.
+    """
 
     image: Image
     jaw_opening_m: float
     name: str
+    play: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +66,8 @@ class View:
     """One image, sampled along all edges in view, with their predictions at the reference.
 
     ``prediction``: from the pose at which it was sampled, with its ``profiles`` (n, s) in grey levels and edge
-    ``candidates``; ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m``
+    ``candidates``; ``at_reference`` predicts the same samples at the reference, but for the image's play, and the
+    reported opening; ``offset_m``
     (k,): offset of each candidate from there across the line of sight; ``expected_m`` (n,): that of the samples;
     ``per_m`` (n,): px per metre.
     """
@@ -115,11 +119,15 @@ class Viewer:
         share: float = USUAL_SHARE,
         patience: Patience = NARROW,
     ) -> Measurement:
-        """Measure the image as in operation, starting from a pose, the reference if None."""
+        """Measure the image as in operation, starting from a pose, where the gripper stands in it if None."""
         rig = self.rig
         meter = FingertipMeter(rig.camera, rig.gripper, rig.settings.corners, rig.settings.jaw_sigma_m, taught)
-        here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
+        here = self.stands(image) if cam_T_grip is None else cam_T_grip
         return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
+
+    def stands(self, image: TeachingImage) -> Array:
+        """Where the gripper stands in an image (4, 4): at the reference, but for its play."""
+        return self.ref_cam_T_grip if image.play is None else perturb(self.ref_cam_T_grip, image.play)
 
     def off_reference_px(self, found: Measurement) -> float:
         """Distance in the image between the measured gripper and the reference."""
@@ -148,9 +156,9 @@ class Viewer:
         self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
     ) -> View:
         """Sample all edges in view, or those ``taught``, at the density of pixels: at the pose of the fitted sharp
-        model, or else at the reference with a ``zoom``.
+        model, or else where the gripper stands with a ``zoom``.
         """
-        cam_T_grip, jaw_opening_m = self.ref_cam_T_grip, image.jaw_opening_m
+        cam_T_grip, jaw_opening_m = self.stands(image), image.jaw_opening_m
         if found is not None:
             cam_T_grip, jaw_opening_m, zoom = found.cam_T_grip, found.jaw_opening_m, found.candidates.zoom
         rig, sampling, grey = self.rig, self._dense, image.image
@@ -158,10 +166,10 @@ class Viewer:
         sampling = msgspec.structs.replace(sampling, **margins)
         layout = lay_out(rig.camera, rig.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
         # Both use the same samples: those that the lens maps from both poses.
-        here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        here = self._predict(layout, self.stands(image), image.jaw_opening_m, None, zoom)
         there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
         if there.layout is not here.layout:
-            here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+            here = self._predict(there.layout, self.stands(image), image.jaw_opening_m, None, zoom)
         edges = rig.settings.corners.edges
         profiles = read_profiles(grey, there.map_x, there.map_y, edges.response)
         noise = estimate_noise(profiles, quantum(grey))

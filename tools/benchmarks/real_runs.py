@@ -61,8 +61,8 @@ class Still(msgspec.Struct, frozen=True):
 
 class Part(msgspec.Struct, frozen=True):
     """Stills that were replayed in one run, the first ``uncounted`` of them to begin with; ``proposed_m``,
-    ``proposed_rad``: the bounds that ``check`` promises.  ``taught``: the half that was taught from, without those
-    ``left_out``; ``refused``: why nothing could be, and nothing was replayed.
+    ``proposed_rad``: the limits that ``check`` proposes from the images that it has.  ``taught``: the half that was
+    taught from, without those ``left_out``; ``refused``: why nothing could be, and nothing was replayed.
     """
 
     names: tuple[str, ...]
@@ -103,12 +103,18 @@ def bound_of(record: FrameRecord) -> Protection | None:
     return None if not record.measured or (by_reference and record.since_reference is None) else record.protection
 
 
-def proposed_by_check(config: gripmon.Config) -> tuple[float | None, float | None]:
-    """Bounds (m, rad) that ``gripmon check`` promises, which it proposes as limits where the configured ones are below;
-    None where it says that nothing can be measured.
+def proposed_by_check(config: gripmon.Config, images: Path) -> tuple[float | None, float | None]:
+    """Alert limits (m, rad) that ``gripmon check`` proposes from a folder of images; in a gripmon that can't, the
+    bounds that it forecasts, which it proposes where the configured ones are below.  None where there are none.
     """
-    bound = gripmon.forecast(config).protection
-    return (None, None) if bound is None else (bound.position_m, bound.rotation_rad)
+    try:
+        from gripmon.daemon.promised import images_of, kept_of
+    except ImportError:
+        bound = gripmon.forecast(config).protection
+        return (None, None) if bound is None else (bound.position_m, bound.rotation_rad)
+    given = images_of(config, images)
+    assert given is not None
+    return kept_of(config, given).proposed or (None, None)
 
 
 def runs_of(name: str, folder: Path, limit: Limit) -> Iterator[Run]:
@@ -121,7 +127,8 @@ def runs_of(name: str, folder: Path, limit: Limit) -> Iterator[Run]:
     with TemporaryDirectory(prefix="gripmon-real-") as place:
         project = _Project(folder, Path(place), limit)
         for bound in bound_names():
-            yield _run(name, project, bound, (project.replayed(bound, _EVERY, len(_HALVES)),))
+            # Untaught, check has a half of what is judged: with all of them it would propose what they need.
+            yield _run(name, project, bound, (project.replayed(bound, _EVERY, _HALVES["even"][0], len(_HALVES)),))
             yield _run(name, project, bound, tuple(project.taught(bound, half) for half in _HALVES))
 
 
@@ -159,12 +166,12 @@ class _Project:
         path.write_text(yaml.safe_dump(values))
         return gripmon.load_config(path, check_source=False)
 
-    def replayed(self, bound: str, judged: slice, uncounted: int, taught: Path | None = None) -> Part:
-        """The stills one after another."""
+    def replayed(self, bound: str, judged: slice, promised: slice, uncounted: int, taught: Path | None = None) -> Part:
+        """The stills one after another; ``promised``: those that ``check`` has."""
         images, config = self._images[judged], self.config(bound, taught)
         with gripmon.open_source(self._stills(images), fps=1.0 / APART_S) as source:
             stills = tuple(_still(record) for record in gripmon.replay(source, config))
-        proposed_m, proposed_rad = proposed_by_check(config)
+        proposed_m, proposed_rad = proposed_by_check(config, self._stills(self._images[promised]))
         names = tuple(path.name for path in images)
         return Part(names, uncounted, stills=stills, proposed_m=proposed_m, proposed_rad=proposed_rad)
 
@@ -174,7 +181,7 @@ class _Project:
         model = self._models[half] = self._models.get(half) or self._teach(half, learnt_from)
         if isinstance(model, str):
             return Part(tuple(path.name for path in self._images[judged]), 1, half, refused=model)
-        part = self.replayed(bound, judged, 1, model.path)
+        part = self.replayed(bound, judged, learnt_from, 1, model.path)
         return msgspec.structs.replace(part, taught=half, left_out=model.left_out)
 
     def _teach(self, half: str, learnt_from: slice) -> _Model | str:

@@ -297,8 +297,8 @@ STEPS = (
         "page", "Teach", ("camera.yaml", "gripper.yaml", "hand_eye.yaml", "teaching"), ("config.yaml",), _teach,
     ),
     Step(
-        "check", "Forecast", "The monitor's expected performance in this view.", "form", "Check", ("config.yaml",),
-        ("check.json",), lambda _values: ["gripmon", "check", "config.yaml"],
+        "check", "Forecast", "What the monitor keeps over your images, and what it can in this view.", "form", "Check",
+        ("config.yaml",), ("check.json",), lambda _values: ["gripmon", "check", "config.yaml"],
     ),
     Step(
         "run", "Start", "The monitor itself.  It ends with this page; without the page start it by the "

@@ -72,12 +72,14 @@ class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The reference that was taught at; ``offset``: the perturbation (6,) from it to the gripper in the images, as far
-    as bevels don't explain it (m, rad).
+    as bevels don't explain it (m, rad); ``images_covariance`` (36,), 6 x 6 row by row: how well the images alone show
+    where the gripper is, None in files of earlier versions.
     """
 
     id: str
     cam_T_grip: Transform
     offset: PoseOffset = (0.0,) * 6
+    images_covariance: Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)] | None = None
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -206,7 +208,8 @@ class TaughtEdges:
     gripper (1: brighter to the right); ``shown`` (e,): part of it that showed.  An edge that isn't known has no shift,
     and is expected to show.  ``usual_m``: root mean square offset of
     the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
-    at, which their offsets have in them: one standard deviation along each of k directions, m and rad.
+    at, which their offsets have in them: one standard deviation along each of k directions, m and rad, given both the
+    reference's own covariance and what the teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
     poses are off by as much if the camera moved since the calibration.
     """
@@ -233,9 +236,11 @@ class TaughtEdges:
         jaw_opening_m: float | None,
         covariance: Sequence[float] | None = None,
         offset: Sequence[float] = (0.0,) * 6,
+        images_covariance: Sequence[float] | None = None,
     ) -> TaughtEdges:
         """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
-        it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images.
+        it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of which
+        ``images_covariance`` says as above how well they show it, None if not at all.
         """
         untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
         listed = [edges.get(name, untaught) for name in gripper.edge_ids]
@@ -256,7 +261,7 @@ class TaughtEdges:
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             np.array([e.seen for e in listed]),
             float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
-            np.zeros((0, 6)) if covariance is None else np.linalg.cholesky(np.reshape(covariance, (6, 6))).T,
+            np.zeros((0, 6)) if covariance is None else _error(covariance, images_covariance),
             np.array(offset),
         )
 
@@ -267,7 +272,8 @@ class TaughtEdges:
         """
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
         opening_m = float(np.mean(openings)) if openings else None
-        return cls.of(model.edges, gripper, taught_pose(model), opening_m, covariance, model.reference.offset)
+        at, shown = taught_pose(model), model.reference
+        return cls.of(model.edges, gripper, at, opening_m, covariance, shown.offset, shown.images_covariance)
 
     @property
     def digest(self) -> str:
@@ -286,6 +292,15 @@ class TaughtEdges:
         """
         across, _ = sight_axes(gripper, points_grip_m, cam_T_grip)
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
+
+
+def _error(covariance: Sequence[float], images_covariance: Sequence[float] | None) -> Array:
+    """(6, 6) one standard deviation along each of six directions of a pose of which two things tell, independently."""
+    both = np.reshape(covariance, (6, 6))
+    if images_covariance is not None:
+        both = both - both @ np.linalg.solve(both + np.reshape(images_covariance, (6, 6)), both)
+        both = 0.5 * (both + both.T)
+    return np.asarray(np.linalg.cholesky(both).T)
 
 
 def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tuple[Array, Array]:

@@ -69,7 +69,7 @@ def hypotheses_of(
     sides: tuple[NDArray[np.bool_], ...] = (),
 ) -> Hypotheses:
     """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end,
-    ``inner`` (v,) for those that what is grasped touches.
+    ``inner`` (v,) for those that what is grasped touches.  The names as a sentence has them ("the left finger").
 
     A lone finger's ends are all that there are: something else taken for them is one hypothesis, as of all fingers.
     """
@@ -81,14 +81,14 @@ def hypotheses_of(
     for number, name in enumerate(edge_names):
         others = np.arange(count) != number
         if not (lone and (others == along).all()):
-            rows.append((f"edge {name} belongs to something else", WRONG_EDGE, others, False, False))
+            rows.append((f"{name} belongs to something else", WRONG_EDGE, others, False, False))
     for number, name in enumerate(finger_names):
         own = finger == number
         if (own & ~along).sum() > 1 and not lone:
-            what = f"the ends of finger {name} belong to something else"
+            what = f"the ends of {name} belong to something else"
             rows.append((what, WRONG_EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
-            rows.append((f"finger {name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
+            rows.append((f"{name} is not where its model says", WRONG_GRIPPER, ~own, False, True))
     grasp: tuple[int, ...] = ()
     for part, what in ((inner & along, "inner edges"), (inner, "inner edges with their ends")):
         if part.sum() > 1 and not part.all() and (not grasp or (part & ~along).any()):

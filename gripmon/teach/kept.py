@@ -1,0 +1,264 @@
+"""What frames keep: a monitor's own bounds over images that are there, and what makes them as large.
+
+A forecast knows neither the light nor what stands behind the fingers; on real grippers it promised a third of what the
+frames needed.  So wherever there are images, the monitor itself is run over them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.records import NOTHING_WRONG, Array, Frame, FrameRecord, ReferenceRecord, ValidBy, Verdict
+from gripmon.model.units import in_degrees, in_mm
+from gripmon.monitor import Monitor
+from gripmon.teach.accuracy import as_if_measured, rounded_up
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import VAGUE_M, VAGUE_RAD
+from gripmon.track.edges.words import in_words
+
+APART_S = 1.0
+"""Between two still images that have no time stamps."""
+
+SHARE = 0.9
+"""Of the frames that a proposed alert limit is to leave valid: that of real grippers' stills (docs/integrity.md)."""
+
+QUANTILE_ERROR = 1.71 / 1.2816
+"""Standard error of a normal sample's 90 % quantile, times the root of its size, in units of its distance from the
+median (no unit): sqrt(0.9 · 0.1) over the density there, 0.1755, is 1.71 standard deviations; the quantile is 1.2816
+away.
+"""
+
+LEAST_HELP = 0.9
+"""Ratio of bounds below which a remedy is worth saying."""
+
+
+class Sizes(msgspec.Struct, frozen=True):
+    """A bound over all counted images: its median, and what nine of ten are within (m, rad); None where fewer have a
+    bound.
+    """
+
+    median_m: float | None
+    median_rad: float | None
+    most_m: float | None
+    most_rad: float | None
+
+    @classmethod
+    def of(cls, bounds: Array) -> Sizes:
+        """From (n, 2) in m and rad, infinite without one."""
+        if not len(bounds):
+            return cls(None, None, None, None)
+        ordered = np.sort(bounds, axis=0)
+        rows = [ordered[math.ceil(share * len(ordered)) - 1].tolist() for share in (0.5, SHARE)]
+        return cls(*(value if math.isfinite(value) else None for row in rows for value in row))
+
+
+class Kept(msgspec.Struct, frozen=True):
+    """What a monitor said of ``images`` one after the other; ``first``: how many were not counted at the beginning, as
+    a single frame is never confirmed.  ``measured`` and ``valid`` of the counted ones; both bounds, of which
+    ``valid_by`` names the one that a verdict goes by.
+
+    ``hypothesis``: what it can't be excluded most often, that makes this bound as large, and in how many images;
+    ``reason``: why most of those that weren't measured weren't.  ``helps``: what would help most, and the median that
+    the bound has with it, None where that wasn't computed.
+    """
+
+    images: int
+    first: int
+    measured: int
+    valid: int
+    valid_by: ValidBy
+    since_reference: Sizes
+    absolute: Sizes
+    hypothesis: str
+    hypothesis_images: int
+    reason: str | None
+    alert_limit_m: float
+    alert_limit_rad: float
+    helps: str | None = None
+    helped_m: float | None = None
+    helped_rad: float | None = None
+
+    @property
+    def counted(self) -> int:
+        return self.images - self.first
+
+    @property
+    def sizes(self) -> Sizes:
+        """The bound that verdicts go by."""
+        return self.since_reference if self.valid_by is ValidBy.REFERENCE else self.absolute
+
+    @property
+    def proposed(self) -> tuple[float, float] | None:
+        """Alert limits (m, rad) within which nine of ten further frames like these should be; None where too few images
+        have a bound.
+
+        The 90 % quantile of few images is itself uncertain, by a standard error that follows from its distance from the
+        median, on a logarithmic scale, and the number of images (:data:`QUANTILE_ERROR`): that much is added.
+        """
+        sizes = self.sizes
+        if sizes.most_m is None or sizes.most_rad is None or sizes.median_m is None or sizes.median_rad is None:
+            return None
+        power = QUANTILE_ERROR / math.sqrt(self.counted)
+        return (
+            sizes.most_m * (sizes.most_m / sizes.median_m) ** power,
+            sizes.most_rad * (sizes.most_rad / sizes.median_rad) ** power,
+        )
+
+    @property
+    def excess(self) -> float:
+        """The larger of the bounds that nine of ten images keep, over its alert limit; infinite where there is none."""
+        sizes = self.sizes
+        if sizes.most_m is None or sizes.most_rad is None:
+            return math.inf
+        return max(sizes.most_m / self.alert_limit_m, sizes.most_rad / self.alert_limit_rad)
+
+    @property
+    def median_excess(self) -> float:
+        """The same of the median."""
+        sizes = self.sizes
+        if sizes.median_m is None or sizes.median_rad is None:
+            return math.inf
+        return max(sizes.median_m / self.alert_limit_m, sizes.median_rad / self.alert_limit_rad)
+
+    def text(self) -> str:
+        """One line for a person: what the bounds are."""
+        seen = f"{self.measured} of {self.counted} measured, {self.valid} valid"
+        sizes, of = self.sizes, "the motion since the reference" if self.valid_by is ValidBy.REFERENCE else "the TCP"
+        if sizes.median_m is None or sizes.median_rad is None:
+            return f"{seen}; {self.reason or 'no bound is known'}"
+        text = f"{seen}; bound on {of}, median {_said(sizes.median_m, sizes.median_rad)}"
+        if sizes.most_m is None or sizes.most_rad is None:
+            return f"{text}, {100.0 * SHARE:g} % of them: none"
+        return f"{text}, {100.0 * SHARE:g} % within {_said(sizes.most_m, sizes.most_rad)}"
+
+    def why(self) -> str:
+        """What makes the bound as large, in words of the picture; empty where nothing was measured."""
+        if not self.hypothesis:
+            return ""
+        often = f"in {self.hypothesis_images} of {self.measured} images"
+        if self.hypothesis == NOTHING_WRONG:
+            return f"{often} it is as large since too little of the gripper is seen"
+        return f"{often} it is as large since it can't be excluded that {self.hypothesis}"
+
+    def needed(self) -> str:
+        """The alert limits that nine of ten such frames would keep, where the present ones are too tight, as settings;
+        empty where they are wide enough.
+        """
+        proposed = self.proposed
+        if proposed is None or self.excess <= 1.0:
+            return ""
+        parts, (m, rad) = [], (rounded_up(value) for value in proposed)
+        if m > self.alert_limit_m:
+            parts.append(f"alert_limit_m of at least {m:g} ({1e3 * m:g} mm)")
+        if rad > self.alert_limit_rad:
+            parts.append(f"alert_limit_rad of at least {rad:g} ({in_degrees(rad)} degrees)")
+        return " and ".join(parts)
+
+    def help(self) -> str:
+        """The one thing that helps most, in words."""
+        if self.helps is None:
+            return ""
+        with_it = "" if self.helped_m is None or self.helped_rad is None else _said(self.helped_m, self.helped_rad)
+        return f"what helps most: {self.helps}{f' (median then {with_it})' if with_it else ''}"
+
+
+def _said(position_m: float, rotation_rad: float) -> str:
+    return f"{in_mm(position_m)} mm and {in_degrees(rotation_rad)}°"
+
+
+class _Run(NamedTuple):
+    """Records of counted frames, and the number of all."""
+
+    images: int
+    records: list[FrameRecord]
+
+
+def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
+    """Run the daemon's monitor over frames, each with the jaw opening that it would be told, and say what came of it.
+
+    The same frames give the same answer.  Without a frame, nothing is measured.
+    """
+    policy = rig.settings.policy
+    monitor = Monitor(rig.camera, rig.gripper, rig.settings, reference, rig.taught)
+    records = [monitor.process(frame) for frame in frames]
+    first = min(policy.confirm_frames - 1, max(len(records) - 1, 0))
+    counted = records[first:]
+    since, absolute = np.full((len(counted), 2), np.inf), np.full((len(counted), 2), np.inf)
+    for k, record in enumerate(counted):
+        if record.measured and record.since_reference is not None:
+            since[k] = record.since_reference.position_m, record.since_reference.rotation_rad
+        if record.measured and record.absolute is not None:
+            absolute[k] = record.absolute.position_m, record.absolute.rotation_rad
+    for bounds in (since, absolute):  # what a frame's reason calls undetermined
+        bounds[(bounds > (VAGUE_M, VAGUE_RAD)).any(axis=1)] = np.inf
+    measured = [record for record in counted if record.measured]
+    named = Counter(r.protection.hypothesis for r in measured if r.protection is not None)
+    hypothesis, often = named.most_common(1)[0] if named else ("", 0)
+    unseen = Counter(r.reason for r in counted if not r.measured and r.reason)
+    return Kept(
+        images=len(records),
+        first=first,
+        measured=len(measured),
+        valid=sum(record.verdict is Verdict.VALID for record in counted),
+        valid_by=policy.valid_by,
+        since_reference=Sizes.of(since),
+        absolute=Sizes.of(absolute),
+        hypothesis=hypothesis,
+        hypothesis_images=often,
+        reason=unseen.most_common(1)[0][0] if unseen else None,
+        alert_limit_m=policy.alert_limit_m,
+        alert_limit_rad=policy.alert_limit_rad,
+    )
+
+
+def as_frames(images: Iterable[TeachingImage]) -> list[Frame]:
+    """Teaching images as frames, one after the other."""
+    return [
+        Frame(k, round(1e9 * APART_S * (k + 1)), each.image, each.jaw_opening_m, each.name)
+        for k, each in enumerate(images)
+    ]
+
+
+def with_help(found: Kept, rig: Rig, reference: ReferenceRecord, again: Callable[[], Iterable[Frame]]) -> Kept:
+    """The same with the one thing that helps most: the monitor is run over the frames, which ``again`` gives, with each
+    thing known that a person can measure.  Where none of these helps, what the hypothesis asks for.
+    """
+    tried = {words: kept(known, reference, again()) for words, known in as_if_measured(rig).items()}
+    if found.valid_by is ValidBy.ABSOLUTE:
+        tried["valid_by: reference, if only the motion since the reference counts"] = msgspec.structs.replace(
+            found, valid_by=ValidBy.REFERENCE
+        )
+    if tried and math.isfinite(found.median_excess):
+        words, best = min(tried.items(), key=lambda each: each[1].median_excess)
+        if best.median_excess < LEAST_HELP * found.median_excess:
+            sizes = best.sizes
+            return msgspec.structs.replace(found, helps=words, helped_m=sizes.median_m, helped_rad=sizes.median_rad)
+    return msgspec.structs.replace(found, helps=_asked_for(found.hypothesis))
+
+
+def _asked_for(hypothesis: str) -> str | None:
+    """What would exclude a hypothesis."""
+    if not hypothesis:
+        return None
+    if hypothesis == NOTHING_WRONG:
+        return "more of the fingers in the picture, nearer and in focus"
+    if "grasped" in hypothesis:
+        return "frames with nothing between the fingers"
+    if "opening" in hypothesis:
+        return "a jaw opening that is known better (monitor.jaw_sigma_m)"
+    if "end" in hypothesis or "stand" in hypothesis or "tip" in hypothesis:
+        return "all fingers' tips in the picture, with nothing over them"
+    return "more edges of the fingers in the picture, so that none decides alone"
+
+
+def doubted_edges(found: Kept, rig: Rig, cam_T_grip: Array) -> NDArray[np.bool_]:
+    """(e,) which of the gripper's edges the hypothesis is about, seen from a pose (4, 4)."""
+    return in_words(rig.gripper, cam_T_grip).meant(found.hypothesis, rig.gripper)
