@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import (
     CommandReply,
+    Frame,
     FrameRecord,
     MonitorState,
     Protection,
@@ -29,10 +31,12 @@ from gripmon.model.records import (
     from_json,
     to_json,
 )
-from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.monitor import Monitor, MonitorSettings, trust
 from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, CommonError, Opened
+from gripmon.monitor.tracker import Tracker
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.integrity import Separation
 
 BY_REFERENCE = PolicySettings(valid_by=ValidBy.REFERENCE)
@@ -128,7 +132,7 @@ def at_reference(cam_T_grip: np.ndarray, count: int = 1, sigma: float = 1e-4) ->
     fits = Separation(
         np.zeros((count, 6)), np.tile(np.diag(np.square([sigma] * 6)), (count, 1, 1)), np.zeros((count, 1, 6))
     )
-    return AtReference(cam_T_grip, fits, 0.03, 30, Since.FIRST_PROVED, 0, 1e-6)
+    return AtReference(cam_T_grip, fits, 0.03, 30, Since.FIRST_PROVED, 0, 1e-6, True)
 
 
 def random_pose(rng: np.random.Generator, size: float = 1.0) -> np.ndarray:
@@ -281,7 +285,7 @@ class Mean:
     """Stands in for the anchor: an average of ``frames``, with a bound of a millimetre."""
 
     def __init__(self, cam_T_grip: np.ndarray, frames: int = 1):
-        self.cam_T_grip, self.frames = cam_T_grip, frames
+        self.cam_T_grip, self.frames, self.misread, self.proven = cam_T_grip, frames, 1e-6, True
 
     def fits(self) -> Separation:
         return at_reference(self.cam_T_grip).fits
@@ -341,7 +345,10 @@ def test_a_restart_goes_on_with_it_and_sees_a_knock_in_between():
     assert isinstance(state.at_reference, tuple) and len(state.at_reference) == 1
 
     again = restarted(state, settings)
-    assert again.since_refused is None and again.state().at_reference == state.at_reference
+    (kept,) = again.state().at_reference
+    at_T = state.at_reference[0].cam_T_grip
+    np.testing.assert_allclose(pose_of(kept.cam_T_grip), pose_of(at_T), atol=1e-12)
+    assert again.since_refused is None and (msgspec.structs.replace(kept, cam_T_grip=at_T),) == state.at_reference
     after = [again.process(simulator.frame(i)) for i in range(KNOCKED, 24)]
     since = before[-1].since_reference, after[-1].since_reference
     assert since[0] is not None and since[1] is not None and since[0].since_ns == since[1].since_ns
@@ -353,6 +360,53 @@ def test_a_restart_goes_on_with_it_and_sees_a_knock_in_between():
     assert "measured with other settings" in (refused.since_refused or "") and refused._trust.since.current is None
     old = restarted(msgspec.structs.replace(state, at_reference=msgspec.UNSET), settings)
     assert "from an earlier version" in (old.since_refused or "")
+
+
+def test_a_knock_while_it_was_off_is_seen_in_the_motion_though_the_first_frames_after_it_prove_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Something hides the fingers' ends in two frames; what was known of the reference must survive these."""
+    monkeypatch.setattr(trust, "PROOF_EVERY_FRAMES", 1)
+    pose, camera, gripper = nominal_cam_T_grip(), make_camera(PAPER_LENS), box_gripper(sharp=False)
+    settings = MonitorSettings(policy=BY_REFERENCE)
+    monitor = Monitor(camera, gripper, settings, reference_at(pose))
+    before = Simulator(camera, gripper, pose, scene(FIRST_FRAMES + 10), 2)
+    for index in range(FIRST_FRAMES + 8):
+        told = monitor.process(before.frame(index)).since_reference
+        monitor.run_pending()
+    again, knocked = restarted(monitor.state(), settings), pose.copy()
+    knocked[:3, 3] += KNOCK_M
+    ends, after, records = Tracker.ends, Simulator(camera, gripper, knocked, scene(20), 3), []
+
+    def no_ends(tracker: Tracker, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
+        none = np.zeros(2, dtype=np.intp)
+        return replace(ends(tracker, frame, measurement), seen=none, strictly=none)
+
+    for index in range(16):
+        with monkeypatch.context() as patch:
+            if index < 2:
+                patch.setattr(Tracker, "ends", no_ends)
+            records.append(again.process(after.frame(index)))
+        again.run_pending()
+    assert told is not None and all(r.since_reference and r.since_reference.since_ns == told.since_ns for r in records)
+    valid = [record for record in records if record.verdict is Verdict.VALID]
+    assert len(valid) >= 10
+    for record in valid:
+        assert record.drift is not None and record.protection is not None
+        error_m = np.linalg.norm(np.subtract(record.drift.tcp_shift_m, KNOCK_M))
+        assert error_m < min(2e-4, record.protection.position_m)
+
+
+@pytest.mark.parametrize("days", [0.0, 7.0])
+def test_that_a_mount_stays_is_known_less_the_longer_ago_the_reference_is(days: float):
+    kept = begun()
+    kept.add(Mean(np.eye(4)), 0.03, 10**9)
+    kept.now_ns = 10**9 + int(days * 86_400e9)
+    assert kept.elapsed_s == days * 86_400.0 and not kept.knocked
+    kept.now_ns = 0
+    assert kept.elapsed_s == 0.0, "a clock that was set back"
+    kept.moved()
+    assert kept.knocked
 
 
 def test_a_reference_that_is_measured_again_begins_it_from_its_own_frames_and_an_undo_goes_back():

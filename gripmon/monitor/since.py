@@ -133,6 +133,7 @@ class Average(Protocol):
     cam_T_grip: Array
     frames: int
     misread: float
+    proven: bool
 
     def fits(self) -> Separation:
         """The averages under the lasting hypotheses, as shifts from ``cam_T_grip``."""
@@ -172,8 +173,8 @@ class Differences(NamedTuple):
 class AtReference(NamedTuple):
     """What the monitor measured at the reference: ``fits`` under each of g lasting hypotheses as shifts from
     ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
-    ``misread``: probability that what looked like the fingers' ends in all of these was something else; ``knocked``:
-    whether the mount was, later on.
+    ``misread``: probability that what looked like the fingers' ends in all of these was something else; ``proven``:
+    whether one of them proved the pose; ``knocked``: whether the mount was, later on.
     """
 
     cam_T_grip: Array
@@ -183,6 +184,7 @@ class AtReference(NamedTuple):
     since: Since
     since_ns: int
     misread: float
+    proven: bool
     knocked: bool = False
 
     def motion(self, cam_T_grip: Array) -> Array:
@@ -297,10 +299,10 @@ class AtReferences:
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""
         at = anchor.cam_T_grip, anchor.fits(), jaw_opening_m, anchor.frames, Since.REFERENCE, reference.stamp_ns
-        self._keep(reference.reference_id, AtReference(*at, anchor.misread))
+        self._keep(reference.reference_id, AtReference(*at, anchor.misread, anchor.proven))
 
     def add(self, anchor: Average, jaw_opening_m: float, stamp_ns: int) -> None:
-        """A frame has proved a pose, which ``anchor`` includes; nothing else begins what is known of a reference."""
+        """A frame counts, which ``anchor`` includes: it has proved a pose, or none has yet."""
         growing = self._growing
         if growing is None and self.current is not None:
             return
@@ -311,9 +313,15 @@ class AtReferences:
             self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
         self._openings_m.append(jaw_opening_m)
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
-        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns, anchor.misread)
+        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns, anchor.misread, anchor.proven)
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
+
+    def proved(self) -> None:
+        """A frame has proved a pose: what was known of the reference in force without the fingers' ends is dropped."""
+        if self.current is not None and not self.current.proven:
+            self._known.pop(self._id)
+            self._growing = None
 
     def moved(self) -> None:
         """The mount was knocked: that it stays where it was says nothing about the motion since any reference."""
@@ -358,6 +366,7 @@ class AtReferences:
             at.since,
             at.since_ns,
             at.misread,
+            at.proven,
             at.knocked,
         )
 
@@ -380,7 +389,7 @@ class AtReferences:
                 )
             else:
                 at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns
-                self._known[each.reference_id] = AtReference(*at, each.misread, each.knocked)
+                self._known[each.reference_id] = AtReference(*at, each.misread, each.proven, each.knocked)
         return refused
 
 

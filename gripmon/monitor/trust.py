@@ -295,9 +295,10 @@ class Integrity:
             assert self._weigher.anchor is not None
             self._jaw_opening_m = measurement.jaw_opening_m
             if proves:
-                if trust.displaced:
-                    self.since.moved()
-                self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
+                self.since.proved()
+            if proves and self._weigher.moved():
+                self.since.moved()
+            self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
         if proves and frame.image is not None and not (moved or trust.may_have_slid):
             # A copy: learning can wait, and the caller may read the next image into the same memory.
             self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s

@@ -308,8 +308,23 @@ class Weigher:
         """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
         """
-        covariance = np.diag(self._mount.creep(self._since.elapsed_s) + self.swing) + self._tracker.floor
-        return covariance + knocks.spread if displaced or self._since.knocked else covariance
+        return self._usual_motion + knocks.spread if displaced or self._since.knocked else self._usual_motion
+
+    @property
+    def _usual_motion(self) -> Array:
+        """(6, 6) covariance of what a mount moves by since the reference's frames without a knock."""
+        return np.diag(self._mount.creep(self._since.elapsed_s) + self.swing) + self._tracker.floor
+
+    def moved(self) -> bool:
+        """Whether the anchor isn't where the reference's frames had the gripper, by more than a mount moves by itself:
+        also after a knock while the monitor was off or the ends were hidden.
+        """
+        first, anchor = self._since.current, self.anchor
+        if first is None or anchor is None:
+            return False
+        way = perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
+        covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
+        return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
 
     def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the

@@ -78,6 +78,7 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     misread: Annotated[
         float, Meta(description="probability that what looked like the fingers' ends in all of them was something else")
     ]
+    proven: Annotated[bool, Meta(description="whether one of them proved the pose by the fingers' ends")]
     knocked: Annotated[bool, Meta(description="whether the mount was knocked later on")]
 
 
