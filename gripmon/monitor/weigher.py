@@ -8,7 +8,6 @@ knocked, which is rare: the average of the proven poses is the anchor.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,29 +19,18 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
-from gripmon.monitor.anchor import Anchor, Lasting
-from gripmon.monitor.bounds import (
-    UNBOUNDED_M,
-    UNBOUNDED_RAD,
-    Cases,
-    ModelError,
-    TwoDoubts,
-    bounds_of,
-    doubts_since,
-    larger,
-    reaching,
-    unbounded,
-)
+from gripmon.monitor.anchor import Anchor
+from gripmon.monitor.bounds import Cases, TwoDoubts, bounds_of, doubts_since, larger, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
+from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import AtReferences, Bounds, CommonError, Differences
+from gripmon.monitor.since import AtReferences, Bounds, Differences
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end, inner_edges, sides
+from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.edges.words import Words, in_words
-from gripmon.track.integrity import Hypotheses, Knocks, Mount, bounds, hypotheses_of
+from gripmon.track.integrity import Knocks, Mount, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
@@ -57,19 +45,6 @@ exceeds it in one of a thousand knocks, which is then accepted a frame later.
 
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
-
-MOST_KEPT = 64
-"""Sets of seen edges whose hypotheses are remembered."""
-
-
-class About(NamedTuple):
-    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, and
-    ``rows`` (g,), which hypothesis each lasting one is.
-    """
-
-    hypotheses: Hypotheses
-    without_ends: Hypotheses
-    rows: NDArray[np.intp]
 
 
 class Weigher:
@@ -89,12 +64,8 @@ class Weigher:
         creep = settings.smoothing
         variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month)
-        self._model, self._since = _model_error(tracker, gripper), since
-        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
-        every = np.arange(len(gripper.edge_ids))
-        self._words = in_words(gripper, from_record(reference.cam_T_grip))
-        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open, self._words))
-        self._kept: dict[bytes, About] = {}
+        self._possible = Possible(tracker, gripper, settings, from_record(reference.cam_T_grip))
+        self._lasting, self._since = self._possible.lasting, since
         self._newest: tuple[Measurement, float, Refits] | None = None
         self.anchor: Anchor | None = None
         self.question: Question | None = None
@@ -119,7 +90,7 @@ class Weigher:
 
     def restore(self, records: tuple[AtReferenceRecord, ...]) -> str | None:
         """See :meth:`AtReferences.restore`."""
-        return self._since.restore(records, len(self._lasting.name), self._model.parts)
+        return self._since.restore(records, len(self._lasting.name), self._possible.model.parts)
 
     @property
     def expected(self) -> tuple[Array, Array]:
@@ -280,7 +251,7 @@ class Weigher:
         prior = self._lasting.priors(ever)
         every = np.arange(len(prior))
         if anchor is not None and not displaced:
-            rows, wander = self._about(fits.edges).rows, self._wander(now_s)
+            rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
             absolute, told = anchor.cases(cam_T_grip, fits, rows, wander, prior)
             doubts = replace(doubts, absolute=doubts.absolute + fits.model.absolute(absolute, cam_T_grip))
             since, lasting = [told], [every]
@@ -334,7 +305,7 @@ class Weigher:
             return fits
         if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
             return None
-        hypotheses = self._about(fits.edges).without_ends
+        hypotheses = self._possible.about(fits.edges).without_ends
         return Refits(measurement, hypotheses, self._tracker.floor, fits.model, fits.known, together=False)
 
     def _knocked_cases(
@@ -374,7 +345,7 @@ class Weigher:
         proven = trust.proven
         if self.proved and not proven:
             return
-        rows = self._about(trust.fits.edges).rows
+        rows = self._possible.about(trust.fits.edges).rows
         if proven:
             self._slid = trust.may_have_slid
         if self.proved:
@@ -475,48 +446,7 @@ class Weigher:
             expected_T, covariance = self.expected
             of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
             known = Known(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
-            model = self._model._replace(first=self._since.published_by)
-            hypotheses = self._about(measurement.normal.edge).hypotheses
+            model = self._possible.model._replace(first=self._since.published_by)
+            hypotheses = self._possible.about(measurement.normal.edge).hypotheses
             self._newest = measurement, now_s, Refits(measurement, hypotheses, self._tracker.floor, model, known)
         return self._newest[2]
-
-    def _about(self, edges: NDArray[np.intp]) -> About:
-        """What may be wrong with a fit of ``edges`` (v,)."""
-        key = edges.tobytes()
-        if key not in self._kept:
-            if len(self._kept) >= MOST_KEPT:
-                self._kept.clear()
-            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open, self._words)
-            self._kept[key] = About(hypotheses, hypotheses.without_ends(), self._lasting.rows(hypotheses, edges))
-        return self._kept[key]
-
-
-def _hypotheses_about(
-    edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool, words: Words
-) -> Hypotheses:
-    names = tuple(words.edges[edge] for edge in edges)
-    of_each = gripper.edge_finger[edges], words.fingers, tracker.along[edges], inner_edges(gripper)[edges]
-    return hypotheses_of(names, *of_each, may_open, tuple(side[edges] for side in sides(gripper)))
-
-
-def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
-    scale_sigma, taught, offset = gripper.model.scale_sigma, tracker.taught_error, tracker.taught_offset
-    common = CommonError(scale_sigma, taught, offset) if scale_sigma or len(taught) or offset.any() else None
-    return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids), common)
-
-
-def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement) -> Bounds:
-    """The protection levels of a single frame with the given measurement and proven fingers' ends, where the frames of
-    the reference show no more.
-    """
-    if not len(measurement.normal.edge):
-        return unbounded(settings.policy.integrity_risk, NOTHING_WRONG)
-    may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0
-    words = in_words(gripper, measurement.prediction.cam_T_grip)
-    hypotheses = _hypotheses_about(measurement.normal.edge, gripper, tracker, may_open, words)
-    model = _model_error(tracker, gripper)
-    nothing = Known(measurement.cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
-    fits = Refits(measurement, hypotheses, tracker.floor, model, nothing)
-    cases = fits.cases(measurement.cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
-    doubts = TwoDoubts(model.absolute(cases, measurement.cam_T_grip), doubts_since(cases, None))
-    return bounds_of(doubts, settings.policy.integrity_risk)

@@ -164,8 +164,8 @@ class FingerEnds:
         fingers = len(self._gripper.finger_ids)
         places, strictly, past = self._at_places(image, measurement)
         asked = places, self.in_view(measurement.prediction), strictly
-        seen, might, strictly = (np.bincount(self.finger[each], minlength=fingers) for each in asked)
-        return FingerEndsSeen(seen, might, strictly, past)
+        seen, might, of_these = (np.bincount(self.finger[each], minlength=fingers) for each in asked)
+        return FingerEndsSeen(seen, might, of_these, past)
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
         """(s,) the places that might be seen as ends in this view."""

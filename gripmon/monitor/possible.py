@@ -1,0 +1,91 @@
+"""What may be wrong with the fits of one gripper, and with its file."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import NOTHING_WRONG, Array
+from gripmon.monitor.anchor import Lasting
+from gripmon.monitor.bounds import (
+    UNBOUNDED_M,
+    UNBOUNDED_RAD,
+    ModelError,
+    TwoDoubts,
+    bounds_of,
+    doubts_since,
+    unbounded,
+)
+from gripmon.monitor.refits import Known, Refits
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.since import Bounds, CommonError
+from gripmon.monitor.tracker import Tracker
+from gripmon.track.edges import Measurement, inner_edges, sides
+from gripmon.track.edges.words import in_words
+from gripmon.track.integrity import Hypotheses, hypotheses_of
+
+MOST_KEPT = 64
+"""Sets of seen edges whose hypotheses are remembered."""
+
+
+class About(NamedTuple):
+    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, and
+    ``rows`` (g,), which hypothesis each lasting one is.
+    """
+
+    hypotheses: Hypotheses
+    without_ends: Hypotheses
+    rows: NDArray[np.intp]
+
+
+class Possible:
+    """The hypotheses about one gripper's fits: ``lasting``, those that may hold in every frame, and its ``model``'s
+    error.
+    """
+
+    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, cam_T_grip: Array):
+        """``cam_T_grip`` (4, 4): where the picture shows the gripper, for its edges' names in words."""
+        self._gripper, self._along, self._sides = gripper, tracker.along, sides(gripper)
+        self._words, self._inner = in_words(gripper, cam_T_grip), inner_edges(gripper)
+        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
+        self._kept: dict[bytes, About] = {}
+        self.lasting = Lasting.of(self.hypotheses(np.arange(len(gripper.edge_ids))))
+        scale_sigma, taught, offset = gripper.model.scale_sigma, tracker.taught_error, tracker.taught_offset
+        common = CommonError(scale_sigma, taught, offset) if scale_sigma or len(taught) or offset.any() else None
+        of_each = gripper.edge_finger, len(gripper.finger_ids)
+        self.model = ModelError(tracker.model_sigma_m, tracker.finger_axis, *of_each, common)
+
+    def hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
+        """What may be wrong with a fit of ``edges`` (v,)."""
+        names = tuple(self._words.edges[edge] for edge in edges)
+        of_each = self._gripper.edge_finger[edges], self._words.fingers, self._along[edges], self._inner[edges]
+        return hypotheses_of(names, *of_each, self._may_open, tuple(side[edges] for side in self._sides))
+
+    def about(self, edges: NDArray[np.intp]) -> About:
+        """The same with what follows from it, kept from frame to frame."""
+        key = edges.tobytes()
+        if key not in self._kept:
+            if len(self._kept) >= MOST_KEPT:
+                self._kept.clear()
+            hypotheses = self.hypotheses(edges)
+            self._kept[key] = About(hypotheses, hypotheses.without_ends(), self.lasting.rows(hypotheses, edges))
+        return self._kept[key]
+
+
+def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement) -> Bounds:
+    """The protection levels of a single frame with the given measurement and proven fingers' ends, where the frames of
+    the reference show no more.
+    """
+    if not len(measurement.normal.edge):
+        return unbounded(settings.policy.integrity_risk, NOTHING_WRONG)
+    cam_T_grip = measurement.cam_T_grip
+    possible = Possible(tracker, gripper, settings, measurement.prediction.cam_T_grip)
+    hypotheses = possible.hypotheses(measurement.normal.edge)
+    nothing = Known(cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
+    fits = Refits(measurement, hypotheses, tracker.floor, possible.model, nothing)
+    cases = fits.cases(cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
+    doubts = TwoDoubts(possible.model.absolute(cases, cam_T_grip), doubts_since(cases, None))
+    return bounds_of(doubts, settings.policy.integrity_risk)
