@@ -47,3 +47,8 @@ def test_the_spread_is_that_of_what_is_sampled():
     knocks = Knocks.of(AXIS_CAM)
     covariance = np.cov(sampled_m(knocks).T)
     np.testing.assert_allclose(covariance, knocks.spread[:3, :3], atol=0.08 * knocks.spread[:3, :3].max())
+
+
+def test_two_knocks_in_three_turn_the_camera_by_a_degree_about_each_axis():
+    variance = Knocks.of(AXIS_CAM).spread[3:, 3:]
+    np.testing.assert_allclose(variance, 2.0 / 3.0 * 0.02**2 * np.eye(3), atol=1e-12)

@@ -409,6 +409,16 @@ def test_that_a_mount_stays_is_known_less_the_longer_ago_the_reference_is(days: 
     assert kept.knocked
 
 
+def test_the_configured_reference_the_one_in_force_and_the_newest_are_kept():
+    kept = begun()
+    kept.measured(reference_at(np.eye(4)), Mean(np.eye(4)), 0.03)
+    configured = kept.state()[0].reference_id
+    for number in range(12):
+        newer = msgspec.structs.replace(reference_at(np.eye(4)), reference_id=f"again-{number}")
+        kept.measured(newer, Mean(np.eye(4)), 0.03)
+    assert [each.reference_id for each in kept.state()] == [configured, *(f"again-{k}" for k in range(5, 12))]
+
+
 def test_a_reference_that_is_measured_again_begins_it_from_its_own_frames_and_an_undo_goes_back():
     kept, anchor = begun(), Mean(np.eye(4), 40)
     for _ in range(FIRST_FRAMES):
