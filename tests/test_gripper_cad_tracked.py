@@ -87,7 +87,7 @@ def test_what_was_made_from_a_mesh_tracks_it(shape: str, tmp_path: Path):
             errors.append(error)
             valid += record.verdict is Verdict.VALID
     # The first frame has none before it that confirms it.
-    assert len(errors) >= 0.98 * FRAMES and valid >= 0.98 * (FRAMES - 1)
+    assert len(errors) >= 0.98 * FRAMES and valid >= 0.97 * (FRAMES - 1)
     off = np.abs(np.array(errors))
     assert np.quantile(np.linalg.norm(off[:, :2], axis=1), 0.95) < across_m
     assert np.quantile(off[:, 2], 0.95) < along_m

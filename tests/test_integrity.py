@@ -361,6 +361,7 @@ def test_hypotheses_doubt_what_their_names_say():
         "finger a is not where its model says": a,
         "finger b is not where its model says": b,
         "the fingers' inner edges belong to what is grasped": {"a_in", "b_in"},
+        "the fingers' outer edges belong to something beside them": {"a_out", "b_out"},
         "the jaw opening is wrong": set(),
         "what looks like the fingers' ends is something else": {
             n for n, along in zip(NAMES, ALONG, strict=True) if not along
@@ -373,6 +374,7 @@ def test_hypotheses_doubt_what_their_names_say():
     assert {p for n, p in prior.items() if n.startswith("the ends of")} == {WRONG_EDGE}
     assert {p for n, p in prior.items() if n.startswith("finger ")} == {WRONG_GRIPPER}
     assert prior["the fingers' inner edges belong to what is grasped"] == WRONG_EDGE
+    assert prior["the fingers' outer edges belong to something beside them"] == WRONG_EDGE
     assert prior["the jaw opening is wrong"] == WRONG_GRIPPER
 
 
@@ -383,6 +385,7 @@ def test_hypotheses_know_what_kind_they_are():
         "finger a is not where its model says",
         "finger b is not where its model says",
         "the fingers' inner edges belong to what is grasped",
+        "the fingers' outer edges belong to something beside them",
         "what looks like the fingers' ends is something else",
     }
     assert found.name[0] == "nothing is wrong"
@@ -400,7 +403,8 @@ def test_without_ends_each_hypothesis_doubts_them_besides():
     on_the_sides = [f"edge {name} belongs to something else" for name in ("a_out", "a_in", "b_out", "b_in")]
     fingers = [f"finger {name} is not where its model says" for name in "ab"]
     grasped = "the fingers' inner edges belong to what is grasped"
-    wrong = {*on_the_sides, *fingers, grasped, "the jaw opening is wrong"}
+    outer = "the fingers' outer edges belong to something beside them"
+    wrong = {*on_the_sides, *fingers, grasped, outer, "the jaw opening is wrong"}
     assert {every.name[k] for k in np.flatnonzero(more)} == wrong
 
 

@@ -184,8 +184,8 @@ def test_stills_of_a_real_xarm_are_promised_what_they_keep_and_nearly_all_are_ta
     values, said = checked(capsys, REAL / "xarm" / "config.yaml")
     assert values["kept"]["measured"] == 25
     assert "the right finger's outer border (e18) belongs to something else" in said
-    # The forecast's bound, which was what check promised, is a third of what nine of ten frames keep.
-    assert values["kept"]["absolute"]["most_m"] > 2.0 * values["absolute"]["position_m"]
+    # The forecast's bound, which was what check promised, is far below what nine of ten frames keep.
+    assert values["kept"]["absolute"]["most_m"] > 1.5 * values["absolute"]["position_m"]
     config = gripmon.load_config(REAL / "xarm" / "config.yaml", check_source=False)
     teaching = gripmon.teach_edges(config, [REAL / "xarm"])
     assert len(teaching.images) >= 22  # 18 of 26 where play was a reason to leave an image out

@@ -51,7 +51,7 @@ def test_there_is_one_of_each():
     assert {name: type(message) for name, message in ONE_OF_EACH.items()} == MESSAGES
 
 
-VERSIONS = {"transform": 2}
+VERSIONS = {"transform": 2, "reply": 2}
 """Major versions of messages; of the others 1."""
 
 

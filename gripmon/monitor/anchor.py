@@ -29,6 +29,11 @@ YOUNG_VARIANCE_RATIO = 0.2
 would gain little, given the least variance that an average may claim.
 """
 
+LEFT_WITH_BACKGROUND, ATTACHED_SHARE = 0.3, 1e-2
+"""Share of the things that were taken for the fingers' ends that still are before another background; and of those that
+always are, being attached to the gripper: a cable, a strip of tape.  Assumed, not measured.
+"""
+
 CONFIRMING_FRAMES = 5
 """Frames after a knock, besides the first, that need the full proof of the new place."""
 
@@ -100,7 +105,9 @@ class Anchor:
         """``knocked``: the first pose differs from the one expected before; ``misread``: probability that what looked
         like the fingers' ends there was something else.
         """
-        self.misread, self.proven = misread, proven
+        self.clearest, self.proven = misread, proven
+        self.backgrounds = 1
+        """Before how many different ones a pose was proved here."""
         self._lasting, self._base_T, self._origin = lasting, base_T, origin
         self.now_s, self.frames = now_s, 1
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
@@ -109,6 +116,13 @@ class Anchor:
         self._scatter = np.zeros((len(rows), 6))
         self._weight = PRIOR_FRAMES
         self._conclude()
+
+    @property
+    def misread(self) -> float:
+        """Probability that what looked like the fingers' ends was something else in every frame: as the :attr:`clearest`
+        has it; what isn't the gripper's mostly leaves with its background.
+        """
+        return self.clearest * max(LEFT_WITH_BACKGROUND ** (self.backgrounds - 1), ATTACHED_SHARE)
 
     @property
     def confirmed(self) -> bool:
@@ -120,7 +134,7 @@ class Anchor:
         since the last one; ``misread`` as at first.
         """
         self.now_s = now_s
-        self.misread = min(self.misread, misread)
+        self.clearest = min(self.clearest, misread)
         self.frames += 1
         self._to_confirm -= 1
         frame = _chosen(fits, rows, self._base_T)

@@ -133,7 +133,7 @@ class Integrity:
         if learn_from is not None:
             self._look.learn(*learn_from)
             self._strips.learn(*learn_from)
-            self._weigher.learnt_along()
+            self._weigher.learnt(self._look.backgrounds)
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
@@ -291,8 +291,11 @@ class Integrity:
         proves = trust.proven and (moved or not trust.displaced)
         unproven = self._weigher.proved and not proves
         if trust.fits is not None and (proves or not (trust.displaced or self._weigher.proved)):
+            before = self._weigher.anchor
             self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
             assert self._weigher.anchor is not None
+            if self._weigher.anchor is not before:
+                self._look.count_again()
             self._jaw_opening_m = measurement.jaw_opening_m
             if proves:
                 self.since.proved()

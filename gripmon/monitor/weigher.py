@@ -187,9 +187,11 @@ class Weigher:
         along_unseen = besides * float(knocks.share[knocks.along].sum()) > risk
         return self._explained(trust, measurement, cam_T_grip, prior, fits, along_unseen)
 
-    def learnt_along(self) -> None:
-        """The fingers' strips were learnt at the anchor."""
-        self._along_misread = self.misread_ever
+    def learnt(self, backgrounds: int) -> None:
+        """The fingers' strips were learnt at the anchor, which was proved before so many different backgrounds."""
+        assert self.anchor is not None
+        self._along_misread = self.anchor.clearest
+        self.anchor.backgrounds = max(backgrounds, 1)
 
     def displaced(self, measurement: Measurement, now_s: float) -> bool:
         """Whether a measured pose isn't where the gripper is expected."""

@@ -96,7 +96,7 @@ def hypotheses_of(
             # In one image another distance and opening make up for it; where the gripper was before doesn't fit then.
             rows.append((f"the fingers' {what} belong to what is grasped", WRONG_EDGE, ~part, False, True))
     outer = along & ~inner
-    if outer.sum() > 1 and not outer.all():
+    if outer.sum() > 1 and not outer.all() and not lone:
         # A slot, a sleeve, a cable at each finger.
         rows.append(("the fingers' outer edges belong to something beside them", WRONG_EDGE, ~outer, False, True))
     for side in sides:

@@ -50,6 +50,9 @@ finger another background, a block on it another look.  A patch of which two fra
 gripper's: that is the square of the length of the mean of its unit vectors.
 """
 
+MOST_BACKGROUNDS = 8
+"""Different backgrounds that are remembered: a robot that goes to and fro between two stations sees two."""
+
 CHANGED_BACKGROUND_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
@@ -91,11 +94,21 @@ class GripperLook:
         self._far = np.abs(steps_m) > SLIDES_M[0]
         self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
         self.views = 0
+        self._different: list[NDArray[np.float32]] = []
         self._laid_out: tuple[Array, float | None] | None = None
         self._last_s: float | None = None
         self._not_before_s = -math.inf
         self._behind: NDArray[np.float32] | None = None
         self._begin(Layout(np.zeros((0, POINTS, 3)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)))
+
+    @property
+    def backgrounds(self) -> int:
+        """Before how many different backgrounds it was learnt since they are counted, of :data:`MOST_BACKGROUNDS`."""
+        return len(self._different)
+
+    def count_again(self) -> None:
+        """Count different backgrounds anew: the gripper stands elsewhere."""
+        self._different = []
 
     @property
     def ready(self) -> bool:
@@ -134,6 +147,9 @@ class GripperLook:
         if self._behind is not None and not another_background(behind, self._behind):
             return False
         self._behind = behind
+        new = len(behind) > 0 and all(another_background(behind, other) for other in self._different)
+        if new and len(self._different) < MOST_BACKGROUNDS:
+            self._different.append(behind)
         pair = 2 * (self.views % len(SLIDES_M))
         slid = np.stack([cam_T_grip] * 3)
         slid[1:, :3, 3] += self._slides_grip_m[pair : pair + 2] @ cam_T_grip[:3, :3].T
