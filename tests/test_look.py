@@ -182,6 +182,22 @@ def test_nothing_is_learnt_before_a_background_that_stands_still():
     assert np.isnan(agreement.correlation).all() and not agreement.log_odds.any()
 
 
+def test_different_backgrounds_are_counted_once_each_and_anew_elsewhere():
+    """A robot that goes to and fro sees two, and light is none."""
+    moving = filmed()
+    here, there = moving.render(0), moving.render(40)
+    truths = moving.truth(0), moving.truth(40)
+    look = new_look()
+    for k in range(10):
+        image, truth = ((here, truths[0]), (there, truths[1]))[k % 2]
+        dimmed = np.clip(image * (1.0 - 0.04 * k), 0, 255).astype(image.dtype)
+        look.learn(dimmed, truth.cam_T_grip, truth.jaw_opening_m, 0.1 * k)
+    assert look.backgrounds == 2 and look.views == 10
+    look.count_again()
+    assert look.backgrounds == 0
+    assert taught(moving).backgrounds > 4 and taught(filmed(background=Background(motion="still"))).backgrounds == 1
+
+
 def test_it_judges_after_the_fewest_views():
     simulation = filmed()
     look = taught(simulation, FEWEST_VIEWS - 1)
