@@ -215,8 +215,8 @@ def test_the_poses_covariance_includes_bevels_that_nobody_stated(opening_m: floa
         assert found.reference is not None, found.no_reference
         xi = perturbation_between(from_record(found.reference.cam_T_grip), pose)
         squares.append(xi @ np.linalg.solve(np.reshape(found.reference.covariance, (6, 6)), xi))
-        # The page promises what the run's bounds will say: with the error that the taught edges take over, what is known
-        # of the reference and what their images show of it together.
+        # The page promises what the run's bounds will say: with the error that the taught edges take over, what is
+        # known of the reference and what their images show of it together.
         _, taught = setup.taught(found.reference, [TeachingImage(image, found.snapped.jaw_opening_m, "")])
         known = np.linalg.inv(np.reshape(found.reference.covariance, (6, 6)))
         more = np.linalg.inv(taught.reference_error.T @ taught.reference_error) - known

@@ -119,8 +119,8 @@ class Anchor:
 
     @property
     def misread(self) -> float:
-        """Probability that what looked like the fingers' ends was something else in every frame: as :attr:`clearest` has
-        it; what isn't the gripper's mostly leaves with its background.
+        """Probability that what looked like the fingers' ends was something else in every frame: as :attr:`clearest`
+        has it; what isn't the gripper's mostly leaves with its background.
         """
         return self.clearest * max(LEFT_WITH_BACKGROUND ** (self.backgrounds - 1), ATTACHED_SHARE)
 
