@@ -132,8 +132,11 @@ class Average(Protocol):
 
     cam_T_grip: Array
     frames: int
-    misread: float
     proven: bool
+
+    @property
+    def misread(self) -> float:
+        """Probability that what looked like the fingers' ends was something else in all of its frames."""
 
     def fits(self) -> Separation:
         """The averages under the lasting hypotheses, as shifts from ``cam_T_grip``."""
