@@ -19,7 +19,7 @@ from support.watched import Watched, pose_of, reference_of, watch
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import AlertKind, Verdict
+from gripmon.model.records import AlertKind, Frame, Verdict
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.bounds import SIGMA_INFLATION
 from gripmon.monitor.ends import MISREAD_PROBABILITY
@@ -286,6 +286,45 @@ def test_what_looks_like_a_lone_fingers_end_elsewhere_is_not_valid(condition: st
     seen = run_scene(f"one finger: {condition}", 2026, scene, 96)
     frames = [k for k, valid in enumerate(seen["valid"]) if valid]
     assert all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)
+
+
+@pytest.mark.usefixtures("tools_importable")
+def test_a_bar_flush_with_the_tips_hides_no_knock(tmp_path: Path):
+    """Its border goes on beside one finger and makes a corner with the other, where the ends were before the camera was
+    knocked by 4 mm along the fingers; the background stands still.
+    """
+    from benchmarks.meshes import MeshCamera, box_fingers, write_meshes
+
+    from gripmon.teach.cad import gripper_from_cad
+
+    camera, pose, meshes = make_camera(PAPER_LENS), nominal_cam_T_grip(), box_fingers()
+    stated = {"unit": "mm", "jaw_range_m": (0.0, 0.06), "length_m": 0.035, "bevel_m": 0.0}
+    gripper = gripper_from_cad(write_meshes(meshes, tmp_path), camera=camera, cam_T_grip=pose, **stated).gripper
+    left, right, low, y_m = -0.027, 0.08, -0.012, -0.0081
+    bar_m = np.array([[left, y_m, low], [right, y_m, low], [right, y_m, 0.0], [left, y_m, 0.0]])
+    bar = bar_m @ pose[:3, :3].T + pose[:3, 3]
+    if np.cross(bar[1] - bar[0], bar[2] - bar[0]) @ bar[0] > 0.0:
+        bar = bar[::-1]  # it faces the camera
+    knocked = pose.copy()
+    knocked[:3, 3] -= 4e-3 * pose[:3, 2]
+    image = MeshCamera(camera, meshes, 11).picture(knocked, None, before=[(bar, 170.0)])
+    covariance = np.diag(np.square([1e-4] * 3 + [1e-3] * 3)).ravel().tolist()
+    monitor = Monitor(
+        camera, gripper, MonitorSettings(), msgspec.structs.replace(reference_of(pose), covariance=tuple(covariance))
+    )
+    rng, records = np.random.default_rng(5), []
+    for seq in range(12):
+        noisy = np.clip(image + rng.normal(0.0, 1.5, image.shape), 0.0, 255.0).astype(np.uint8)
+        opening_m = gripper.jaw_nominal_m
+        records.append(monitor.process(Frame(seq, 10**18 + seq * 66_666_667, noisy, jaw_opening_m=opening_m)))
+        monitor.run_pending()
+    for record in records:
+        assert record.cam_T_grip is not None and record.protection is not None
+        error_m = np.linalg.norm(pose_of(record.cam_T_grip)[:3, 3] - knocked[:3, 3])
+        assert record.verdict is not Verdict.VALID or error_m < record.protection.position_m
+    assert any(np.linalg.norm(pose_of(r.cam_T_grip)[:3, 3] - knocked[:3, 3]) > 3e-3 for r in records), (
+        "else it is no trap"
+    )
 
 
 def knocked_round_tips(knock_m: float, radius_m: float, background: Background, settings: MonitorSettings) -> Watched:
