@@ -171,7 +171,7 @@ class Weigher:
         without = self._without_ends(measurement, fits, besides, displaced)
         wrong, left_out = self._knocked_cases(fits, without, cam_T_grip, prior, knocks, odds)
         cases = Cases.together([fits.cases(cam_T_grip, prior, anchored).among(fits.stays), *wrong])
-        differences = fits.model.differences(cam_T_grip, fits.opened)
+        differences = self._differences(fits, cam_T_grip)
         doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), doubts_since(cases, differences))
         doubts = self._with_lasting(doubts, fits, differences, cam_T_grip, displaced, now_s, knocks)
         both = self._with_questions(bounds_of(doubts, risk, left_out), cam_T_grip, displaced)
@@ -276,6 +276,13 @@ class Weigher:
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
+
+    def _differences(self, fits: Refits, cam_T_grip: Array) -> Differences | None:
+        """What makes fits near a pose (4, 4) those of the motion since the reference's frames; None before these.  Of a
+        mount that vibrates their average and its place at their stamp differ by that.
+        """
+        found = fits.model.differences(cam_T_grip, fits.opened)
+        return None if found is None else found._replace(more=found.more + np.diag(self.swing))
 
     def _staying(self, knocks: Knocks, displaced: bool) -> Array:
         """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
@@ -423,7 +430,7 @@ class Weigher:
         fingers show a motion along themselves even without their ends.
         """
         cases = fits.cases(cam_T_grip, fits.hypotheses.prior)
-        since = doubts_since(cases, fits.model.differences(cam_T_grip, fits.opened))
+        since = doubts_since(cases, self._differences(fits, cam_T_grip))
         doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), since)
         both = bounds_of(doubts, self._policy.integrity_risk)
         return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
