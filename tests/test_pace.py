@@ -23,7 +23,7 @@ from gripmon.monitor import warm_up
 
 @pytest.mark.parametrize(
     ("possible_hz", "fps", "live"),
-    [(200.0, 60.0, True), (90.0, 60.0, True), (89.0, 30.0, True), (44.0, 15.0, True), (22.0, 15.0, False)],
+    [(200.0, 60.0, True), (120.0, 60.0, True), (119.0, 30.0, True), (59.0, 15.0, True), (29.0, 15.0, False)],
 )
 def test_the_fastest_pace_with_a_margin_is_chosen(possible_hz: float, fps: float, live: bool):
     chosen = pace.pace_for(possible_hz)

@@ -20,9 +20,10 @@ TRIAL_S = 2.0
 which may take longer than that on a busy machine, says nothing about the pace.
 """
 
-MARGIN = 1.5
+MARGIN = 2.0
 """By how much a machine must be faster than the pace (no unit): for two seconds, while the hand is there, a frame takes
-1.4 times as long to render as the mean frame of the scenario, and recording and publishing come on top.
+1.4 times as long to render as the mean frame of the scenario, and recording and publishing take 1.4 times as long on
+top: two cores that were 1.9 times as fast dropped 15 of 240 frames.
 """
 
 
