@@ -397,6 +397,20 @@ def test_a_knock_while_it_was_off_is_seen_in_the_motion_though_the_first_frames_
         assert error_m < min(2e-4, record.protection.position_m)
 
 
+def test_a_knock_is_a_change_for_the_state_file_once(monkeypatch: pytest.MonkeyPatch):
+    """Not in each later frame that proves the new place, until a recalibration measures another reference."""
+    monkeypatch.setattr(trust, "PROOF_EVERY_FRAMES", 1)
+    pose, camera, gripper = nominal_cam_T_grip(), make_camera(PAPER_LENS), box_gripper(sharp=False)
+    monitor = Monitor(camera, gripper, MonitorSettings(policy=BY_REFERENCE), reference_at(pose))
+    simulator, changes = Simulator(camera, gripper, pose, scene(40, mount=(KNOCK,)), 2), []
+    for index in range(36):
+        monitor.process(simulator.frame(index))
+        monitor.run_pending()
+        changes.append(monitor._trust.since.changes)
+    assert monitor._trust.since.knocked
+    assert changes[KNOCKED - 1] < changes[KNOCKED + 5] == changes[-1]
+
+
 @pytest.mark.parametrize("days", [0.0, 7.0])
 def test_that_a_mount_stays_is_known_less_the_longer_ago_the_reference_is(days: float):
     kept = begun()

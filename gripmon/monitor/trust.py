@@ -299,8 +299,8 @@ class Integrity:
             self._jaw_opening_m = measurement.jaw_opening_m
             if proves:
                 self.since.proved()
-            if proves and self._weigher.moved():
-                self.since.moved()
+            if proves and not self.since.knocked and self._weigher.moved():
+                self.since.moved()  # once: each change is written to the state file
             self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
         if proves and frame.image is not None and not (moved or trust.may_have_slid):
             # A copy: learning can wait, and the caller may read the next image into the same memory.
