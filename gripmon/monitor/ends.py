@@ -51,9 +51,9 @@ class EndsEvidence:
         if kept is not None:
             edges = edges[np.isin(edges, measurement.normal.edge[kept])]
         times = self._times(edges, ends)
-        if ends is not None and not ends.seen.any() and _on_one_line(measurement, edges):
-            times = min(times, 1)
         if ends is not None:
+            if not ends.seen.any() and _on_one_line(measurement, edges):
+                times = min(times, 1)
             fingers = list(set(self._finger[edges].tolist()))
             times -= int(np.count_nonzero((ends.seen[fingers] > 0) & (ends.strictly[fingers] == 0)))
         return MISREAD_PROBABILITY ** max(times, 0)

@@ -304,7 +304,7 @@ class Weigher:
             return False
         way = perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
         covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
-        return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
+        return _contradicts(way, covariance)
 
     def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
@@ -388,7 +388,7 @@ class Weigher:
         if self._slid is None:
             covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor
             way = perturbation_between(self._reference_T, cam_T_grip)
-            displaced = bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
+            displaced = _contradicts(way, covariance)
         else:
             assert self.anchor is not None
             way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
@@ -401,7 +401,7 @@ class Weigher:
         risk = self._policy.integrity_risk
         if self._mount.knocked(unseen_s, hidden) > risk:
             return unbounded(risk, "the mount was knocked while nothing is seen of the gripper")
-        position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
+        position_m, rotation_rad = _radii(growth, risk)
         return Bounds(
             *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
@@ -438,8 +438,7 @@ class Weigher:
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
         risk = self._policy.integrity_risk
-        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
-        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
+        position_m, rotation_rad = _radii(self._expected[1], risk)
         why = "the mount was knocked before the start, or the model is off: it wasn't where the reference has it"
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
@@ -459,3 +458,13 @@ class Weigher:
             hypotheses = self._possible.about(measurement.normal.edge).hypotheses
             self._newest = measurement, now_s, Refits(measurement, hypotheses, self._tracker.floor, model, known)
         return self._newest[2]
+
+
+def _contradicts(way: Array, covariance: Array) -> bool:
+    """Whether a motion (6,) is larger than its covariance (6, 6) allows."""
+    return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
+
+
+def _radii(covariance: Array, risk: float) -> list[float]:
+    """Lengths, m and rad, that position and rotation of a covariance (6, 6) exceed with a probability ``risk``."""
+    return bounds(np.stack([covariance[:3, :3], covariance[3:, 3:]]), np.full(2, risk)).tolist()
