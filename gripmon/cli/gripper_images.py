@@ -15,11 +15,14 @@ IMAGE...                image file, or folder with images
                         width of a fingertip across the jaws, with its standard deviation (m)
 | --reference FILE.yaml
                         hand/eye calibration, of gripmon calibrate plane or another one: its frame is kept
+--fingers {1,2}         how many fingers the images show; with 1, another one isn't expected (default: 2)
+--within LEFT,TOP,RIGHT,BOTTOM
+                        where in the image the fingers are (px), if something else stays in it, too
 --name NAME             the gripper's name (default: gripper)
 --out FILE.yaml         gripper file to write
 --reference-out FILE.yaml
                         reference to write, for a configuration's `reference:`
---picture FILE.png      also draw outline, scatter and fingers over the first image
+--picture FILE.png      also draw outline, scatter and fingers over the first image, or what stays if that isn't clear
 --force                 replace existing files
 --json                  one JSON object instead of text; m, rad, px
 """
@@ -50,18 +53,31 @@ def _length(text: str) -> tuple[float, float]:
     return found
 
 
+def _box(text: str) -> tuple[int, int, int, int]:
+    try:
+        left, top, right, bottom = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' isn't LEFT,TOP,RIGHT,BOTTOM in pixels"
+        ) from None
+    if not (0 <= left < right and 0 <= top < bottom):
+        raise argparse.ArgumentTypeError(f"'{text}' is empty; LEFT,TOP,RIGHT,BOTTOM in pixels, e.g. 100,200,500,479")
+    return left, top, right, bottom
+
+
 @Command(
     "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=_length,
-    finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
+    finger_width=_length, fingers={"type": int, "choices": (1, 2)}, within=_box, name={"default": "gripper"},
+    out=REQUIRED,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
-    """Measure a gripper's outline, inner edges and pose in ten to a hundred images of the wrist camera: the
+    """Measure a gripper's outline, inner edges and pose in five to a hundred images of the wrist camera: the
     robot moves, so that the background changes and the gripper stays.  This needs no dimensions, straight
     edges or plate, but one length: the distance of the fingertips from the camera, or the width of a
     finger.  Images at several jaw openings show how the fingers move; with the openings in metres in a
     timestamps.csv beside them, as for gripmon replay, they also give the length.
 
-    Use at least ten images of each opening, in focus, each before another background, lit as in use.  If
+    Use at least five images of each opening, in focus, each before another background, lit as in use.  If
     the fingers' long edges meet in one point (their vanishing point), it gives the fingers' pose in space,
     otherwise the motion of both fingers between openings; with one opening the outline is then assumed to
     be flat and facing the camera.  The uncertainty is printed and in the reference's covariance.
@@ -71,8 +87,9 @@ def from_images(arguments: Arguments) -> None:
     import cv2
 
     from gripmon.daemon.gripper_images import images_inputs
-    from gripmon.model.images import image_paths
+    from gripmon.model.images import image_in, image_paths
     from gripmon.model.provenance import provenance_of
+    from gripmon.teach.fingers import UnclearPartsError
     from gripmon.teach.from_images import gripper_from_images
     from gripmon.teach.hand_eye import gripper_values
 
@@ -81,11 +98,15 @@ def from_images(arguments: Arguments) -> None:
     images = image_paths(arguments.image)
     given = images_inputs(images, arguments.camera, arguments.reference)
     provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*images, *given.files])))
-    found = gripper_from_images(
-        images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
-        finger_width_m=arguments.finger_width, reference=given.reference, name=arguments.name, provenance=provenance,
-        progress=progress_bar,
-    )  # fmt: skip
+    try:
+        found = gripper_from_images(
+            images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
+            finger_width_m=arguments.finger_width, reference=given.reference, fingers=arguments.fingers,
+            within=arguments.within, name=arguments.name, provenance=provenance, progress=progress_bar,
+        )  # fmt: skip
+    except UnclearPartsError as unclear:
+        arguments.save("picture", unclear.picture(image_in(images[0])))
+        raise
     arguments.save("out", gripper_values(found.gripper.model))
     arguments.save("reference_out", lambda: found.document(provenance))
     arguments.save("picture", found.picture)

@@ -17,8 +17,15 @@ from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.image_outline import OpeningSeen
-from gripmon.teach.silhouette import Stations, from_ideal_px, in_image, inner_side, measure_transitions, to_ideal_px
-from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, STATION_MARGIN_PX, STRAIGHT_PX
+from gripmon.teach.silhouette import (
+    Stations,
+    from_ideal_px,
+    inner_side,
+    lines_in_image,
+    measure_transitions,
+    to_ideal_px,
+)
+from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, STRAIGHT_PX
 
 ON_A_PIECE = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
 """Fractions of its length at which a piece, the least-squares line through a stretch of a curve, crosses the curve:
@@ -53,7 +60,7 @@ def smooth_curve(
         way = np.gradient(uv, axis=0)
         normal = np.column_stack([-way[:, 1], way[:, 0]]) / np.linalg.norm(way, axis=1)[:, None]
         normal = np.where(inner_side(uv, normal, mask)[:, None] > 0.0, -normal, normal)
-        stations = Stations(uv, normal, in_image(uv, mask.shape, STATION_MARGIN_PX))
+        stations = Stations(uv, normal, lines_in_image(uv, normal, mask.shape))
         found = measure_transitions(seen.matte.images, stations, seen.matte.noise, wide=False, blur_px=seen.blur_px)
         shown = to_ideal_px(camera, uv + np.where(found.usable, found.offset_px, 0.0)[:, None] * normal)
         curve = _spline(at, s, np.where(found.usable[:, None], shown, base), found.usable, vertices[[0, -1]])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, check_opened
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
 from gripmon.teach.motion_depth import place_by_motion
-from gripmon.teach.prongs import apart_by_motion
 from gripmon.track.edges.taught import gripper_digest
 
 MOST_IMAGES = 200
@@ -129,16 +129,19 @@ def gripper_from_images(
     distance_m: Length | None = None,
     finger_width_m: Length | None = None,
     reference: Pose | None = None,
+    fingers: int | None = None,
+    within: tuple[int, int, int, int] | None = None,
     name: str = "gripper",
     provenance: Provenance | None = None,
     progress: Progress = quiet,
 ) -> GripperFromImages:
-    """A gripper and its reference from ten to some hundred ``images`` in front of changing backgrounds.
+    """A gripper and its reference from five to some hundred ``images`` in front of changing backgrounds.
 
     ``openings_m``: the jaw's opening in each image (None: images of one opening are recognised by themselves); an
-    opening with fewer than ten images isn't used.  The scale comes from ``distance_m`` (of the fingertips from
-    the camera, along the optical axis), ``finger_width_m`` (of a fingertip, across the jaws), a ``reference``
-    calibration, or from several openings.
+    opening with fewer than five images isn't used.  ``fingers``: how many are seen, 1 or 2 (default: 2, and anything
+    else is refused); ``within`` (left, top, right, bottom): where in the image they are, px.  The scale comes from
+    ``distance_m`` (of the fingertips from the camera, along the optical axis), ``finger_width_m`` (of a fingertip,
+    across the jaws), a ``reference`` calibration, or from several openings.
 
     Raises :class:`~gripmon.model.errors.InputError` for wrong arguments,
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
@@ -154,7 +157,8 @@ def gripper_from_images(
     notes: list[str] = []
     left_out: dict[str, str] = {}
     with progress(None, "step") as step:
-        seen, around = _see_openings(made, grey, groups, [file for file, _ in taken], least, notes, left_out, step)
+        see = partial(see_opening, made, least_noise=least, step=step, fingers=fingers, within=within)
+        seen, around = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out)
         outlines = finger_outlines(made, seen)
         pose = None if reference is None else reference[0]
         at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
@@ -199,14 +203,12 @@ def gripper_from_images(
 
 
 def _see_openings(
-    camera: Camera,
+    see: Callable[[Sequence[NDArray[np.float32]]], OpeningSeen],
     grey: Sequence[NDArray[np.float32]],
     groups: Mapping[float, list[int]],
     files: Sequence[str],
-    least_noise: float,
     notes: list[str],
     left_out: dict[str, str],
-    step: Callable[[], None],
 ) -> tuple[OpeningSeen, dict[float, OpeningSeen]]:
     """What the images of the first opening show, and of each other opening with enough images; adds to ``notes`` and
     ``left_out``.
@@ -217,18 +219,17 @@ def _see_openings(
             notes.append(f"opening {opening:g} m: {len(own)} images aren't used; {FEWEST_IMAGES} or more")
             continue
         try:
-            seen[opening] = see_opening(camera, [grey[k] for k in own], least_noise, step)
+            seen[opening] = see([grey[k] for k in own])
         except NoResultError as refused:
-            if len(groups) == 1:
-                raise
-            of = f"{len(own)} of {len(files)} images show one opening, from {files[own[0]]} to {files[own[-1]]}"
-            raise NoResultError(f"{of}; of them {refused}") from None
+            if len(groups) > 1:
+                of = f"{len(own)} of {len(files)} images show one opening, from {files[own[0]]} to {files[own[-1]]}"
+                refused.args = (f"{of}; of them {refused}",)
+            raise
         left_out.update({files[own[k]]: why for k, why in seen[opening].left_out.items()})
     first, *others = seen
-    pronged = apart_by_motion(camera, seen[first], [seen[opening] for opening in others])
-    if pronged is not None:
-        notes.append("parts of the image that join the fingers and don't move with them aren't used")
-    return pronged or seen[first], {opening: seen[opening] for opening in others}
+    if seen[first].rest.any():
+        notes.append("what joins the fingers, or stays elsewhere in the image, isn't used")
+    return seen[first], {opening: seen[opening] for opening in others}
 
 
 def _check(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
-from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
+from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.matte import sets_refused
-from gripmon.teach.silhouette import FOLDS, Stations, in_image, inner_side, measure_transitions
+from gripmon.teach.silhouette import Stations, inner_side, lines_in_image, measure_transitions
 from gripmon.teach.straight_pieces import WORST_RMS_PX, jackknife_sigma
 
 SAME_OPENING_M = 5e-5
@@ -63,7 +63,7 @@ def motion_of(
     at = _samples(points, pieces)
     normal = normals(camera, at, mask)
     shift = np.array([rough[0], rough[1], 0.0]) / camera.fx_px * float(np.median(at[:, 2]))
-    folds, rms = np.zeros((FOLDS, 3)), np.inf
+    folds, rms = np.zeros((0, 3)), np.inf
     for turn in range(4):
         stations, design = _stations(camera, at, normal, shift, other.matte.mean.shape)
         found = measure_transitions(
@@ -153,7 +153,7 @@ def _stations(camera: Camera, at: Array, normal: Array, shift: Array, shape: tup
     uv, d_uv = camera.project_with_jacobian(at[:, :3] + shift)
     uv = np.nan_to_num(uv, nan=-1e3)
     return (
-        Stations(uv, normal, in_image(uv, shape, BORDER_PX)),
+        Stations(uv, normal, lines_in_image(uv, normal, shape)),
         np.nan_to_num(np.einsum("ni,nij->nj", normal, d_uv)),
     )
 

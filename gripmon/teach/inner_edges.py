@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.matte import Matte
-from gripmon.teach.silhouette import FOLDS, from_ideal_px, to_ideal_px
+from gripmon.teach.silhouette import folds_of, from_ideal_px, to_ideal_px
 from gripmon.teach.straight_pieces import jackknife_sigma
 
 SHORTEST_PX = 20.0
@@ -53,10 +53,11 @@ def find_inner_edges(camera: Camera, matte: Matte, mask: NDArray[np.bool_]) -> l
     size = 2 * int(FROM_OUTLINE_PX) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     inside = np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderValue=1), np.uint8)
-    fold = np.arange(len(matte.images)) % FOLDS
-    sums = np.stack([np.sum(matte.images[fold == f], axis=0, dtype=float) for f in range(FOLDS)])
-    total, images = sums.sum(axis=0), np.bincount(fold, minlength=FOLDS)
-    left = [(total, len(fold)), *((total - sums[f], len(fold) - images[f]) for f in range(FOLDS))]
+    fold = folds_of(len(matte.images))
+    images = np.bincount(fold)
+    sums = np.stack([np.sum(matte.images[fold == f], axis=0, dtype=float) for f in range(len(images))])
+    total = sums.sum(axis=0)
+    left = [(total, len(fold)), *((total - sums[f], len(fold) - count) for f, count in enumerate(images.tolist()))]
     means = [np.asarray(part / count, np.float32) for part, count in left]
     grey = np.clip(cv2.GaussianBlur(matte.mean, (0, 0), 0.8), 0.0, 255.0).astype(np.uint8)
     segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]

@@ -19,8 +19,8 @@ from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import ALONG_RAD, FLAT_SIGMA_RAD, Outline, PlacedOutlines, innermost
 from gripmon.teach.image_motion import STATIONS, normals, rough_shift_px
-from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
-from gripmon.teach.silhouette import Stations, in_image, measure_transitions
+from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.silhouette import Stations, lines_in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX
 
 LARGEST_COMMON_MOTION = 0.2
@@ -197,7 +197,7 @@ def _measured(
     across = normals(camera, np.column_stack([points, rays[ends[:, 1]] - rays[ends[:, 0]]]), seen.fingers[k].mask)
     uv, d_uv = camera.project_with_jacobian(points + moved)
     uv = np.nan_to_num(uv, nan=-1e3)
-    stations = Stations(uv, across, in_image(uv, other.matte.mean.shape, BORDER_PX))
+    stations = Stations(uv, across, lines_in_image(uv, across, other.matte.mean.shape))
     if roughly:
         off = _border(other.matte.still, stations)
         usable = stations.inside & np.isfinite(off)

@@ -26,12 +26,16 @@ from scipy.special import ndtr
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 
-FOLDS = 10
-"""Number of groups of images that the jackknife leaves out in turn."""
+MOST_FOLDS = 10
+"""Largest number of groups of images that the jackknife leaves out in turn."""
 BLURS_PX = tuple(np.arange(0.5, 4.01, 0.1).tolist())
+MOST_RELIGHT = 0.5
+"""Largest change of a finger's grey level from image to image, relative: the lamp behind instead of above it."""
 FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
+FROM_BORDER_PX = 4.0
+"""Least distance of a search line from the image's border: there the smoothed contour turns along the border."""
 _STEP_PX = 0.5
 _WIDE_PX, _NARROW_PX = 8.0, 5.0
 _GRID_PX = 0.125
@@ -68,6 +72,11 @@ class Transitions:
     sharpness: Array
 
 
+def folds_of(count: int) -> NDArray[np.intp]:
+    """The group (n,) of each image that the jackknife leaves out together: at most ten groups, of equal sizes."""
+    return np.arange(count) % min(count, MOST_FOLDS)
+
+
 def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
     """Closed contours (k, 2) of a mask's regions and holes, one point per pixel, smoothed; px."""
     found, _ = cv2.findContours(still.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -85,14 +94,14 @@ def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
     return out
 
 
-def stations_along(contour: Array, still: NDArray[np.bool_], margin_px: float) -> Stations:
+def stations_along(contour: Array, still: NDArray[np.bool_]) -> Stations:
     """A station at each point (s, 2) of a closed contour."""
     tangent = np.roll(contour, -2, axis=0) - np.roll(contour, 2, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-9)[:, None]
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     side = inner_side(contour, normal, still)
     normal = normal if float(side.sum()) < 0.0 else -normal
-    return Stations(contour, normal, in_image(contour, still.shape, margin_px))
+    return Stations(contour, normal, lines_in_image(contour, normal, still.shape, _WIDE_PX))
 
 
 def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
@@ -107,6 +116,16 @@ def in_image(uv_px: Array, shape: tuple[int, ...], margin_px: float) -> NDArray[
     """Mask (n,) of points at least a margin inside of an image of this shape."""
     limit = np.array([shape[1] - 1.0, shape[0] - 1.0]) - margin_px
     return np.asarray(((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1))
+
+
+def lines_in_image(
+    uv_px: Array, normal: Array, shape: tuple[int, ...], reach_px: float = _NARROW_PX
+) -> NDArray[np.bool_]:
+    """Mask (n,) of search lines that end in an image of this shape; along a finger that leaves it they reach almost to
+    its border.
+    """
+    ends = np.stack([uv_px - reach_px * normal, uv_px + reach_px * normal])
+    return np.asarray(in_image(uv_px, shape, FROM_BORDER_PX) & in_image(ends, shape, 1.0).all(axis=0))
 
 
 def measure_transitions(
@@ -124,8 +143,12 @@ def measure_transitions(
         within, beyond = (s <= -2.0) & (s >= -4.0), (s >= 2.0) & (s <= 4.0)
     finger = _finger_levels(profiles, s, wide=wide)
     d = profiles - finger[None]
-    # An image with another grey level on the finger (a shadow, a hand) is not used at this station.
-    sound = np.abs(d[:, :, within].mean(axis=2)) < 4.0 * max(noise, 1.0)
+    off = d[:, :, within].mean(axis=2)
+    # Light changes on a finger, by some tenths; where its grey level is another altogether, or changes along the search
+    # line, something else is in front of it, and the image isn't used at this station.
+    lit = np.abs(off) < MOST_RELIGHT * np.maximum(finger[:, within].mean(axis=1), 10.0)
+    d -= np.where(lit, off, 0.0)[:, :, None]
+    sound = lit & (d[:, :, within].std(axis=2) < 4.0 * max(noise, 1.0) + finger[:, within].std(axis=1))
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
     weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
@@ -140,9 +163,9 @@ def measure_transitions(
         blur_px = _usual_blur(transition[usable][:, near], s[near], search)
     offset, fits = _edge(transition[:, near], s[near], blur_px, search)
     usable &= fits
-    fold = np.arange(len(images)) % FOLDS
-    folds = np.empty((FOLDS, len(offset)))
-    for f in range(FOLDS):
+    fold = folds_of(len(images))
+    folds = np.empty((int(fold.max()) + 1, len(offset)))
+    for f in range(len(folds)):
         part = fold == f
         without = (total_upper - upper[part].sum(axis=0)) / np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)[
             :, None

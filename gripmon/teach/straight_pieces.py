@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.silhouette import Stations, from_ideal_px, in_image, measure_transitions, to_ideal_px
+from gripmon.teach.silhouette import Stations, from_ideal_px, lines_in_image, measure_transitions, to_ideal_px
 from gripmon.track.edges.prediction import STRETCH
 
 SHORTEST_PIECE_PX = 6.0
@@ -36,8 +36,6 @@ LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
 """Distance from a corner within which the blur of its two edges mixes."""
-STATION_MARGIN_PX = 6.0
-"""Margin to the image's border: the reach of search lines, with the neighbours that interpolation reads."""
 _GAP_PX = 12.0
 _OUTLIER_PX = 1.0
 _MOST_POINTS = 1500
@@ -339,7 +337,7 @@ def _stations_on(
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     if float((normal * outward.mean(axis=0)).sum()) < 0.0:
         normal = -normal
-    return Stations(uv, normal, in_image(uv, shape, STATION_MARGIN_PX))
+    return Stations(uv, normal, lines_in_image(uv, normal, shape))
 
 
 def _weighted_line(p: Array, chosen: NDArray[np.bool_]) -> tuple[Array, float]:

@@ -1,0 +1,232 @@
+"""Which parts of what stays in the image are fingers: those that enter from the image's border or from a palm and end
+in view.  A palm's border between two fingers is seen, and they are cut off along it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Array, Image
+from gripmon.teach.staying import Bits, Edges, Plane
+
+SHORTEST_OUTLINE_PX = 40.0
+"""Shortest outline of a finger in view: 8 px across a tip and twice 16 px along it are the least that six parameters of
+a pose need."""
+LEAST_DEPTH = 0.25
+"""Least depth of a finger, from where it enters to its tip, over the length of border it enters through: a corner of
+the image that a lens hides, or a housing, is flatter; a finger cut off by a corner is deeper than a third of it."""
+LEAST_VALLEY = 0.25
+"""Least depth of the space between two fingers of one part, over the distance of their tips."""
+ALIKE_OUTLINES = 0.3
+"""Least outline of a second finger over the first one's; what is shorter is taken for something else."""
+_BOTTOM = 0.9
+_BORDER_PX = 2
+
+
+@dataclass(frozen=True)
+class Parts:
+    """``fingers``, each a mask (h, w), and ``outwards``, the directions (2,) to their tips in the image; ``rest`` (h,
+    w): what stays and is no finger.
+    """
+
+    fingers: tuple[Bits, ...]
+    outwards: tuple[Array, ...]
+    rest: Bits
+
+
+class UnclearPartsError(NoResultError):
+    """Which parts are the fingers isn't clear.  ``parts``: masks (h, w) of those that may be."""
+
+    def __init__(self, text: str, parts: list[Bits], still: Bits):
+        super().__init__(text)
+        self.parts, self.still = parts, still
+
+    def picture(self, shown: Image) -> Image:
+        """The image (h, w[, 3]) with what stays (blue) and what may be a finger (green, numbered); BGR."""
+        grey = shown if shown.ndim == 2 else shown.mean(axis=2)
+        out = cv2.cvtColor(np.clip(grey * (255.0 / max(float(grey.max()), 1.0)), 0, 255).astype(np.uint8), 8)
+        for number, (mask, colour) in enumerate(
+            [(self.still, (230, 120, 40)), *((p, (60, 200, 60)) for p in self.parts)]
+        ):
+            found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(out, found, -1, colour, 2, cv2.LINE_AA)
+            if number:
+                at = np.argwhere(mask).mean(axis=0)[::-1].round().astype(int)
+                cv2.putText(out, str(number), tuple(at.tolist()), cv2.FONT_HERSHEY_SIMPLEX, 0.8, colour, 2, cv2.LINE_AA)
+        return out
+
+
+def find_fingers(
+    still: Bits, edges: Edges, count: int | None = None, within: tuple[int, int, int, int] | None = None
+) -> Parts:
+    """The fingers among what stays (h, w), from left to right (or from top to bottom): ``count`` of them if given,
+    else two; only ``within`` (left, top, right, bottom), px, if given.  Raises :class:`UnclearPartsError`.
+    """
+    if within is not None:
+        left, top, right, bottom = within
+        inner = np.zeros_like(still)
+        inner[top : bottom + 1, left : right + 1] = still[top : bottom + 1, left : right + 1]
+    else:
+        inner = still
+    found = [own for part in _connected(inner) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
+    strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
+    found = [own for own in found if _mean_along(own[0], still, strength) > edges.limit]
+    if any(enters for *_, enters in found):  # what floats in the view is a mark on the lens, a stamp, a reflection
+        found = [own for own in found if own[3]]
+    found.sort(key=lambda own: -own[2])
+    if found:
+        found = [own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]]
+    parts = [own[0] for own in found]
+    wanted = count or 2
+    if not parts:
+        raise UnclearPartsError(
+            "what stays in the images has no finger's shape: it should enter from the image's border or from a palm "
+            "and end in view",
+            [],
+            still,
+        )
+    if len(parts) < wanted:
+        raise UnclearPartsError("one finger is seen; --fingers 1 if the gripper shows no more", parts, still)
+    if len(parts) > wanted and count is None:
+        raise UnclearPartsError(
+            f"{len(parts)} parts that stay may be fingers (see --picture); --within LEFT,TOP,RIGHT,BOTTOM around the "
+            "two, in pixels",
+            parts,
+            still,
+        )
+    chosen = found[:wanted]
+    centres = np.array([np.argwhere(own[0])[:, ::-1].mean(axis=0) for own in chosen])
+    axis = int(np.ptp(centres, axis=0).argmax()) if len(chosen) > 1 else 0
+    chosen = [chosen[k] for k in np.argsort(centres[:, axis]).tolist()]
+    fingers = tuple(own[0] for own in chosen)
+    return Parts(fingers, tuple(own[1] for own in chosen), still & ~np.any(fingers, axis=0))
+
+
+_Part = tuple[Bits, Array, float, bool]
+"""A part's mask, the direction to its tip, the length of its outline in view (px), and whether it enters the view."""
+
+
+def _connected(mask: Bits) -> list[Bits]:
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return [labels == k for k in range(1, count)]
+
+
+def _divided(part: Bits) -> list[_Part]:
+    """The two fingers of a part with a valley between them, without the palm that joins them; else the part itself,
+    if it is deep enough for a finger.
+    """
+    cut = _cut(part)
+    if cut is not None:
+        way, level = cut
+        ahead = np.indices(part.shape)[::-1].transpose(1, 2, 0) @ way > level
+        prongs = sorted(_connected(part & ahead), key=lambda own: -np.count_nonzero(own))[:2]
+        outlines = [_outline_px(prong, part) for prong in prongs]
+        if len(prongs) == 2 and min(outlines) >= max(SHORTEST_OUTLINE_PX, ALIKE_OUTLINES * max(outlines)):
+            body = cv2.dilate((part & ~ahead).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            roots = [np.argwhere(prong & body)[:, ::-1] for prong in prongs]
+            return [
+                (prong, _outwards_from(prong, root.mean(axis=0) if len(root) else _root(prong)), outline, True)
+                for prong, root, outline in zip(prongs, roots, outlines, strict=True)
+            ]
+    outwards, outline = _outwards_from(part, _root(part)), _outline_px(part, part)
+    border = part & _at_border(part.shape)
+    if not border.any():
+        return [(part, outwards, outline, False)]
+    points = np.argwhere(part)[:, ::-1] @ outwards
+    depth = float(points.max() - (np.argwhere(border)[:, ::-1] @ outwards).min())
+    inside = float(points.max() - np.median(np.argwhere(border)[:, ::-1] @ outwards))
+    if min(depth, inside) < LEAST_DEPTH * np.count_nonzero(border) / _BORDER_PX:
+        return []
+    return [(part, outwards, outline, True)]
+
+
+def _cut(part: Bits) -> tuple[Array, float] | None:
+    """A line along the bottom of the valley between two fingers: its unit normal (2,) towards their tips, and its level
+    along that; None where there is no such valley.
+    """
+    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contour = max(contours, key=len)
+    hull = np.sort(cv2.convexHull(contour, returnPoints=False), axis=0)[::-1]
+    defects = cv2.convexityDefects(contour, hull) if len(hull) > 3 else None
+    if defects is None:
+        return None
+    points = np.reshape(contour, (-1, 2)).astype(float)
+    best: tuple[float, Array, float] | None = None
+    for row in np.reshape(defects, (-1, 4)):
+        start, end, depth = int(row[0]), int(row[1]), float(row[3])
+        tips = points[[start, end]]
+        valley = points[start : end + 1] if start < end else np.vstack([points[start:], points[: end + 1]])
+        apart = float(np.linalg.norm(tips[1] - tips[0]))
+        if apart < 1.0 or depth / 256.0 < LEAST_VALLEY * apart or not _ends_in_view(tips, part.shape):
+            continue
+        chord = (tips[1] - tips[0]) / apart
+        normal = np.array([-chord[1], chord[0]])
+        below = (valley - tips[0]) @ normal
+        normal *= -1.0 if abs(below.max()) > abs(below.min()) else 1.0
+        below = np.abs(below)
+        bottom = valley[below > _BOTTOM * below.max()]
+        spread = bottom - bottom.mean(axis=0)
+        way = np.linalg.svd(spread, full_matrices=False)[2][0] if len(bottom) > 2 else chord
+        # A valley that ends in a point has no bottom to go along: then along the line from tip to tip.
+        if np.ptp(spread @ way) < 0.2 * apart or abs(float(way @ chord)) < math.cos(math.radians(30.0)):
+            way = chord
+        across = np.array([-way[1], way[0]])
+        across *= np.sign(float(across @ normal)) or 1.0
+        if best is None or depth > best[0]:
+            best = depth, across, float((bottom @ across).max()) + 1.0
+    return None if best is None else (best[1], best[2])
+
+
+def _ends_in_view(tips: Array, shape: tuple[int, ...]) -> bool:
+    last = np.array([shape[1] - 1.0, shape[0] - 1.0])
+    return bool(((tips > _BORDER_PX) & (tips < last - _BORDER_PX)).all())
+
+
+def _at_border(shape: tuple[int, ...]) -> Bits:
+    out = np.ones(shape, bool)
+    out[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
+    return out
+
+
+def _outline_px(mask: Bits, part: Bits) -> float:
+    """Length of a mask's outline in view that is also the outline of the part it belongs to."""
+    return float(np.count_nonzero(_outline(mask, part)))
+
+
+def _outline(mask: Bits, part: Bits) -> Bits:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return mask & (cv2.erode(part.astype(np.uint8), cross, borderValue=1) == 0) & ~_at_border(mask.shape)
+
+
+def _mean_along(mask: Bits, still: Bits, strength: Plane) -> float:
+    """Mean share of the images that show an edge along a part's outline, to a pixel or two."""
+    near = cv2.dilate(strength, np.ones((3, 3), np.uint8))
+    return float(near[_outline(mask, still)].mean())
+
+
+def _root(mask: Bits) -> Array:
+    """Where (2,) a part enters the image, or would enter it."""
+    points = np.argwhere(mask)[:, ::-1].astype(float)
+    border = np.argwhere(mask & _at_border(mask.shape))[:, ::-1]
+    if len(border):
+        return np.asarray(border.mean(axis=0))
+    centre = points.mean(axis=0)
+    last = np.array([mask.shape[1] - 1.0, mask.shape[0] - 1.0])
+    gaps = np.concatenate([centre, last - centre])
+    nearest = int(gaps.argmin())
+    centre[nearest % 2] = 0.0 if nearest < 2 else last[nearest % 2]
+    return centre
+
+
+def _outwards_from(mask: Bits, root: Array) -> Array:
+    """Direction (2,) in the image from a part's root (2,) to its farthest points."""
+    points = np.argwhere(mask)[:, ::-1].astype(float)
+    # The farthest hundredth of the pixels: a single pixel is not a tip.
+    away = np.linalg.norm(points - root, axis=1)
+    tip = points[away >= np.quantile(away, 0.99)].mean(axis=0)
+    return np.asarray((tip - root) / max(float(np.linalg.norm(tip - root)), 1e-9))
