@@ -114,7 +114,7 @@ def made_from_images(name: str, folder: Path, place: Path, task: Task, of_video:
     videos = sorted(folder.glob("*.mp4"))
     _lay_out(folder, videos, stills)
     command = [
-        sys.executable, "-m", "gripmon", "gripper", "from-images", "--camera", str(camera), "--out", str(gripper),
+        sys.executable, "-P", "-m", "gripmon", "gripper", "from-images", "--camera", str(camera), "--out", str(gripper),
         "--reference-out", str(reference), *task.options, *(map(str, videos) if of_video else [str(stills)]),
     ]  # fmt: skip
     begun_s = time.monotonic()
