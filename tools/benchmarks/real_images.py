@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import yaml
@@ -102,6 +102,36 @@ class Made:
         return f"{self.name}, the video itself" if self.of_video else self.name
 
 
+class Answer(NamedTuple):
+    """A command's exit code and its lines: of what it printed, or of its fault."""
+
+    code: int
+    words: tuple[str, ...]
+    took_s: float
+
+
+def answered(*words: str | Path, without: Sequence[Path] = ()) -> Answer:
+    """``gripmon`` with these arguments, in a process of its own; ``without``: folders that its lines needn't name."""
+    begun_s = time.monotonic()
+    answer = subprocess.run(
+        [sys.executable, "-P", "-m", "gripmon", *map(str, words)], capture_output=True, text=True, check=False
+    )
+    said = answer.stdout if answer.returncode == 0 else answer.stderr
+    for folder in without:
+        said = said.replace(f"{folder}/", "")
+    lines = tuple(line for line in said.splitlines() if line.strip())
+    return Answer(answer.returncode, lines, time.monotonic() - begun_s)
+
+
+def camera_file(lens: dict[str, Any]) -> str:
+    """A lens as `gripmon calibrate` writes one whose uncertainty isn't known."""
+    provenance = {"gripmon": "", "time": "", "command": "what the lens is said to be"}
+    schema = "gripmon.camera_calibration/1"
+    return yaml.safe_dump(
+        {"schema": schema, "camera": lens, "parameters": [], "covariance": [], "provenance": provenance}
+    )
+
+
 def made_from_images(name: str, folder: Path, place: Path, task: Task, of_video: bool = False) -> Made:
     """Run the command on a folder's stills, or on a video's frames as files; ``of_video``: on the video as it is.
     Raises :class:`~gripmon.InputError` for a folder that has neither.
@@ -110,32 +140,18 @@ def made_from_images(name: str, folder: Path, place: Path, task: Task, of_video:
     stills.mkdir(parents=True)
     values = dict(task.values) or yaml.safe_load((folder / CONFIG).read_text())
     camera, gripper, reference = (stills / f"{what}.yaml" for what in ("camera", "gripper", "reference"))
-    camera.write_text(yaml.safe_dump(_camera_file(values["camera"])))
+    camera.write_text(camera_file(values["camera"]))
     videos = sorted(folder.glob("*.mp4"))
     _lay_out(folder, videos, stills)
-    command = [
-        sys.executable, "-P", "-m", "gripmon", "gripper", "from-images", "--camera", str(camera), "--out", str(gripper),
-        "--reference-out", str(reference), *task.options, *(map(str, videos) if of_video else [str(stills)]),
-    ]  # fmt: skip
-    begun_s = time.monotonic()
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    took_s = time.monotonic() - begun_s
-    said = answer.stdout if answer.returncode == 0 else answer.stderr
-    said = said.replace(f"{stills}/", "").replace(f"{folder}/", "")
-    words = tuple(line for line in said.splitlines() if line.strip())
-    if answer.returncode != 0:
-        return Made(name, of_video, answer.returncode, took_s, words[-1:])
+    of = videos if of_video else [stills]
+    options = ("--camera", camera, "--out", gripper, "--reference-out", reference, *task.options)
+    answer = answered("gripper", "from-images", *of, *options, without=(stills, folder))
+    if answer.code != 0:
+        return Made(name, of_video, answer.code, answer.took_s, answer.words[-1:])
     try:
-        return _measured(Made(name, of_video, 0, took_s, words, stills), values)
+        return _measured(Made(name, of_video, 0, answer.took_s, answer.words, stills), values)
     except InputError as unusable:
-        return Made(name, of_video, 0, took_s, (str(unusable).replace(f"{stills}/", ""),))
-
-
-def _camera_file(lens: dict[str, Any]) -> dict[str, Any]:
-    """A lens as `gripmon calibrate` writes one whose uncertainty isn't known."""
-    provenance = {"gripmon": "", "time": "", "command": "the set's configuration"}
-    schema = "gripmon.camera_calibration/1"
-    return {"schema": schema, "camera": lens, "parameters": [], "covariance": [], "provenance": provenance}
+        return Made(name, of_video, 0, answer.took_s, (str(unusable).replace(f"{stills}/", ""),))
 
 
 def _measured(made: Made, values: dict[str, Any]) -> Made:
