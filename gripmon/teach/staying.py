@@ -201,17 +201,18 @@ def _boundaries(labels: NDArray[np.int64], edges: Edges) -> tuple[NDArray[np.int
     strength = edges.strength
     count = int(labels.max()) + 1
     keys, values = [], []
-    for one, other in (
+    for here, there in (
         ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
         ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
     ):
-        apart = labels[one] != labels[other]
-        a, b = labels[one][apart], labels[other][apart]
+        apart = labels[here] != labels[there]
+        a, b = labels[here][apart], labels[there][apart]
         keys.append(np.minimum(a, b) * count + np.maximum(a, b))
-        values.append(np.maximum(strength[one], strength[other])[apart])
+        values.append(np.maximum(strength[here], strength[there])[apart])
     key, index = np.unique(np.concatenate(keys), return_inverse=True)
-    one, other = (np.asarray(part, np.int64) for part in np.divmod(key, count))
-    return one, other, np.bincount(index, np.concatenate(values)), np.bincount(index).astype(float)
+    one, other = np.asarray(key // count, np.int64), np.asarray(key % count, np.int64)
+    total, length_px = np.bincount(index, np.concatenate(values)), np.bincount(index)
+    return one, other, np.asarray(total, float), np.asarray(length_px, float)
 
 
 def _merged(

@@ -74,7 +74,7 @@ def tasks(limits: dict[str, tuple[float, float]], play_m: float) -> dict[str, Ta
     """By folder; ``limits`` and play as for the files made by hand, whose distance is the one stated here."""
     return {
         "xarm": Task(("--distance", "0.24:0.005"), limits["xarm"], 14 / 24, play_m),
-        "piper": Task(("--distance", "0.15:0.005"), limits["piper"], 9 / 13, play_m),
+        "piper": Task(("--distance", "0.15:0.005", "--fingers", "1"), limits["piper"], 9 / 13, play_m),
         # Nothing says how large this gripper is.  The marks on its mounts move by up to 2 px of 346 in the video.
         "umi_left": Task((), (0.025, math.radians(8.0)), 0.6, 2.0 / 346.0, of_distance=True, values=_VIDEO),
     }
