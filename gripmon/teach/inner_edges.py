@@ -18,14 +18,14 @@ from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import folds_of, from_ideal_px, to_ideal_px
 from gripmon.teach.straight_pieces import jackknife_sigma
 
-SHORTEST_PX = 20.0
-"""Least length of an edge: texture has shorter lines, scratches and brush marks."""
+SHORTEST_PX = 10.0
+"""Least length of an edge: two more than the outline's, since nothing but its grey level tells it from texture."""
 LEAST_CONTRAST = 6.0
 """Least step over a pixel's noise: a search line averaged over three rows then shows it at ten sigma."""
 SEEN_SHARE = 0.7
 """Least part of an edge's length along which its step has one sign."""
-FROM_OUTLINE_PX = 5.0
-"""Least distance from the outline, where the background shines in."""
+FROM_OUTLINE_PX = 3.0
+"""Least distance from the outline, where the background shines in: two and a half times a usual blur of 1.2 px."""
 _REACH_PX = 3.0
 _STEP_PX = 0.25
 _SAME_PX, _SAME_COS = 3.0, 0.996

@@ -28,6 +28,8 @@ MOST_PLAY_PX = 4.0
 """Largest displacement of the gripper in an image that is moved back: 1 mm of play, at 4 px/mm."""
 SEARCH_PX = 8
 """Displacement, px, within which an image's edges are looked for; what is farther is another place."""
+CLEARLY_BETTER = 1.1
+"""Likeness at another displacement over that at none, from which it is one: edges are as alike a pixel beside."""
 LEAST_LIKENESS = 0.5
 """Least share of the gripper's edges that an image must show, over the usual share: more is hidden, or elsewhere."""
 SMALLEST_PART = 100
@@ -98,8 +100,7 @@ def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], N
                 )
         elif np.abs(change).max() < 0.25:
             break
-    still = _grown(enclosed(edges), images[0].shape)
-    _check(still, edges)
+    still = _grown(_static(edges), images[0].shape)
     stack = np.stack([shifted(given[k], -moved[k]) for k in kept])
     inside = _inside(still)
     _level(stack, inside)
@@ -150,9 +151,11 @@ def _grown(mask: Bits, shape: tuple[int, ...]) -> Bits:
     return np.asarray(out > 0)
 
 
-def _check(still: Bits, edges: Edges) -> None:
-    share = float(still.mean())
-    if share > MOST_STILL_SHARE or not edges.changing.any():
+def _static(edges: Edges) -> Bits:
+    """The pixels (h, w) that don't belong to the background.  Raises :class:`NoResultError`."""
+    still = enclosed(edges)
+    share = 1.0 if still is None else float(still.mean())
+    if still is None or share > MOST_STILL_SHARE:
         raise NoResultError(
             f"{100.0 * share:.0f} % of the image stays the same; images with changing backgrounds: move the robot "
             "between them"
@@ -162,6 +165,7 @@ def _check(still: Bits, edges: Edges) -> None:
             "no edges that stay enclose anything; a camera that is fixed to the gripper, one gripper, jaws at rest, "
             "sharp images"
         )
+    return still
 
 
 def _displacements(images: Sequence[Plane], edges: Edges, at: Array) -> tuple[Array, Array]:
@@ -191,8 +195,11 @@ def _displacements(images: Sequence[Plane], edges: Edges, at: Array) -> tuple[Ar
         ]) / len(rows)  # fmt: skip
         y, x = np.unravel_index(int(scores.argmax()), scores.shape)
         share[k] = scores[y, x]
+        if share[k] < CLEARLY_BETTER * scores[SEARCH_PX, SEARCH_PX]:
+            out[k] = at[k]  # within the width of the edges, which the outline's measurement tells
+            continue
         out[k] = at[k] + [reach[x] + _vertex(scores[y], int(x)), reach[y] + _vertex(scores[:, x], int(y))]
-    return out, share
+    return out - np.median(out, axis=0), share
 
 
 def _vertex(values: Array, at: int) -> float:

@@ -42,7 +42,10 @@ CHANGING_SLOPES = 4.0
 CHANGING_FACTOR = 2.5
 """... and over the slope that two thirds of the images show, which on a standing edge is about the same."""
 CHANGING_PART = 0.3
-"""Part of a cell where edges come and go, from which it is background: a thin finger fills two thirds of a cell."""
+"""Part of a cell where edges come and go, from which it is background: a thin finger fills two thirds of a cell.  At
+most half of what the tenth of the cells has that changes most: a background of few edges."""
+LEAST_CHANGING = 0.02
+"""Least part of these cells where edges come and go; noise alone makes a thousandth."""
 CHANGE_WORTH = 0.5
 """What a boundary between a cell where everything changes and one where nothing does counts over an edge that stays in
 all images: by itself, as where a wall begins, not enough."""
@@ -91,8 +94,9 @@ class Edges:
 def edges_that_stay(images: Sequence[Plane]) -> Edges:
     """Of ``images`` (h, w), grey levels of 0 to 255, at one jaw opening."""
     usual, high = _quantiles(images)
-    # The quietest tenth is plain; a third of a Rayleigh's values are below 0.93 sigma, less after smoothing.
-    noise = max(float(np.quantile(usual[::3, ::3], 0.1)) / 0.75, LEAST_SLOPE / 8.0)
+    # The quietest fiftieth is a plain part of a fingertip or a wall; a third of a Rayleigh's values are below 0.93 s.
+    quiet = float(np.quantile(cv2.blur(usual, (9, 9))[::3, ::3], 0.02))
+    noise = max(quiet / 0.93, LEAST_SLOPE / 8.0)
     full = max(NOISE_SLOPES * noise, LEAST_SLOPE)
     share, across_rad = _share(images, full)
     chance, _ = _share(_displaced(images), full)
@@ -162,15 +166,18 @@ def _ridge(slope: Plane, across_rad: Plane) -> Bits:
     return np.asarray((soft >= sides[0]) & (soft >= sides[1]))
 
 
-def enclosed(edges: Edges) -> Bits:
-    """The pixels (h, w) that edges which stay separate from the background."""
+def enclosed(edges: Edges) -> Bits | None:
+    """The pixels (h, w) that edges which stay separate from the background; None where nothing changes."""
     labels = _cells(edges.stays)
     count = int(labels.max()) + 1
     area = np.bincount(labels.ravel(), minlength=count)
     changing = np.bincount(labels.ravel(), edges.changing.ravel(), minlength=count) / np.maximum(area, 1)
+    most = float(np.quantile(changing, 0.9))
+    if most < LEAST_CHANGING:
+        return None
     one, other, total, length_px = _boundaries(labels, edges)
     total += CHANGE_WORTH * length_px * np.abs(changing[one] - changing[other])
-    start = np.where(changing > CHANGING_PART, 0, np.arange(count))
+    start = np.where(changing > min(CHANGING_PART, 0.5 * most), 0, np.arange(count))
     return np.asarray(_merged(one, other, total, length_px, start, edges.limit)[labels] != 0)
 
 
