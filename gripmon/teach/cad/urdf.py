@@ -1,19 +1,21 @@
-"""Reads a gripper's URDF: which links its joint moves, and their positions at every opening.
+"""Reads a gripper's URDF: which links its joints move, and where they are at every opening.
 
-https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.
+https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.  The joints are
+settled before any mesh is read, and only what the gripper's own base carries is read: an arm isn't.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon.model.errors import InputError
-from gripmon.model.geometry import make_transform
+from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
 from gripmon.teach.cad.files import MESHES, Body, joined, mesh_library, read_mesh
 
@@ -23,9 +25,25 @@ STEPS = 41
 TURNS_RAD = 1e-3
 """Largest turn, over the joint's range, of a link that counts as not turning: 0.02 mm at 20 mm."""
 
+PAIR_COSINE = 0.9998
+"""Axes of two jaws' joints are along one line to 1.1 degrees."""
+
+PAIR_SHARE = 0.02
+"""Largest difference of the ranges of two joints that move as a pair, over the range."""
+
+NUMBERS = partial(np.linspace, 0.0, 1.0, STEPS)
+
+
+class NoMeshError(InputError):
+    """A link's mesh isn't there, or nothing here reads it."""
+
 
 @dataclass(frozen=True, slots=True)
-class _Joint:
+class Joint:
+    """``parent_T_child`` at zero is ``origin`` (4, 4); ``axis`` (3,) in the child's frame; ``mimic``: the joint that it
+    follows, factor, offset.
+    """
+
     name: str
     kind: str
     parent: str
@@ -35,8 +53,12 @@ class _Joint:
     limits: tuple[float, float]
     mimic: tuple[str, float, float] | None
 
+    @property
+    def range(self) -> float:
+        return self.limits[1] - self.limits[0]
+
     def placed(self, values: dict[str, float]) -> Array:
-        """``parent_T_child`` (4, 4) with the driving joints at ``values``."""
+        """``parent_T_child`` (4, 4) with the joints at ``values``; those that it doesn't name at zero."""
         name, times, plus = self.mimic or (self.name, 1.0, 0.0)
         value = times * values.get(name, 0.0) + plus
         moved = np.eye(4)
@@ -48,11 +70,26 @@ class _Joint:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkGroup:
-    """A group of links that move together: ``body`` in the base's frame at the middle of the joint's range, ``path_m``
-    (s, 3) its shifts from there, and ``turns_rad``, its largest turn over the range.
+class Drive:
+    """What moves the jaws: by joint the position at the start and at the end of their way, and the positions of joints
+    that ``stand``.
     """
 
+    ways: dict[str, tuple[float, float]]
+    stand: dict[str, float]
+    notes: tuple[str, ...] = ()
+
+    def values(self, share: float) -> dict[str, float]:
+        return {**self.stand, **{name: a + share * (b - a) for name, (a, b) in self.ways.items()}}
+
+
+@dataclass(frozen=True, slots=True)
+class LinkGroup:
+    """Links that move together: ``body`` in the base's frame as drawn, at the middle of the jaws' way or where the
+    joints stand, ``path_m`` (s, 3) its shifts along the way, ``turns_rad`` its largest turn on it.
+    """
+
+    links: tuple[str, ...]
     body: Body
     path_m: Array
     turns_rad: float
@@ -60,30 +97,73 @@ class LinkGroup:
 
 @dataclass(frozen=True, slots=True)
 class Linkage:
-    """A URDF gripper: the bodies that the joint moves, the fixed one (``base``), and the driving ``joint``."""
+    """A URDF gripper in the frame of ``base``, the link that carries it: what the joints move, what stays (by link),
+    and ``pivot``, place and direction (2, 3) of the first joint's axis if it turns.  ``moves``: whether the jaws move in
+    the file.
+    """
 
-    moving: list[LinkGroup]
-    base: Body | None
     joint: str
+    base: str
+    moving: list[LinkGroup]
+    still: dict[str, Body]
+    pivot: Array | None
+    moves: bool
     notes: list[str] = field(default_factory=list)
 
 
-class _Reader:
+class Urdf:
+    """A file's links and joints.  :class:`InputError` for a file that isn't a URDF."""
+
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.notes: list[str] = []
         try:
-            self.root = ElementTree.parse(path).getroot()
+            root = ElementTree.parse(path).getroot()
         except (OSError, ElementTree.ParseError) as error:
             raise InputError(f"{path}: can't be read as URDF ({error}); XML, xacro expanded") from None
-        if self.root.tag != "robot":
-            raise InputError(f"{path}: its root is <{self.root.tag}>; <robot>, a URDF")
-        if any(
-            "xacro" in part.tag or part.tag.endswith("}macro") or "${" in str(part.attrib) for part in self.root.iter()
-        ):
+        if root.tag != "robot":
+            raise InputError(f"{path}: its root is <{root.tag}>; <robot>, a URDF")
+        if any("xacro" in part.tag or part.tag.endswith("}macro") or "${" in str(part.attrib) for part in root.iter()):
             raise InputError(f"{path}: holds xacro macros; expand it first: xacro {path} > {path.stem}.urdf")
+        self._links = {link.get("name", "?"): link for link in root.findall("link")}
+        self.joints = [self._joint(part) for part in root.findall("joint")]
+        self._holding = {joint.child: joint for joint in self.joints}
+        self.shown = [n for n, link in self._links.items() if link.findall("visual") or link.findall("collision")]
+        if not self.shown:
+            raise InputError(f"{path}: no link has a geometry; visual meshes or boxes")
 
     def refuse(self, where: str, wrong: str) -> InputError:
         return InputError(f"{self.path}: {where}: {wrong}")
+
+    def base_of(self, link: str) -> str:
+        """The link that carries ``link`` rigidly, and that no fixed joint carries further."""
+        seen = {link}
+        while (joint := self._holding.get(link)) is not None and joint.kind == "fixed" and joint.parent not in seen:
+            link = joint.parent
+            seen.add(link)
+        return link
+
+    def moved_by(self, joint: Joint) -> list[str]:
+        """The links with a geometry that a joint moves, and those that follow it."""
+        ends = {joint.child, *(j.child for j in self.joints if j.mimic and j.mimic[0] == joint.name)}
+        return [name for name in self.shown if ends & set(self._up(name))]
+
+    def placed(self, base: str, values: dict[str, float]) -> dict[str, Array]:
+        """``base_T_link`` of every link with a geometry that ``base`` carries, the joints at ``values``."""
+        out = {}
+        for name in self.shown:
+            way = self._up(name)
+            if base in way:
+                carried = [self._holding[link].placed(values) for link in way[: way.index(base)]]
+                out[name] = np.linalg.multi_dot([np.eye(4), *reversed(carried), np.eye(4)])
+        return out
+
+    def _up(self, link: str) -> list[str]:
+        """The link, its parent, and so on."""
+        way = [link]
+        while (joint := self._holding.get(way[-1])) is not None and joint.parent not in way:
+            way.append(joint.parent)
+        return way
 
     def numbers(self, part: ElementTree.Element | None, key: str, default: str, where: str, count: int = 3) -> Array:
         text = default if part is None else part.get(key, default)
@@ -95,15 +175,12 @@ class _Reader:
             raise self.refuse(where, f"{key} is '{text}'; {count} ordinary numbers")
         return values
 
-    def origin(self, part: ElementTree.Element, where: str) -> Array:
+    def _origin(self, part: ElementTree.Element, where: str) -> Array:
         given = part.find("origin")
         turn = Rotation.from_euler("xyz", self.numbers(given, "rpy", "0 0 0", where)).as_matrix()
         return make_transform(turn, self.numbers(given, "xyz", "0 0 0", where))
 
-    def joints(self) -> list[_Joint]:
-        return [self._joint(part) for part in self.root.findall("joint")]
-
-    def _joint(self, part: ElementTree.Element) -> _Joint:
+    def _joint(self, part: ElementTree.Element) -> Joint:
         name, kind = part.get("name", "?"), part.get("type", "?")
         where = f"joint '{name}'"
         if kind not in ("fixed", "prismatic", "revolute", "continuous"):
@@ -112,7 +189,7 @@ class _Reader:
         axis = self.numbers(part.find("axis"), "xyz", "1 0 0", where)
         if kind != "fixed" and not np.linalg.norm(axis) > 0.0:
             raise self.refuse(where, "has an axis without direction; a unit vector")
-        limit = part.find("limit")
+        limit = next((each for each in part.findall("limit") if each.get("lower") or each.get("upper")), None)
         low, high = (float(self.numbers(limit, key, "0", where, 1)[0]) for key in ("lower", "upper"))
         mimic = part.find("mimic")
         follows = None
@@ -120,18 +197,24 @@ class _Reader:
             times, plus = (self.numbers(mimic, k, d, where, 1)[0] for k, d in (("multiplier", "1"), ("offset", "0")))
             follows = (str(mimic.get("joint")), float(times), float(plus))
         axis = axis / max(float(np.linalg.norm(axis)), 1e-30)
-        return _Joint(name, kind, parent, child, self.origin(part, where), axis, (low, high), follows)
+        return Joint(name, kind, parent, child, self._origin(part, where), axis, (low, high), follows)
 
-    def bodies(self) -> dict[str, Body]:
-        """Each link's geometry in its own frame; links without any are left out."""
-        out = {}
-        for link in self.root.findall("link"):
-            name = link.get("name", "?")
-            shown = link.findall("visual") or link.findall("collision")
-            parts = [self._geometry(part, f"link '{name}'") for part in shown]
-            if parts:
-                out[name] = joined(parts, name)
-        return out
+    def body(self, name: str) -> Body:
+        """A link's geometry in its own frame.  A visual mesh that can't be read is replaced by the collision's, with a
+        note: that may be coarser.
+        """
+        visual, collision = self._links[name].findall("visual"), self._links[name].findall("collision")
+        try:
+            return joined([self._geometry(part, f"link '{name}'") for part in visual or collision], name)
+        except NoMeshError as error:
+            if not (visual and collision):
+                raise
+            try:
+                body = joined([self._geometry(part, f"link '{name}'") for part in collision], name)
+            except NoMeshError:
+                raise error from None
+            self.notes.append(f"link '{name}': its collision mesh is used, which may be coarser; {error.wrong}")
+            return body
 
     def _geometry(self, part: ElementTree.Element, where: str) -> Body:
         geometry = part.find("geometry")
@@ -139,18 +222,20 @@ class _Reader:
         if shape is None:
             raise self.refuse(where, "has no geometry; a mesh, box, cylinder or sphere")
         body = self._mesh(shape, where) if shape.tag == "mesh" else self._primitive(shape, where)
-        return body.moved(self.origin(part, where))
+        return body.moved(self._origin(part, where))
 
     def _mesh(self, shape: ElementTree.Element, where: str) -> Body:
         name, scale = shape.get("filename", ""), self.numbers(shape, "scale", "1 1 1", where)
         path = self._find(name)
         if path is None:
-            raise self.refuse(
-                where, f"its mesh '{name}' isn't there; the file beside the URDF, or the package's folder"
-            )
+            right = "the file beside the URDF, or the package's folder"
+            raise NoMeshError(f"{self.path}: {where}: its mesh '{name}' isn't there; {right}")
         if path.suffix.lower() not in MESHES:
-            raise self.refuse(where, f"its mesh is '{path.name}'; {', '.join(MESHES)}: convert it")
-        return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
+            raise NoMeshError(f"{self.path}: {where}: its mesh is '{path.name}'; {', '.join(MESHES)}: convert it")
+        try:
+            return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
+        except InputError as error:
+            raise NoMeshError(error.wrong) from None
 
     def _find(self, name: str) -> Path | None:
         """Find a mesh file; ``package://NAME/…`` is searched for from the URDF's folder upwards."""
@@ -177,75 +262,148 @@ class _Reader:
 
 
 def read_urdf(path: Path, joint: str | None) -> Linkage:
-    """Read a URDF's gripper, moved by ``joint``.  None: by the only joint that moves and mimics no other, or by two
-    such joints of one kind and range on one link, together.
+    """Read a URDF's gripper.  ``joint``: NAME of the joint that opens the jaws, NAME=POSITION of one that stands there
+    (m or rad), or two of these with a comma.  None: the only joint that moves by itself, or the only two if they are a
+    pair: siblings that run the same way in opposite directions.
 
-    Raises :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which one opens the jaws.
+    :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which opens the jaws; it comes
+    before any mesh is read.
     """
-    reader = _Reader(path)
-    joints, bodies = reader.joints(), reader.bodies()
-    if not bodies:
-        raise InputError(f"{path}: no link has a geometry; visual meshes or boxes")
-    driving, together = _driving(reader, joints, joint)
-    lowest, highest = driving.limits
-    if not highest > lowest:
-        raise reader.refuse(f"joint '{driving.name}'", f"moves from {lowest:g} to {highest:g}; limit lower < upper")
-    values = np.linspace(lowest, highest, STEPS)
-    poses = [_placed(joints, {name: share * v for name, share in together.items()}) for v in values.tolist()]
+    urdf = Urdf(path)
+    drive = _driving(urdf, joint)
+    first = next(j for j in urdf.joints if j.name == next(iter({**drive.ways, **drive.stand})))
+    base = urdf.base_of(first.parent)
+    # Where the jaws stand, a sweep of the joint tells what it moves.
+    swept = drive if drive.ways else Drive({name: (v - 0.1, v + 0.1) for name, v in drive.stand.items()}, {})
+    poses = [urdf.placed(base, swept.values(share)) for share in NUMBERS().tolist()]
+    drawn = poses[STEPS // 2]
+    bodies = {name: urdf.body(name).moved(drawn[name]) for name in drawn}
     groups: dict[bytes, list[str]] = {}
-    for name in bodies:
-        way = np.array([pose.get(name, np.eye(4)) for pose in poses])
-        middle = np.linalg.inv(way[STEPS // 2])
-        # Links with the same motion are one body.
-        groups.setdefault(np.round(way @ middle, 9).tobytes(), []).append(name)
-    moving, base = [], None
-    for names in groups.values():
-        way = np.array([pose.get(names[0], np.eye(4)) for pose in poses])
-        body = joined([bodies[name].moved(poses[STEPS // 2].get(name, np.eye(4))) for name in names], names[0])
+    still = {}
+    for name in drawn:
+        way = np.array([pose[name] for pose in poses])
         if np.abs(way - way[0]).max() < 1e-9:
-            base = body
-            continue
-        turned = Rotation.from_matrix(way[:, :3, :3]) * Rotation.from_matrix(way[STEPS // 2, :3, :3]).inv()
-        turns_rad = float(turned.magnitude().max())
-        moving.append(LinkGroup(body, way[:, :3, 3] - way[STEPS // 2, :3, 3], turns_rad))
+            still[name] = bodies[name]
+        else:  # links with the same motion are one body
+            groups.setdefault(np.round(way @ invert(drawn[name]), 9).tobytes(), []).append(name)
+    moving = []
+    for names in groups.values():
+        way = np.array([pose[names[0]] for pose in poses])
+        turned = Rotation.from_matrix(way[:, :3, :3]) * Rotation.from_matrix(drawn[names[0]][:3, :3]).inv()
+        body = joined([bodies[name] for name in names], names[0])
+        moving.append(
+            LinkGroup(tuple(names), body, way[:, :3, 3] - drawn[names[0]][:3, 3], float(turned.magnitude().max()))
+        )
     if not moving:
-        raise reader.refuse(f"joint '{driving.name}'", "moves no link that has a geometry; the joint of the jaws")
-    return Linkage(moving, base, driving.name)
+        raise urdf.refuse(f"joint '{first.name}'", "moves no link that has a geometry; the joint of the jaws")
+    pivot = None
+    if first.kind != "prismatic":
+        at = _carried(urdf, base, first)
+        pivot = np.stack([at[:3, 3], at[:3, :3] @ first.axis])
+    return Linkage(first.name, base, moving, still, pivot, bool(drive.ways), [*drive.notes, *urdf.notes])
 
 
-def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_Joint, dict[str, float]]:
-    """The jaws' joint, and the joints driven with it, by name: the ratio of their values to its value."""
-    free = [j for j in joints if j.kind != "fixed" and j.mimic is None]
-    if name is not None:
-        chosen = [j for j in free if j.name == name]
-        if not chosen:
-            names = ", ".join(j.name for j in free) or "none"
-            raise InputError(f"{name}: {reader.path} has no such joint that drives others; one of {names}", "joint")
-        return chosen[0], {name: 1.0}
-    if not free:
-        raise InputError(f"{reader.path}: no joint moves; prismatic or revolute joints, or its meshes by themselves")
-    alike = all(j.kind == free[0].kind and j.limits == free[0].limits for j in free)
-    if len(free) == 1 or (len(free) == 2 and alike and free[0].parent == free[1].parent):
-        return free[0], {j.name: 1.0 for j in free}
-    names = ", ".join(j.name for j in free)
-    raise InputError(
-        f"is missing: {reader.path} has {len(free)} joints that move by themselves; one of {names}", "joint"
+def _carried(urdf: Urdf, base: str, joint: Joint) -> Array:
+    """``base_T_joint`` (4, 4), all joints at zero."""
+    transform = joint.origin
+    link = joint.parent
+    while link != base and (holding := next((j for j in urdf.joints if j.child == link), None)) is not None:
+        transform, link = holding.placed({}) @ transform, holding.parent
+    return transform
+
+
+def _driving(urdf: Urdf, text: str | None) -> Drive:
+    """What opens the jaws: what ``--joint`` names, and with it its twin."""
+    free = {j.name: j for j in urdf.joints if j.kind != "fixed" and j.mimic is None and urdf.moved_by(j)}
+    if text is None:
+        if not free:
+            right = "prismatic or revolute joints, or its meshes by themselves"
+            raise InputError(f"{urdf.path}: no joint moves; {right}")
+        if len(free) == 1 or (len(free) == 2 and _twin(urdf, *free.values())):
+            return _ways(urdf, list(free.values()), {}, ())
+        leading = {j.mimic[0] for j in urdf.joints if j.mimic} & set(free)
+        hint = f" ({', '.join(sorted(leading))} also leads others)" if leading else ""
+        raise InputError(
+            f"is missing: {urdf.path} has {len(free)} joints that move by themselves; one of {', '.join(free)}{hint}",
+            "joint",
+        )
+    asked = _asked(text)
+    strange = next((name for name in asked if name not in free), None)
+    if strange is not None:
+        follows = next((j.mimic[0] for j in urdf.joints if j.name == strange and j.mimic), None)
+        raise InputError(
+            f"{strange}: {urdf.path} has no such joint that drives others; "
+            + (follows or f"one of {', '.join(free) or 'none'}"),
+            "joint",
+        )
+    stand = {name: value for name, value in asked.items() if value is not None}
+    chosen = [free[name] for name in asked if name not in stand]
+    if len(chosen) > 2:
+        raise InputError(
+            f"{text}: opens the jaws by {len(chosen)} joints; one or two, the others as NAME=0.01", "joint"
+        )
+    first = free[next(iter(asked))]
+    notes: tuple[str, ...] = ()
+    others = [j for name, j in free.items() if name not in asked and _siblings(urdf, first, j)]
+    if others:
+        if len(others) == len(chosen) == 1 and _twin(urdf, chosen[0], others[0]):
+            chosen.append(others[0])
+            notes = (f"joint '{others[0].name}' opens the jaws together with '{first.name}'",)
+        else:
+            left = others[0]
+            link = urdf.moved_by(left)[0]
+            raise InputError(
+                f"{text}: leaves out link '{link}', which joint '{left.name}' moves; {first.name},{left.name} if both "
+                f"open the jaws, or {text},{left.name}=POSITION where it stands",
+                "joint",
+            )
+    return _ways(urdf, chosen, stand, notes)
+
+
+def _asked(text: str) -> dict[str, float | None]:
+    """Joints by name, with their positions where they stand."""
+    asked: dict[str, float | None] = {}
+    for word in text.split(","):
+        name, equals, position = word.strip().partition("=")
+        try:
+            asked[name] = float(position) if equals else None
+        except ValueError:
+            raise InputError(f"'{word}' isn't NAME=POSITION; a number, in metres or radians", "joint") from None
+        if equals and not np.isfinite(float(position)):
+            raise InputError(f"'{word}': is not a position; an ordinary number, in metres or radians", "joint")
+    return asked
+
+
+def _siblings(urdf: Urdf, one: Joint, other: Joint) -> bool:
+    return urdf.base_of(one.parent) == urdf.base_of(other.parent)
+
+
+def _against(urdf: Urdf, one: Joint, other: Joint) -> float:
+    """Cosine between the axes of two joints on one base."""
+    base = urdf.base_of(one.parent)
+    a, b = (_carried(urdf, base, j)[:3, :3] @ j.axis for j in (one, other))
+    return float(a @ b)
+
+
+def _twin(urdf: Urdf, one: Joint, other: Joint) -> bool:
+    """Whether two joints move a pair of jaws: on one base, along (or about) parallel axes, over ranges of one size."""
+    alike = one.kind == other.kind and _siblings(urdf, one, other) and one.range > 0.0
+    return (
+        alike
+        and abs(one.range - other.range) <= PAIR_SHARE * one.range
+        and abs(_against(urdf, one, other)) >= PAIR_COSINE
     )
 
 
-def _placed(joints: list[_Joint], values: dict[str, float]) -> dict[str, Array]:
-    """``base_T_link`` of every link held by a joint; a link without one is at the base."""
-    children = {j.child: j for j in joints}
-    out: dict[str, Array] = {}
-
-    def at(link: str, seen: tuple[str, ...]) -> Array:
-        joint = children.get(link)
-        if joint is None or link in seen:
-            return np.eye(4)
-        if link not in out:
-            out[link] = at(joint.parent, (*seen, link)) @ joint.placed(values)
-        return out[link]
-
-    for link in children:
-        at(link, ())
-    return out
+def _ways(urdf: Urdf, chosen: list[Joint], stand: dict[str, float], notes: tuple[str, ...]) -> Drive:
+    """The way of each joint over its range; of two the second in the other direction in space."""
+    for joint in chosen:
+        if not joint.range > 0.0:
+            raise urdf.refuse(
+                f"joint '{joint.name}'",
+                f"moves from {joint.limits[0]:g} to {joint.limits[1]:g}; limit lower < upper",
+            )
+    ways = {joint.name: joint.limits for joint in chosen}
+    if len(chosen) == 2 and _siblings(urdf, *chosen) and _against(urdf, *chosen) > 0.0:
+        ways[chosen[1].name] = (chosen[1].limits[1], chosen[1].limits[0])
+    return Drive(ways, stand, notes)
