@@ -21,8 +21,8 @@ from gripmon.teach.cad.files import UNITS_M
 from gripmon.teach.cad.frame import AXES, approach_of, axes_of, check_level, frame_of
 from gripmon.teach.cad.jaw import jaw_of
 from gripmon.teach.cad.outline import outline_shape
-from gripmon.teach.cad.picture import draw_gripper
 from gripmon.teach.cad.parts import LONGEST_M, STRAIGHT_NOTE, Parts, read_parts
+from gripmon.teach.cad.picture import draw_gripper
 from gripmon.teach.cad.solid import Shape, cut, is_solid, solid_shape
 from gripmon.teach.cad.surface import Surface
 from gripmon.teach.cad.written import gripper_text, model_of
@@ -30,7 +30,7 @@ from gripmon.teach.cad.written import gripper_text, model_of
 
 @dataclass(frozen=True)
 class CadGripper:
-    """A gripper from CAD: its ``model`` and the ``notes`` on it; ``origins``: for each finger the file, bodies or links;
+    """A gripper from CAD: its ``model`` and the ``notes`` on it; ``origins``: the file, bodies or links of each finger;
     ``grip_T_cad`` (4, 4); ``camera`` and ``cam_T_grip``: the view that was given, None without one.
     """
 
@@ -91,15 +91,16 @@ def gripper_from_cad(
 
     ``unit`` of meshes: "m", "mm", "cm" or "in"; URDF, DAE and .cao have theirs.  ``body``: which bodies of a file are
     fingers ("all" for one, "1,2", "1+3,2"), or which links of a URDF.  ``frame``: "tcp" puts the origin between the
-    fingertips, x across the jaws, from the finger called left to the right one, and z along ``approach`` (an axis of the
-    CAD frame, "+z" and the like, or two with a comma: z and x; if None, "+z", or for a URDF the axis along which its
-    fingers reach); "cad" keeps the file's axes.
+    fingertips, x across the jaws, from the finger called left to the right one, and z along ``approach`` (an axis of
+    the CAD frame, "+z" and the like, or two with a comma: z and x; if None, "+z", or for a URDF the axis along which
+    its fingers reach); "cad" keeps the file's axes.
 
-    ``jaw_range_m``: meshes of two fingers move by half of the opening each; a URDF has its own motion, cut to the range.
-    ``joint``: the URDF's joint that opens the jaws, if several are possible, "NAME=POSITION" (m or rad) where it stands,
-    or two with a comma.  ``jaw_opening_m`` is what a robot reports for the fingers as drawn; the distance of the tips if
-    None.  ``length_m``: the length of the fingers to use, from the tips.  ``bevel_m``: width of the bevels on real edges
-    that are sharp in the CAD; 0 only for edges sharper than 0.02 mm, since protection levels include only what is stated.
+    ``jaw_range_m``: meshes of two fingers move by half of the opening each; a URDF has its own motion, cut to the
+    range.  ``joint``: the URDF's joint that opens the jaws, if several are possible, "NAME=POSITION" (m or rad) where
+    it stands, or two with a comma.  ``jaw_opening_m`` is what a robot reports for the fingers as drawn; the distance of
+    the tips if None.  ``length_m``: the length of the fingers to use, from the tips.  ``bevel_m``: width of the bevels
+    on real edges that are sharp in the CAD; 0 only for edges sharper than 0.02 mm, since protection levels include only
+    what is stated.
 
     Convex fingers with flat faces are valid for every view.  Others need ``camera`` and ``cam_T_grip`` (4, 4), and are
     made for that view.  :class:`~gripmon.model.errors.InputError` says what can't be used, and what can.

@@ -29,9 +29,9 @@ ALIKE = 0.05
 def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | None, pivot: Array | None) -> Array:
     """Rotation (3, 3) from the CAD frame to the gripper's: rows x, y, z; x from the first finger to the last.
 
-    ``approach``: z, or z and x with a comma, keys of :data:`AXES`; None: +z.  ``along`` (3,): the direction in which the
-    jaws move; ``pivot`` (3,): the axis about which one turns.  Of meshes alone x is from middle to middle, which holds
-    for two fingers of one shape; for others it has to be an axis of the CAD frame.
+    ``approach``: z, or z and x with a comma, keys of :data:`AXES`; None: +z.  ``along`` (3,): the direction in which
+    the jaws move; ``pivot`` (3,): the axis about which one turns.  Of meshes alone x is from middle to middle, which
+    holds for two fingers of one shape; for others it has to be an axis of the CAD frame.
     """
     first, *second = (approach or "+z").split(",")
     z = AXES[first]
@@ -83,8 +83,8 @@ def _check_longest(finger: Surface, axes: Array, fingers: Sequence[Surface]) -> 
     if size[2] < CLEAR * others:
         extent = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(finger.points_m, axis=0))
         raise InputError(
-            f"is missing: a finger of {extent} mm (x, y, z), which isn't longest along z; the axis of the CAD frame out "
-            "of the gripper, as --approach=+y",
+            f"is missing: a finger of {extent} mm (x, y, z), which isn't longest along z; the axis of the CAD frame "
+            "out of the gripper, as --approach=+y",
             "approach",
         )
 
@@ -120,8 +120,8 @@ def approach_of(fingers: Sequence[Surface], around: Sequence[Surface], along: Ar
     if largest[1] > CLEAR * largest[2] or not largest[2] > 1e-3:
         places = ", ".join(f"{1e3 * v:.0f}" for v in reach)
         raise InputError(
-            f"is missing: the fingers' middle is ({places}) mm from what holds them, which tells no axis; the one out of "
-            f"the gripper, as --approach={found}",
+            f"is missing: the fingers' middle is ({places}) mm from what holds them, which tells no axis; the one out "
+            f"of the gripper, as --approach={found}",
             "approach",
         )
     return found

@@ -74,7 +74,7 @@ def jaw_of(
             "jaw_range_m",
         )
     opening = np.array(jaw_range_m)
-    ways = {
+    ways: dict[str, Array] = {
         name: (opening - nominal)[:, None] * [side, 0.0, 0.0] for name, side in zip(fingers, (-0.5, 0.5), strict=True)
     }
     return Jaw(JawModel(nominal_m=nominal, min_m=low, max_m=high), opening, ways)
@@ -125,8 +125,8 @@ def _linked(
         range_m = max(low, 0.0), high
     elif not (low - OVERLAP_M <= range_m[0] <= nominal <= range_m[1] <= high + OVERLAP_M):
         raise InputError(
-            f"{range_m[0]:g}:{range_m[1]:g} m: the joint opens the jaws from {low:.4f} to {high:.4f} m, and they are drawn "
-            f"at {nominal:.4f} m; a range within, with this, or --jaw-opening with what the robot reports for it",
+            f"{range_m[0]:g}:{range_m[1]:g} m: the joint opens the jaws from {low:.4f} to {high:.4f} m, and they "
+            f"are drawn at {nominal:.4f} m; a range within, with this, or --jaw-opening with what the robot reports for it",
             "jaw_range_m",
         )
     inside = (opening > range_m[0] + 1e-9) & (opening < range_m[1] - 1e-9)

@@ -111,8 +111,8 @@ def _bodies_in(whole: Body, text: str | None, path: str) -> tuple[list[Body], tu
         listed = [f"{k}: {_size(piece.points_m)}" for k, piece in enumerate(pieces[:MOST_NAMED], start=1)]
         more = f", and {len(pieces) - MOST_NAMED} smaller" if len(pieces) > MOST_NAMED else ""
         raise InputError(
-            f"is missing: {path} holds {len(pieces)} bodies ({'; '.join(listed)}{more}); all, if they are one finger, or "
-            "numbers: 1,2 are two fingers, 1+3,2 two of three bodies",
+            f"is missing: {path} holds {len(pieces)} bodies ({'; '.join(listed)}{more}); all, if they are one finger, "
+            "or numbers: 1,2 are two fingers, 1+3,2 two of three bodies",
             "body",
         )
     if text == "all":
@@ -162,7 +162,7 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
     hiding = [(group.body.name, group.body) for group in linkage.moving if group not in chosen]
     turning_names = ", ".join(name for name, _ in hiding)
     if hiding:
-        notes.append(f"links that turn aren't fingers; they only hide what is behind them: {turning_names}")
+        notes.append(f"these links aren't fingers, they only hide what is behind them: {turning_names}")
     around = [surface_of(each) for _, each in hiding]
     around += [surface_of(each) for link, each in linkage.still.items() if link not in still]
     bodies = [group.body for group in chosen] + [linkage.still[link] for link in still]
@@ -189,8 +189,8 @@ def _chosen(path: Path, linkage: Linkage, text: str) -> tuple[list[LinkGroup], l
 def _turning(path: Path, linkage: Linkage, turning: LinkGroup) -> InputError:
     link, turns = turning.links[0], np.degrees(turning.turns_rad)
     return InputError(
-        f"{path}: its finger '{link}' turns by {turns:.0f} degrees to either side while joint '{linkage.joint}' moves, and "
-        f"a gripper file holds fingers that don't turn; --joint {linkage.joint}=POSITION (rad) for the opening that is "
+        f"{path}: its finger '{link}' turns by {turns:.0f} degrees to either side while joint '{linkage.joint}' moves, "
+        f"and a gripper file holds fingers that don't turn; --joint {linkage.joint}=POSITION (rad) for the opening that is "
         "used, or --body LINK of a finger that stands"
     )
 
@@ -216,8 +216,8 @@ def _beside(
     if len(reaching) > 1:
         names = ", ".join(reaching)
         raise InputError(
-            f"is missing: {path}: beside the finger {linkage.moving[0].links[0]} stand the links {names}; the fingers, as "
-            f"--body {linkage.moving[0].links[0]},{reaching[0]}",
+            f"is missing: {path}: beside the finger {linkage.moving[0].links[0]} stand the links {names}; the fingers, "
+            f"as --body {linkage.moving[0].links[0]},{reaching[0]}",
             "body",
         )
     return reaching

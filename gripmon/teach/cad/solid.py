@@ -41,7 +41,9 @@ class Shape:
     def moved(self, to_T_shape: Array) -> Shape:
         """The same in another frame (4, 4)."""
         rotation, translation = to_T_shape[:3, :3], to_T_shape[:3, 3]
-        rounds = {k: (c @ rotation.T + translation, axis @ rotation.T) for k, (c, axis) in self.round_m.items()}
+        rounds: dict[int, tuple[Array, Array]] = {
+            k: (c @ rotation.T + translation, axis @ rotation.T) for k, (c, axis) in self.round_m.items()
+        }
         return replace(
             self,
             points_m=self.points_m @ rotation.T + translation,

@@ -1,7 +1,7 @@
 """Reads a gripper's URDF: which links its joints move, and where they are at every opening.
 
-https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.  The joints are
-settled before any mesh is read, and only what the gripper's own base carries is read: an arm isn't.
+https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.  The joints
+are settled before any mesh is read, and only what the gripper's own base carries is read: an arm isn't.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class LinkGroup:
 @dataclass(frozen=True, slots=True)
 class Linkage:
     """A URDF gripper in the frame of ``base``, the link that carries it: what the joints move, what stays (by link),
-    and ``pivot``, place and direction (2, 3) of the first joint's axis if it turns.  ``moves``: whether the jaws move in
-    the file.
+    and ``pivot``, place and direction (2, 3) of the first joint's axis if it turns.  ``moves``: whether the jaws move
+    in the file.
     """
 
     joint: str
