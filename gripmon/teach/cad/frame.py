@@ -30,20 +30,20 @@ def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | Non
     """Rotation (3, 3) from the CAD frame to the gripper's: rows x, y, z; x from the first finger to the last.
 
     ``approach``: z, or z and x with a comma, keys of :data:`AXES`; None: +z.  ``along`` (3,): the direction in which
-    the jaws move; ``pivot`` (3,): the axis about which one turns.  Of meshes alone x is from middle to middle, which
-    holds for two fingers of one shape; for others it has to be an axis of the CAD frame.
+    the jaws move; ``pivot`` (2, 3): place and axis about which one turns.  Of meshes alone x is from middle to middle,
+    which holds for two fingers of one shape; for others it has to be an axis of the CAD frame.
     """
     first, *second = (approach or "+z").split(",")
     z = AXES[first]
     if second:
         return _rows(AXES[second[0]], z)
-    if len(fingers) < 2 and along is None:
+    if len(fingers) < 2 and along is None and pivot is None:
         across = np.eye(3)[0 if abs(z[0]) < 0.5 else 1]
         if approach is None:
             _check_longest(fingers[0], np.stack([across, np.cross(z, across), z]), fingers)
         return _rows(across, z)
     apart = _middle(fingers[-1]) - _middle(fingers[0])
-    known = along if along is not None else None if pivot is None else np.cross(pivot, z)
+    known = along if along is not None else None if pivot is None else np.cross(pivot[1], z)
     across = apart if known is None else known
     across = across - (across @ z) * z
     if not np.linalg.norm(across) > (1e-3 if known is None else 1e-3 * np.linalg.norm(known)):
@@ -107,24 +107,32 @@ def _alike(one: Surface, other: Surface) -> bool:
 
 def approach_of(fingers: Sequence[Surface], around: Sequence[Surface], along: Array | None, pivot: Array | None) -> str:
     """The axis along which the fingers reach farthest from the body that holds them, or from the CAD frame's origin,
-    which in a URDF is at the flange.  ``along``, ``pivot`` (3,): directions that it isn't, if they are known.
+    which in a URDF is at the flange.  ``along`` (3,): the jaws' direction, if it is known.  ``pivot``, place and
+    direction (2, 3): then it is the axis along which what is there, ``around`` included, reaches farthest beyond it.
     """
-    held = np.concatenate([s.points_m for s in around]) if around else np.zeros((1, 3))
-    reach = np.mean([_middle(f) for f in fingers], axis=0) - 0.5 * (held.min(axis=0) + held.max(axis=0))
-    excluded = along if along is not None else pivot
-    if excluded is not None:
-        reach[int(np.abs(excluded).argmax())] = 0.0
-    largest = np.sort(np.abs(reach))
-    k = int(np.abs(reach).argmax())
-    found = ("+" if reach[k] > 0.0 else "-") + "xyz"[k]
-    if largest[1] > CLEAR * largest[2] or not largest[2] > 1e-3:
-        places = ", ".join(f"{1e3 * v:.0f}" for v in reach)
+    if pivot is not None:
+        places = np.concatenate([s.points_m for s in [*fingers, *around]]) - pivot[0]
+        reach = np.where(places.max(axis=0) > -places.min(axis=0), places.max(axis=0), places.min(axis=0))
+        # What reaches beyond the pivot to the other side of the same axis decides nothing either.
+        size = np.concatenate([places.max(axis=0), -places.min(axis=0)])
+        size[[int(np.abs(pivot[1]).argmax()) + k for k in (0, 3)]] = 0.0
+        reach[int(np.abs(pivot[1]).argmax())] = 0.0
+    else:
+        held = np.concatenate([s.points_m for s in around]) if around else np.zeros((1, 3))
+        reach = np.mean([_middle(f) for f in fingers], axis=0) - 0.5 * (held.min(axis=0) + held.max(axis=0))
+        if along is not None:
+            reach[int(np.abs(along).argmax())] = 0.0
+        size = np.abs(reach)
+    found = [("+" if reach[k] > 0.0 else "-") + "xyz"[k] for k in np.argsort(-np.abs(reach)).tolist()]
+    second, largest = np.sort(size)[-2:]
+    if second > CLEAR * largest or not largest > 1e-3:
+        words = ", ".join(f"{1e3 * v:.0f}" for v in reach)
         raise InputError(
-            f"is missing: the fingers' middle is ({places}) mm from what holds them, which tells no axis; the one out "
-            f"of the gripper, as --approach={found}",
+            f"is missing: the fingers reach ({words}) mm from what holds them, which tells no axis; the one out of the "
+            f"gripper, --approach={found[0]} or {found[1]}",
             "approach",
         )
-    return found
+    return found[0]
 
 
 def check_level(surfaces: Sequence[Surface], z: Array) -> None:

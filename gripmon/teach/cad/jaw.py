@@ -126,7 +126,7 @@ def _linked(
     elif not (low - OVERLAP_M <= range_m[0] <= nominal <= range_m[1] <= high + OVERLAP_M):
         raise InputError(
             f"{range_m[0]:g}:{range_m[1]:g} m: the joint opens the jaws from {low:.4f} to {high:.4f} m, and they "
-            f"are drawn at {nominal:.4f} m; a range within, with this, or --jaw-opening with what the robot reports for it",
+            f"are drawn at {nominal:.4f} m; a range within, with this, or --jaw-opening with what the robot reports",
             "jaw_range_m",
         )
     inside = (opening > range_m[0] + 1e-9) & (opening < range_m[1] - 1e-9)

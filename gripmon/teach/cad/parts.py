@@ -33,8 +33,8 @@ STRAIGHT_NOTE = "the fingers move straight along x, half of the opening each; if
 @dataclass(frozen=True)
 class Parts:
     """The fingers and the bodies ``around`` them, in the CAD frame.  ``paths_m``: for each finger its shifts (s, 3) by
-    the joint, empty where none moves them; ``along``, ``pivot`` (3,): the direction in which the jaws move, the axis
-    about which one turns, None if unknown; ``origins``: for each finger, where it comes from.
+    the joint, empty where none moves them; ``along`` (3,): the direction in which the jaws move, ``pivot`` (2, 3):
+    place and axis about which one turns, None if unknown; ``origins``: for each finger, where it comes from.
     """
 
     fingers: dict[str, Surface]
@@ -151,8 +151,8 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
         raise _turning(path, linkage, turning[0])
     one = chosen[0] if len(chosen) == 1 and body is None else None
     surfaces = [_checked(surface_of(group.body), group.links[0]) for group in chosen]
-    pivot = None if linkage.pivot is None or straight else linkage.pivot[1]
-    along = _along(chosen) if linkage.moves and chosen else None
+    pivot = None if straight else linkage.pivot
+    along = _along(chosen if chosen and linkage.moves else straight)
     if one is not None:
         still = _beside(path, linkage, surfaces[0], approach, along, pivot)
         if not still:
@@ -190,13 +190,15 @@ def _turning(path: Path, linkage: Linkage, turning: LinkGroup) -> InputError:
     link, turns = turning.links[0], np.degrees(turning.turns_rad)
     return InputError(
         f"{path}: its finger '{link}' turns by {turns:.0f} degrees to either side while joint '{linkage.joint}' moves, "
-        f"and a gripper file holds fingers that don't turn; --joint {linkage.joint}=POSITION (rad) for the opening that is "
-        "used, or --body LINK of a finger that stands"
+        f"and a gripper file holds fingers that don't turn; --joint {linkage.joint}=POSITION (rad) for the opening in "
+        "use, or --body LINK of a finger that stands"
     )
 
 
 def _along(groups: Sequence[LinkGroup]) -> Array | None:
     """The direction (3,) in which the jaws move against each other where they are drawn."""
+    if not groups:
+        return None
     way = groups[-1].path_m - (groups[0].path_m if len(groups) > 1 else 0.0)
     middle = len(way) // 2
     step = way[middle + 1] - way[middle - 1]

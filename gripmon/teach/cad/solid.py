@@ -42,7 +42,7 @@ class Shape:
         """The same in another frame (4, 4)."""
         rotation, translation = to_T_shape[:3, :3], to_T_shape[:3, 3]
         rounds: dict[int, tuple[Array, Array]] = {
-            k: (c @ rotation.T + translation, axis @ rotation.T) for k, (c, axis) in self.round_m.items()
+            k: (centre @ rotation.T + translation, axis @ rotation.T) for k, (centre, axis) in self.round_m.items()
         }
         return replace(
             self,
