@@ -18,7 +18,7 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
 from gripmon.teach.cad.depth import DepthMap, Pinhole
 from gripmon.teach.cad.files import UNITS_M
-from gripmon.teach.cad.frame import AXES, approach_of, axes_of, check_level, frame_of
+from gripmon.teach.cad.frame import AXES, axes_of, check_level, frame_of
 from gripmon.teach.cad.jaw import jaw_of
 from gripmon.teach.cad.outline import outline_shape
 from gripmon.teach.cad.parts import LONGEST_M, STRAIGHT_NOTE, Parts, read_parts
@@ -196,8 +196,7 @@ def _moved(surface: Surface, grip_T_cad: Array) -> Surface:
 def _frame(parts: Parts, approach: str | None) -> tuple[Array, list[str]]:
     """``tip_T_cad`` (4, 4), and notes on it."""
     fingers = list(parts.fingers.values())
-    if parts.linked and approach is None:
-        approach = approach_of(fingers, parts.around, parts.along, parts.pivot)
+    approach = approach or parts.approach
     axes = axes_of(fingers, approach, parts.along, parts.pivot)
     if parts.pivot is None and "," not in (approach or ""):
         check_level(fingers, axes[2])

@@ -22,6 +22,9 @@ SNAP_COSINE = 0.985
 CLEAR = 0.75
 """Of two lengths that decide on an axis, the smaller over the larger: a larger share decides nothing."""
 
+WIDER = 1.5
+"""Cross-section of a finger's front quarter over that of its rear one, above which its tip may be the other end."""
+
 ALIKE = 0.05
 """Largest difference of the sizes of two fingers that count as one shape, or its mirror image."""
 
@@ -40,7 +43,7 @@ def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | Non
     if len(fingers) < 2 and along is None and pivot is None:
         across = np.eye(3)[0 if abs(z[0]) < 0.5 else 1]
         if approach is None:
-            _check_longest(fingers[0], np.stack([across, np.cross(z, across), z]), fingers)
+            _check_out(fingers, _rows(across, z))
         return _rows(across, z)
     apart = _middle(fingers[-1]) - _middle(fingers[0])
     known = along if along is not None else None if pivot is None else np.cross(pivot[1], z)
@@ -64,7 +67,7 @@ def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | Non
         across = -across
     axes = _rows(across, z)
     if approach is None and known is None:
-        _check_longest(fingers[0], axes, fingers)
+        _check_out(fingers, axes)
     return axes
 
 
@@ -76,17 +79,23 @@ def _middle(surface: Surface) -> Array:
     return 0.5 * (surface.points_m.min(axis=0) + surface.points_m.max(axis=0))
 
 
-def _check_longest(finger: Surface, axes: Array, fingers: Sequence[Surface]) -> None:
-    """Nobody said that z points out of the gripper: fingers are longest along it."""
-    size = np.ptp(finger.points_m @ axes.T, axis=0)
-    others = size[1] if len(fingers) > 1 else max(size[0], size[1])
-    if size[2] < CLEAR * others:
-        extent = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(finger.points_m, axis=0))
-        raise InputError(
-            f"is missing: a finger of {extent} mm (x, y, z), which isn't longest along z; the axis of the CAD frame "
-            "out of the gripper, as --approach=+y",
-            "approach",
-        )
+def _check_out(fingers: Sequence[Surface], axes: Array) -> None:
+    """Nobody said that z points out of the gripper: fingers are longest along it and don't widen towards their tips."""
+    for finger in fingers:
+        places = finger.points_m @ axes.T
+        low, size = places.min(axis=0), np.ptp(places, axis=0)
+        share = (places[:, 2] - low[2]) / max(float(size[2]), 1e-9)
+        rear, front = (float(np.prod(np.ptp(places[own], axis=0)[:2])) for own in (share <= 0.25, share >= 0.75))
+        others = size[1] if len(fingers) > 1 else max(size[0], size[1])
+        wrong = "which isn't longest along z" if size[2] < CLEAR * others else ""
+        wrong = wrong or ("which is wider at its upper end in z" if front > WIDER * rear else "")
+        if wrong:
+            extent = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(finger.points_m, axis=0))
+            raise InputError(
+                f"is missing: a finger of {extent} mm (x, y, z), {wrong}; the axis of the CAD frame out of the "
+                "gripper, as --approach=+y",
+                "approach",
+            )
 
 
 def _alike(one: Surface, other: Surface) -> bool:
@@ -105,34 +114,33 @@ def _alike(one: Surface, other: Surface) -> bool:
     return bool((np.abs(a - b) <= ALIKE * a.max()).all())
 
 
-def approach_of(fingers: Sequence[Surface], around: Sequence[Surface], along: Array | None, pivot: Array | None) -> str:
-    """The axis along which the fingers reach farthest from the body that holds them, or from the CAD frame's origin,
-    which in a URDF is at the flange.  ``along`` (3,): the jaws' direction, if it is known.  ``pivot``, place and
-    direction (2, 3): then it is the axis along which what is there, ``around`` included, reaches farthest beyond it.
+def approach_of(moving: Sequence[Surface], still: Sequence[Surface], along: Array | None, pivot: Array | None) -> str:
+    """The axis along which the fingers that move reach farthest from what stands, or from the CAD frame's origin, which
+    in a URDF is at the flange.  ``along`` (3,): the jaws' direction, if it is known.
+
+    Of a single jaw that turns (``pivot``, place and direction (2, 3)) it is the axis along which what stands, the other
+    finger, reaches farthest beyond the pivot.
     """
-    if pivot is not None:
-        places = np.concatenate([s.points_m for s in [*fingers, *around]]) - pivot[0]
-        reach = np.where(places.max(axis=0) > -places.min(axis=0), places.max(axis=0), places.min(axis=0))
-        # What reaches beyond the pivot to the other side of the same axis decides nothing either.
-        size = np.concatenate([places.max(axis=0), -places.min(axis=0)])
-        size[[int(np.abs(pivot[1]).argmax()) + k for k in (0, 3)]] = 0.0
-        reach[int(np.abs(pivot[1]).argmax())] = 0.0
+    held = np.concatenate([s.points_m for s in still]) if still else np.zeros((1, 3))
+    reach = np.mean([_middle(f) for f in moving], axis=0) - 0.5 * (held.min(axis=0) + held.max(axis=0))
+    if pivot is not None and len(moving) == 1 and still:
+        size = np.concatenate([held.max(axis=0) - pivot[0], pivot[0] - held.min(axis=0)])
+        reach = _middle(moving[0]) - pivot[0]
     else:
-        held = np.concatenate([s.points_m for s in around]) if around else np.zeros((1, 3))
-        reach = np.mean([_middle(f) for f in fingers], axis=0) - 0.5 * (held.min(axis=0) + held.max(axis=0))
-        if along is not None:
-            reach[int(np.abs(along).argmax())] = 0.0
-        size = np.abs(reach)
-    found = [("+" if reach[k] > 0.0 else "-") + "xyz"[k] for k in np.argsort(-np.abs(reach)).tolist()]
-    second, largest = np.sort(size)[-2:]
-    if second > CLEAR * largest or not largest > 1e-3:
-        words = ", ".join(f"{1e3 * v:.0f}" for v in reach)
+        size = np.concatenate([reach, -reach])
+    excluded = along if pivot is None else pivot[1]
+    if excluded is not None:
+        k = int(np.abs(excluded).argmax())
+        size[[k, k + 3]] = 0.0
+    first, second = np.argsort(-size)[:2].tolist()
+    names = [sign + axis for sign in "+-" for axis in "xyz"]
+    if size[second] > CLEAR * size[first] or not min(size[first], np.concatenate([reach, -reach])[first]) > 1e-3:
         raise InputError(
-            f"is missing: the fingers reach ({words}) mm from what holds them, which tells no axis; the one out of the "
-            f"gripper, --approach={found[0]} or {found[1]}",
+            "is missing: how far the fingers reach from what holds them tells none; the axis out of the gripper, as "
+            f"--approach={names[first]} or --approach={names[second]}",
             "approach",
         )
-    return found[0]
+    return names[first]
 
 
 def check_level(surfaces: Sequence[Surface], z: Array) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from gripmon.model.records import Array
 from gripmon.teach.cad.files import MESHES, Body, joined, read_cao, read_mesh, separate
 from gripmon.teach.cad.frame import AXES, approach_of
 from gripmon.teach.cad.surface import Surface, surface_of, welded
-from gripmon.teach.cad.urdf import TURNS_RAD, Linkage, LinkGroup, read_urdf
+from gripmon.teach.cad.urdf import STEPS, TURNS_RAD, Linkage, LinkGroup, read_urdf
 
 FORMATS = (*MESHES, ".urdf", ".cao")
 LONGEST_M = 0.3
@@ -34,7 +34,8 @@ STRAIGHT_NOTE = "the fingers move straight along x, half of the opening each; if
 class Parts:
     """The fingers and the bodies ``around`` them, in the CAD frame.  ``paths_m``: for each finger its shifts (s, 3) by
     the joint, empty where none moves them; ``along`` (3,): the direction in which the jaws move, ``pivot`` (2, 3):
-    place and axis about which one turns, None if unknown; ``origins``: for each finger, where it comes from.
+    place and axis about which one turns, ``approach``: the axis out of the gripper, None where unknown; ``origins``:
+    for each finger, where it comes from.
     """
 
     fingers: dict[str, Surface]
@@ -44,7 +45,7 @@ class Parts:
     paths_m: list[Array] = field(default_factory=list)
     along: Array | None = None
     pivot: Array | None = None
-    linked: bool = False
+    approach: str | None = None
 
 
 def read_parts(
@@ -142,38 +143,37 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
     """
     notes = list(linkage.notes)
     straight = [group for group in linkage.moving if group.turns_rad <= TURNS_RAD]
-    still: list[str] = []
-    if body is not None:
-        chosen, still = _chosen(path, linkage, body)
-    else:
-        chosen = straight or linkage.moving
+    chosen, still = (straight or linkage.moving, []) if body is None else _chosen(path, linkage, body)
     if linkage.moves and (turning := [g for g in chosen if g.turns_rad > TURNS_RAD]):
         raise _turning(path, linkage, turning[0])
-    one = chosen[0] if len(chosen) == 1 and body is None else None
-    surfaces = [_checked(surface_of(group.body), group.links[0]) for group in chosen]
     pivot = None if straight else linkage.pivot
     along = _along(chosen if chosen and linkage.moves else straight)
-    if one is not None:
-        still = _beside(path, linkage, surfaces[0], approach, along, pivot)
+    surfaces = [_checked(surface_of(group.body), group.links[0]) for group in chosen]
+    standing = {link: surface_of(each) for link, each in linkage.still.items()}
+    if approach is None:
+        reaching = [surface_of(group.body) for group in straight or linkage.moving]
+        approach = approach_of(reaching, list(standing.values()), along, pivot)
+    if body is None and len(chosen) == 1:
+        still = _beside(path, chosen[0], surfaces[0], standing, AXES[approach.split(",")[0]])
         if not still:
-            notes.append(f"one finger, link {one.links[0]}: no link that stands reaches as far")
-    surfaces += [_checked(surface_of(linkage.still[link]), link) for link in still]
-    names = [", ".join(group.links) for group in chosen] + still
-    hiding = [(group.body.name, group.body) for group in linkage.moving if group not in chosen]
-    turning_names = ", ".join(name for name, _ in hiding)
+            notes.append(f"one finger, link {chosen[0].links[0]}: no link that stands reaches as far")
+    surfaces += [_checked(standing[link], link) for link in still]
+    hiding = [group for group in linkage.moving if group not in chosen]
     if hiding:
-        notes.append(f"these links aren't fingers, they only hide what is behind them: {turning_names}")
-    around = [surface_of(each) for _, each in hiding]
-    around += [surface_of(each) for link, each in linkage.still.items() if link not in still]
-    bodies = [group.body for group in chosen] + [linkage.still[link] for link in still]
-    steps = len(linkage.moving[0].path_m)
-    paths = [group.path_m for group in chosen] + [np.zeros((steps, 3))] * len(still) if linkage.moves else []
-    if linkage.moves and not chosen:
-        paths, notes = [], [*notes, "the fingers stand: what moves isn't in the file"]
+        names = ", ".join(link for group in hiding for link in group.links)
+        notes.append(f"these links aren't fingers, they only hide what is behind them: {names}")
+    around = [surface_of(group.body) for group in hiding] + [standing[link] for link in standing if link not in still]
+    paths = [group.path_m for group in chosen] + [np.zeros((STEPS, 3))] * len(still)
     if not linkage.moves:
         notes.append("the fingers stand as drawn: the file is for this opening; another file for another one")
+    elif not chosen:
+        notes.append("the fingers stand: what moves isn't in the file")
+    if not (linkage.moves and chosen):
+        paths = []
+    bodies = [group.body for group in chosen] + [linkage.still[link] for link in still]
     notes += [f"the CAD frame is that of link '{linkage.base}'", *_odd(surfaces, bodies)]
-    return _named(surfaces, tuple(names), notes, around, paths, along, pivot)
+    origins = tuple([", ".join(group.links) for group in chosen] + still)
+    return replace(_named(surfaces, origins, notes, paths), around=around, approach=approach, along=along, pivot=pivot)
 
 
 def _chosen(path: Path, linkage: Linkage, text: str) -> tuple[list[LinkGroup], list[str]]:
@@ -206,57 +206,36 @@ def _along(groups: Sequence[LinkGroup]) -> Array | None:
     return step / length if length > 1e-9 else None
 
 
-def _beside(
-    path: Path, linkage: Linkage, finger: Surface, approach: str | None, along: Array | None, pivot: Array | None
-) -> list[str]:
+def _beside(path: Path, group: LinkGroup, finger: Surface, standing: dict[str, Surface], z: Array) -> list[str]:
     """The link that stands beside a single finger that moves: one that reaches into its front half."""
-    still = {link: surface_of(each) for link, each in linkage.still.items()}
-    key = approach or approach_of([finger], list(still.values()), along, pivot)
-    z = AXES[key.split(",")[0]]
     ends = finger.points_m @ z
-    reaching = [link for link, each in still.items() if (each.points_m @ z).max() > 0.5 * (ends.min() + ends.max())]
+    reaching = [link for link, each in standing.items() if (each.points_m @ z).max() > 0.5 * (ends.min() + ends.max())]
     if len(reaching) > 1:
-        names = ", ".join(reaching)
         raise InputError(
-            f"is missing: {path}: beside the finger {linkage.moving[0].links[0]} stand the links {names}; the fingers, "
-            f"as --body {linkage.moving[0].links[0]},{reaching[0]}",
+            f"is missing: {path}: beside the finger {group.links[0]} stand the links {', '.join(reaching)}; the fingers,"
+            f" as --body {group.links[0]},{reaching[0]}",
             "body",
         )
     return reaching
 
 
-def _named(
-    surfaces: list[Surface],
-    origins: tuple[str, ...],
-    notes: list[str],
-    around: list[Surface] | None = None,
-    paths_m: Sequence[Array] = (),
-    along: Array | None = None,
-    pivot: Array | None = None,
-) -> Parts:
+def _named(surfaces: list[Surface], origins: tuple[str, ...], notes: list[str], paths_m: Sequence[Array] = ()) -> Parts:
     """The fingers by name: of two, left and right as their own names say, else along the axis of the CAD frame along
     which they are farthest apart.
     """
     middles = np.array([0.5 * (s.points_m.min(axis=0) + s.points_m.max(axis=0)) for s in surfaces])
     order = np.argsort(middles[:, int(np.ptp(middles, axis=0).argmax())], kind="stable").tolist()
-    sides = [("left" in Path(o).name.lower()) - ("right" in Path(o).name.lower()) for o in origins]
+    own = [Path(origin).stem for origin in origins]
+    sides = [("left" in name.lower()) - ("right" in name.lower()) for name in own]
     if sorted(sides) == [-1, 1]:
         order = [sides.index(1), sides.index(-1)]
     count = len(surfaces)
-    given = [Path(o).stem for o in origins]
-    named = {1: ["finger"], 2: ["left", "right"]}.get(count) or [given[k] for k in order]
+    named = {1: ["finger"], 2: ["left", "right"]}.get(count) or [own[k] for k in order]
     if len(set(named)) < count:
         named = [f"finger{k + 1}" for k in range(count)]
-    return Parts(
-        {name: surfaces[k] for name, k in zip(named, order, strict=True)},
-        tuple(origins[k] for k in order),
-        notes,
-        around or [],
-        [paths_m[k] for k in order] if paths_m else [],
-        along,
-        pivot,
-        around is not None,
-    )
+    fingers = {name: surfaces[k] for name, k in zip(named, order, strict=True)}
+    paths = [paths_m[k] for k in order] if paths_m else []
+    return Parts(fingers, tuple(origins[k] for k in order), notes, paths_m=paths)
 
 
 def _checked(surface: Surface, name: str) -> Surface:
