@@ -212,8 +212,8 @@ def _beside(path: Path, group: LinkGroup, finger: Surface, standing: dict[str, S
     reaching = [link for link, each in standing.items() if (each.points_m @ z).max() > 0.5 * (ends.min() + ends.max())]
     if len(reaching) > 1:
         raise InputError(
-            f"is missing: {path}: beside the finger {group.links[0]} stand the links {', '.join(reaching)}; the fingers,"
-            f" as --body {group.links[0]},{reaching[0]}",
+            f"is missing: {path}: beside finger {group.links[0]} stand the links {', '.join(reaching)}; the fingers, "
+            f"as --body {group.links[0]},{reaching[0]}",
             "body",
         )
     return reaching
@@ -226,7 +226,7 @@ def _named(surfaces: list[Surface], origins: tuple[str, ...], notes: list[str], 
     middles = np.array([0.5 * (s.points_m.min(axis=0) + s.points_m.max(axis=0)) for s in surfaces])
     order = np.argsort(middles[:, int(np.ptp(middles, axis=0).argmax())], kind="stable").tolist()
     own = [Path(origin).stem for origin in origins]
-    sides = [("left" in name.lower()) - ("right" in name.lower()) for name in own]
+    sides = [_says(name, "left") - _says(name, "right") for name in own]
     if sorted(sides) == [-1, 1]:
         order = [sides.index(1), sides.index(-1)]
     count = len(surfaces)
@@ -236,6 +236,10 @@ def _named(surfaces: list[Surface], origins: tuple[str, ...], notes: list[str], 
     fingers = {name: surfaces[k] for name, k in zip(named, order, strict=True)}
     paths = [paths_m[k] for k in order] if paths_m else []
     return Parts(fingers, tuple(origins[k] for k in order), notes, paths_m=paths)
+
+
+def _says(name: str, side: str) -> bool:
+    return side in name.lower() or name.lower().startswith(f"{side[0]}_")
 
 
 def _checked(surface: Surface, name: str) -> Surface:
