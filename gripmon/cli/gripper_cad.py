@@ -74,14 +74,14 @@ def _bevel(text: str) -> float:
     bevel=_bevel,
 )  # fmt: skip
 def from_cad(arguments: Arguments) -> None:
-    """Make a gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one with
-    both, or one URDF.  Meshes need --unit; URDF and .cao are in metres.
+    """Make a gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY, DAE) or ViSP .cao for each finger, one
+    with both, or one URDF.  Meshes need --unit; URDF, DAE and .cao have theirs.
 
-    The origin is the TCP, the middle of the four innermost fingertip corners: x across the jaws, z along
-    --approach, an axis of the CAD frame.  --frame cad keeps the CAD's axes.
+    The origin is the TCP, the middle of the four innermost fingertip corners: x across the jaws, from the
+    finger called left to the right one, z along --approach.  --frame cad keeps the CAD's axes.
 
-    The jaws' motion comes from the URDF's joint; for meshes, both fingers move by half of an opening in
-    --jaw-range.
+    The jaws' motion comes from the URDF's joint; for meshes, both fingers move straight by half of an opening
+    in --jaw-range.  What a URDF or a mesh of several bodies doesn't tell is asked for, with the option.
 
     Real edges are broken, by 0.1 to 0.3 mm if the drawing leaves it open (ISO 13715); CAD draws them sharp.
     --bevel states the width.  The default makes the bounds of an untaught gripper so wide that hardly any
