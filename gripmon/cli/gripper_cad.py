@@ -29,7 +29,7 @@ FILE...                 .stl, .obj, .ply, .dae, .cao: one per finger, or both in
 --length M              use only this length of the fingers, from the tips (m)
 --jaw-range MIN:MAX     range of the jaw opening (m); for a URDF: only this part of its joint's
 --jaw-opening M         reported opening of the jaws as drawn (default: the tips' distance, m)
---joint NAME[=POSITION] for a URDF: the joint that opens the jaws, if several are possible, or where it stands (m or
+--joint NAME[=POS]      for a URDF: the joint that opens the jaws, if several are possible, or where it stands (m or
                         rad); two of them with a comma
 --bevel M               width of the bevels on real edges that are sharp in the CAD (default: 0.0002 m); 0: the edges
                         are known to be sharp to 0.02 mm

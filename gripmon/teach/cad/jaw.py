@@ -66,7 +66,7 @@ def jaw_of(
             f"belongs to two fingers, and the files hold {len(fingers)}; give the meshes of both", "jaw_range_m"
         )
     low, high = jaw_range_m
-    nominal = round(_apart_m(*fingers.values()) if jaw_opening_m is None else jaw_opening_m, 7)
+    nominal = round(max(_gap_m(*fingers.values()), 0.0) if jaw_opening_m is None else jaw_opening_m, 7)
     if not low <= nominal <= high:
         raise InputError(
             f"{low:g}:{high:g} m: the fingers stand {nominal:g} m apart; a range that holds this, or --jaw-opening "
@@ -80,13 +80,8 @@ def jaw_of(
     return Jaw(JawModel(nominal_m=nominal, min_m=low, max_m=high), opening, ways)
 
 
-def _apart_m(left: Surface, right: Surface) -> float:
-    """Distance of the tips' inner sides along x, over the foremost tenth of the fingers."""
-    return max(_gap_m(left, right), 0.0)
-
-
 def _gap_m(left: Surface, right: Surface) -> float:
-    """The same, negative where they overlap."""
+    """Distance of the tips' inner sides along x, over the foremost tenth of the fingers; negative where they overlap."""
     inner = []
     for surface, best in ((left, np.max), (right, np.min)):
         z = surface.points_m[:, 2]

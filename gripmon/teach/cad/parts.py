@@ -14,8 +14,8 @@ from gripmon.model.progress import Progress
 from gripmon.model.records import Array
 from gripmon.teach.cad.files import MESHES, Body, joined, read_cao, read_mesh, separate
 from gripmon.teach.cad.frame import AXES, approach_of
+from gripmon.teach.cad.linkage import STEPS, TURNS_RAD, Linkage, LinkGroup, read_urdf
 from gripmon.teach.cad.surface import Surface, surface_of, welded
-from gripmon.teach.cad.urdf import STEPS, TURNS_RAD, Linkage, LinkGroup, read_urdf
 
 FORMATS = (*MESHES, ".urdf", ".cao")
 LONGEST_M = 0.3
