@@ -81,7 +81,7 @@ def jaw_of(
 
 
 def _gap_m(left: Surface, right: Surface) -> float:
-    """Distance of the tips' inner sides along x, over the foremost tenth of the fingers; negative where they overlap."""
+    """Distance of the tips' inner sides along x, over the foremost tenth of the fingers; negative if they overlap."""
     inner = []
     for surface, best in ((left, np.max), (right, np.min)):
         z = surface.points_m[:, 2]

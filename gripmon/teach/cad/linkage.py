@@ -5,7 +5,7 @@ The joints are settled before any mesh is read, and only what the gripper's own 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +106,9 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
         moving.append(
             LinkGroup(tuple(names), body, way[:, :3, 3] - drawn[names[0]][:3, 3], float(turned.magnitude().max()))
         )
+    left = [j.name for j in _free(urdf) if urdf.base_of(j.parent) in drawn and j.name not in swept.values(0.0)]
+    if left:
+        drive = replace(drive, notes=(*drive.notes, f"joints that nothing moves stand at 0: {', '.join(left)}"))
     if not moving:
         raise urdf.refuse(f"joint '{first.name}'", "moves no link that has a geometry; the joint of the jaws")
     pivot = None
@@ -124,9 +127,14 @@ def _carried(urdf: Urdf, base: str, joint: Joint) -> Array:
     return transform
 
 
+def _free(urdf: Urdf) -> list[Joint]:
+    """The joints that move by themselves, and something with a geometry."""
+    return [j for j in urdf.joints if j.kind != "fixed" and j.mimic is None and urdf.moved_by(j)]
+
+
 def _driving(urdf: Urdf, text: str | None) -> Drive:
     """What opens the jaws: what ``--joint`` names, and with it its twin."""
-    free = {j.name: j for j in urdf.joints if j.kind != "fixed" and j.mimic is None and urdf.moved_by(j)}
+    free = {j.name: j for j in _free(urdf)}
     if text is None:
         if not free:
             right = "prismatic or revolute joints, or its meshes by themselves"
