@@ -45,7 +45,7 @@ def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | Non
         if approach is None:
             _check_out(fingers, _rows(across, z))
         return _rows(across, z)
-    apart = _middle(fingers[-1]) - _middle(fingers[0])
+    apart = _middle(fingers[-1].points_m) - _middle(fingers[0].points_m)
     known = along if along is not None else None if pivot is None else np.cross(pivot[1], z)
     across = apart if known is None else known
     across = across - (across @ z) * z
@@ -75,8 +75,8 @@ def _rows(x: Array, z: Array) -> Array:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _middle(surface: Surface) -> Array:
-    return 0.5 * (surface.points_m.min(axis=0) + surface.points_m.max(axis=0))
+def _middle(points_m: Array) -> Array:
+    return np.asarray(0.5 * (points_m.min(axis=0) + points_m.max(axis=0)))
 
 
 def _check_out(fingers: Sequence[Surface], axes: Array) -> None:
@@ -114,14 +114,14 @@ def _alike(one: Surface, other: Surface) -> bool:
     return bool((np.abs(a - b) <= ALIKE * a.max()).all())
 
 
-def approach_of(moving: Sequence[Surface], still: Sequence[Surface], along: Array | None, pivot: Array | None) -> str:
-    """The axis along which the fingers that move reach farthest from what stands, or from the CAD frame's origin, which
-    in a URDF is at the flange.  ``along`` (3,): the jaws' direction, if it is known.
+def approach_of(moving: Sequence[Array], still: Sequence[Array], along: Array | None, pivot: Array | None) -> str:
+    """The axis along which the fingers that move reach farthest from what stands (points (n, 3) of each), or from the
+    CAD frame's origin, which in a URDF is at the flange.  ``along`` (3,): the jaws' direction, if it is known.
 
     Of a single jaw that turns (``pivot``, place and direction (2, 3)) it is the axis along which what stands, the other
     finger, reaches farthest beyond the pivot.
     """
-    held = np.concatenate([s.points_m for s in still]) if still else np.zeros((1, 3))
+    held = np.concatenate(still) if still else np.zeros((1, 3))
     reach = np.mean([_middle(f) for f in moving], axis=0) - 0.5 * (held.min(axis=0) + held.max(axis=0))
     if pivot is not None and len(moving) == 1 and still:
         size = np.concatenate([held.max(axis=0) - pivot[0], pivot[0] - held.min(axis=0)])
@@ -203,7 +203,7 @@ def frame_of(fingers: Sequence[Surface], grip_R_cad: Array) -> tuple[Array, list
     if len(fingers) == 1:
         tips = [inner_tip(fingers[0], grip_R_cad, 0.0)]
     else:
-        x = [float((_middle(f) @ grip_R_cad.T)[0]) for f in fingers]
+        x = [float((_middle(f.points_m) @ grip_R_cad.T)[0]) for f in fingers]
         middle = 0.5 * (min(x) + max(x))
         tips = [inner_tip(f, grip_R_cad, 1.0 if own < middle else -1.0) for f, own in zip(fingers, x, strict=True)]
     tcp = np.mean([place for place, _ in tips], axis=0)

@@ -149,20 +149,19 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
     pivot = None if straight else linkage.pivot
     along = _along(chosen if chosen and linkage.moves else straight)
     surfaces = [_checked(surface_of(group.body), group.links[0]) for group in chosen]
-    standing = {link: surface_of(each) for link, each in linkage.still.items()}
     if approach is None:
-        reaching = [surface_of(group.body) for group in straight or linkage.moving]
-        approach = approach_of(reaching, list(standing.values()), along, pivot)
+        reaching = [group.body.points_m for group in straight or linkage.moving]
+        approach = approach_of(reaching, [each.points_m for each in linkage.still.values()], along, pivot)
     if body is None and len(chosen) == 1:
-        still = _beside(path, chosen[0], surfaces[0], standing, AXES[approach.split(",")[0]])
+        still = _beside(path, linkage, chosen[0], AXES[approach.split(",")[0]])
         if not still:
             notes.append(f"one finger, link {chosen[0].links[0]}: no link that stands reaches as far")
-    surfaces += [_checked(standing[link], link) for link in still]
+    surfaces += [_checked(surface_of(linkage.still[link]), link) for link in still]
     hiding = [group for group in linkage.moving if group not in chosen]
     if hiding:
         names = ", ".join(link for group in hiding for link in group.links)
         notes.append(f"these links aren't fingers, they only hide what is behind them: {names}")
-    around = [surface_of(group.body) for group in hiding] + [standing[link] for link in standing if link not in still]
+    around = [group.body for group in hiding] + [each for link, each in linkage.still.items() if link not in still]
     paths = [group.path_m for group in chosen] + [np.zeros((STEPS, 3))] * len(still)
     if not linkage.moves:
         notes.append("the fingers stand as drawn: the file is for this opening; another file for another one")
@@ -173,7 +172,13 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
     bodies = [group.body for group in chosen] + [linkage.still[link] for link in still]
     notes += [f"the CAD frame is that of link '{linkage.base}'", *_odd(surfaces, bodies)]
     origins = tuple([", ".join(group.links) for group in chosen] + still)
-    return replace(_named(surfaces, origins, notes, paths), around=around, approach=approach, along=along, pivot=pivot)
+    return replace(
+        _named(surfaces, origins, notes, paths),
+        around=[surface_of(each) for each in around],
+        approach=approach,
+        along=along,
+        pivot=pivot,
+    )
 
 
 def _chosen(path: Path, linkage: Linkage, text: str) -> tuple[list[LinkGroup], list[str]]:
@@ -206,10 +211,11 @@ def _along(groups: Sequence[LinkGroup]) -> Array | None:
     return step / length if length > 1e-9 else None
 
 
-def _beside(path: Path, group: LinkGroup, finger: Surface, standing: dict[str, Surface], z: Array) -> list[str]:
+def _beside(path: Path, linkage: Linkage, group: LinkGroup, z: Array) -> list[str]:
     """The link that stands beside a single finger that moves: one that reaches into its front half."""
-    ends = finger.points_m @ z
-    reaching = [link for link, each in standing.items() if (each.points_m @ z).max() > 0.5 * (ends.min() + ends.max())]
+    ends = group.body.points_m @ z
+    middle = 0.5 * (ends.min() + ends.max())
+    reaching = [link for link, each in linkage.still.items() if (each.points_m @ z).max() > middle]
     if len(reaching) > 1:
         raise InputError(
             f"is missing: {path}: beside finger {group.links[0]} stand the links {', '.join(reaching)}; the fingers, "
@@ -225,7 +231,7 @@ def _named(surfaces: list[Surface], origins: tuple[str, ...], notes: list[str], 
     """
     middles = np.array([0.5 * (s.points_m.min(axis=0) + s.points_m.max(axis=0)) for s in surfaces])
     order = np.argsort(middles[:, int(np.ptp(middles, axis=0).argmax())], kind="stable").tolist()
-    own = [Path(origin).stem for origin in origins]
+    own = [Path(origin.split(", ")[0]).stem for origin in origins]
     sides = [_says(name, "left") - _says(name, "right") for name in own]
     if sorted(sides) == [-1, 1]:
         order = [sides.index(1), sides.index(-1)]
