@@ -116,6 +116,33 @@ def test_an_arm_asks_for_the_joint_at_once_and_isnt_read(tmp_path: Path):
     np.testing.assert_allclose(made.grip_T_cad[:3, :3], np.eye(3), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('mimic joint="a"', 'mimic joint="c"', "joint 'b': follows 'c'; a joint that follows no other"),
+        ('<child link="left"/>', "", "joint 'a': has no parent or no child; a link each"),
+        ('"prismatic"', '"planar"', "joint 'a': is of type 'planar'; fixed, prismatic"),
+        ('upper="-0.002"', 'upper="-0.060"', "joint 'a': moves from -0.05 to -0.06; limit lower < upper"),
+    ],
+)
+def test_a_urdf_with_a_wrong_joint_is_refused(tmp_path: Path, old: str, new: str, said: str):
+    path = parallel(tmp_path, "mimic")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=re.escape(said)):
+        gripper_from_cad([path])
+
+
+def test_given_axes_that_contradict_the_jaws_are_refused(tmp_path: Path):
+    path = parallel(tmp_path)
+    for axes, said in (
+        ("+x", "the jaws move along it"),
+        ("+z,+y", "the jaws don't move along +y"),
+        ("+z,-x", "points from the right finger to the left one"),
+    ):
+        with pytest.raises(InputError, match=re.escape(f"approach: {axes}: {said}" if "," in axes else said)):
+            gripper_from_cad([path], approach=axes)
+
+
 def test_one_jaw_that_slides_towards_a_finger_that_stands(tmp_path: Path):
     made = gripper_from_cad([write(tmp_path, BASE, JAWS, LEFT, joint("f", "fixed", "base right", "1 0 0", "0 0"))])
     assert made.origins == ("left", "right")

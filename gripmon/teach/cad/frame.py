@@ -39,7 +39,12 @@ def axes_of(fingers: Sequence[Surface], approach: str | None, along: Array | Non
     first, *second = (approach or "+z").split(",")
     z = AXES[first]
     if second:
-        return _rows(AXES[second[0]], z)
+        x = AXES[second[0]]
+        if along is not None and abs(along @ x) < SNAP_COSINE:
+            raise InputError(f"{approach}: the jaws don't move along {second[0]}; the axis across them", "approach")
+        if len(fingers) > 1 and (_middle(fingers[-1].points_m) - _middle(fingers[0].points_m)) @ x <= 0.0:
+            raise InputError(f"{approach}: points from the right finger to the left one; the other way", "approach")
+        return _rows(x, z)
     if len(fingers) < 2 and along is None and pivot is None:
         across = np.eye(3)[0 if abs(z[0]) < 0.5 else 1]
         if approach is None:

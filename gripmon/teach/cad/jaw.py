@@ -113,7 +113,7 @@ def _linked(
     if low < -OVERLAP_M and range_m is None:
         raise InputError(
             f"closes the jaws {-1e3 * low:.1f} mm into each other; limits of the joint that the fingers have, or "
-            f"--jaw-range 0:{high:.4f}",
+            f"--jaw-range 0:{max(high, 0.0):.4f}",
             "joint",
         )
     if range_m is None:

@@ -70,6 +70,10 @@ class Urdf:
         self._links = {link.get("name", "?"): link for link in root.findall("link")}
         self.joints = [self._joint(part) for part in root.findall("joint")]
         self._holding = {joint.child: joint for joint in self.joints}
+        leading = {joint.name for joint in self.joints if joint.mimic is None}
+        for joint in self.joints:
+            if joint.mimic is not None and joint.mimic[0] not in leading:
+                raise self.refuse(f"joint '{joint.name}'", f"follows '{joint.mimic[0]}'; a joint that follows no other")
         self.shown = [n for n, link in self._links.items() if link.findall("visual") or link.findall("collision")]
         if not self.shown:
             raise InputError(f"{path}: no link has a geometry; visual meshes or boxes")
@@ -128,6 +132,8 @@ class Urdf:
         if kind not in ("fixed", "prismatic", "revolute", "continuous"):
             raise self.refuse(where, f"is of type '{kind}'; fixed, prismatic, revolute or continuous")
         parent, child = (str(end.get("link")) if (end := part.find(k)) is not None else "" for k in ("parent", "child"))
+        if not (parent and child):
+            raise self.refuse(where, "has no parent or no child; a link each")
         axis = self.numbers(part.find("axis"), "xyz", "1 0 0", where)
         if kind != "fixed" and not np.linalg.norm(axis) > 0.0:
             raise self.refuse(where, "has an axis without direction; a unit vector")
