@@ -17,6 +17,7 @@ from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import InputError
 from gripmon.teach.cad import CadGripper, gripper_from_cad
+from tools.benchmarks.meshes import rounded_fingers, write_meshes
 
 CASES = Path(__file__).resolve().parents[2] / "shared" / "findings" / "2026-11-27" / "public_cases"
 VIEW = {"camera": make_camera(PAPER_LENS), "cam_T_grip": nominal_cam_T_grip()}
@@ -298,6 +299,19 @@ def test_the_cads_own_frame_keeps_its_axes_cut_and_moving(tmp_path: Path):
         points = made.gripper.points_grip_m(opening_m)[made.gripper.point_finger == 1]
         np.testing.assert_allclose(points.min(axis=0), [-0.003, 0.0, opening_m / 2], atol=1e-6)
         np.testing.assert_allclose(points.max(axis=0), [0.013, 0.03, opening_m / 2 + 0.01], atol=1e-6)
+
+
+def test_a_view_of_the_cads_frame_shows_what_that_of_the_tips_shows(tmp_path: Path):
+    paths = write_meshes([m.apply_translation([0.1, 0.2, 0.3]) for m in rounded_fingers(0.004)], tmp_path)
+    stated = {"unit": "mm", "length_m": 0.035, "jaw_range_m": (0.0, 0.06)}
+    tips = gripper_from_cad(paths, **stated, **VIEW)
+    pose = VIEW["cam_T_grip"] @ tips.grip_T_cad
+    cad = gripper_from_cad(paths, frame="cad", camera=VIEW["camera"], cam_T_grip=pose, **stated)
+    assert cad.model.fingers == tips.model.fingers and list(cad.model.points) == list(tips.model.points)
+    for eye in ([0.0, -0.06, -0.1], [0.01, -0.05, -0.11]):
+        seen = [made.gripper.points_grip_m(0.02, grip_T_cad[:3, :3].T @ (np.array(eye) - grip_T_cad[:3, 3]))
+                for made, grip_T_cad in ((tips, np.eye(4)), (cad, tips.grip_T_cad))]  # fmt: skip
+        np.testing.assert_allclose(seen[1] @ tips.grip_T_cad[:3, :3].T + tips.grip_T_cad[:3, 3], seen[0], atol=2e-6)
 
 
 # --- COLLADA ---

@@ -106,7 +106,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
         moving.append(
             LinkGroup(tuple(names), body, way[:, :3, 3] - drawn[names[0]][:3, 3], float(turned.magnitude().max()))
         )
-    left = [j.name for j in _free(urdf) if urdf.base_of(j.parent) in drawn and j.name not in swept.values(0.0)]
+    left = [j.name for j in _free(urdf) if base in urdf.up(j.parent) and j.name not in swept.values(0.0)]
     if left:
         drive = replace(drive, notes=(*drive.notes, f"joints that nothing moves stand at 0: {', '.join(left)}"))
     if not moving:

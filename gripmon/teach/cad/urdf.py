@@ -92,19 +92,19 @@ class Urdf:
     def moved_by(self, joint: Joint) -> list[str]:
         """The links with a geometry that a joint moves, and those that follow it."""
         ends = {joint.child, *(j.child for j in self.joints if j.mimic and j.mimic[0] == joint.name)}
-        return [name for name in self.shown if ends & set(self._up(name))]
+        return [name for name in self.shown if ends & set(self.up(name))]
 
     def placed(self, base: str, values: dict[str, float]) -> dict[str, Array]:
         """``base_T_link`` of every link with a geometry that ``base`` carries, the joints at ``values``."""
         out = {}
         for name in self.shown:
-            way = self._up(name)
+            way = self.up(name)
             if base in way:
                 carried = [self._holding[link].placed(values) for link in way[: way.index(base)]]
                 out[name] = np.linalg.multi_dot([np.eye(4), *reversed(carried), np.eye(4)])
         return out
 
-    def _up(self, link: str) -> list[str]:
+    def up(self, link: str) -> list[str]:
         """The link, its parent, and so on."""
         way = [link]
         while (joint := self._holding.get(way[-1])) is not None and joint.parent not in way:
