@@ -1,0 +1,86 @@
+"""How grey levels follow the light, as images show it, and what it means for a measurement when nobody knows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from support.changing_backgrounds import images_of, moving_robot
+
+from gripmon.model.errors import InputError
+from gripmon.model.response import UNKNOWN_SIGMA_PX, find_response, in_light, likely_linear, response_of
+from gripmon.simulate.disturbance import srgb_dn
+from gripmon.simulate.scenario import Sensor
+from gripmon.track.edges import MeasurementSettings
+from gripmon.track.edges.settings import EdgeSettings
+
+TEACH = Path(__file__).resolve().parents[2] / "shared" / "data" / "mesh_aloha" / "teach"
+GAMMA = {"linear": 1.0, "srgb": 2.2}
+
+
+def test_light_is_what_srgb_encodes():
+    light = np.linspace(0.0, 255.0, 1001, dtype=np.float32)
+    encoded = srgb_dn(light)[None]
+    np.testing.assert_allclose(in_light(encoded / 255.0, "srgb")[0], light / 255.0, atol=2e-6)
+    eight = np.rint(encoded).astype(np.uint8)
+    assert np.abs(in_light(eight, "srgb")[0] / 65535.0 - light / 255.0).max() < 0.5 * 2.4 / 255.0
+    assert in_light(eight, "linear") is eight and in_light(eight, "unknown") is eight
+
+
+@pytest.mark.parametrize("response", ["linear", "srgb"])
+@pytest.mark.parametrize(("kind", "seed"), [("chequer", 305), ("stripes", 304), ("blobs", 301)])
+def test_borders_before_changing_backgrounds_show_the_response(kind: str, seed: int, response: str):
+    sensor = Sensor(response=response)  # type: ignore[arg-type]
+    seen = find_response(images_of(moving_robot(seed, kind, sensor=sensor), 12))
+    assert seen.response == response and seen.low < seen.gamma < seen.high
+    assert seen.gamma == pytest.approx(GAMMA[response], abs=0.4)
+
+
+@pytest.mark.skipif(not TEACH.is_dir(), reason="../shared/data/mesh_aloha is not there")
+@pytest.mark.parametrize("numbers", [range(12), range(12, 24), range(5), range(24)], ids=str)
+def test_pictures_by_another_ray_caster_tell_theirs(numbers: range):
+    """sRGB in colour; and the same made linear, in 16 bits."""
+    images = [cv2.imread(str(TEACH / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED) for k in numbers]
+    openings_m = [0.055 if k < 12 else 0.035 for k in numbers]
+    for response in ("srgb", "linear"):
+        seen = find_response(images, openings_m)
+        assert seen.response == response and seen.gamma == pytest.approx(GAMMA[response], abs=0.35)
+        images = [in_light(image, "srgb") for image in images]
+
+
+def test_what_does_not_tell_is_unknown_of_colour_cameras_and_linear_of_others():
+    images = images_of(moving_robot(301, "blobs"), 3)
+    assert find_response(images).response == "linear"
+    coloured = [np.dstack([image // 2, image, image]) for image in images]
+    assert likely_linear(images) and not likely_linear(coloured)
+    seen = find_response(coloured)
+    assert seen.response == "unknown" and "3 images" in seen.text() and f"{UNKNOWN_SIGMA_PX:g} px" in seen.text()
+    # One picture again and again, with other noise: nothing changes behind the gripper.
+    rng = np.random.default_rng(0)
+    again = [np.clip(coloured[0] + rng.normal(0.0, 2.0, coloured[0].shape), 0, 255).astype(np.uint8) for _ in range(6)]
+    assert find_response(again).response == "unknown"
+    assert response_of(coloured, "srgb").response == "srgb"
+    with pytest.raises(InputError, match="response: 'gamma' is no response; auto, linear or srgb"):
+        response_of(coloured, "gamma")
+
+
+def test_play_of_the_mount_is_not_taken_for_a_response():
+    """A pixel to either side, as real mounts have."""
+    rng = np.random.default_rng(3)
+    images = images_of(moving_robot(305, "chequer", sensor=Sensor(response="srgb")), 12)
+    shifts = rng.uniform(-1.0, 1.0, (12, 2))
+    moved = [
+        cv2.warpAffine(image, np.array([[1.0, 0.0, u], [0.0, 1.0, v]]), image.shape[::-1], flags=cv2.INTER_CUBIC)
+        for image, (u, v) in zip(images, shifts, strict=True)
+    ]
+    assert find_response(moved).response == "srgb"
+
+
+def test_an_unknown_response_is_in_the_standard_deviation_of_every_edge():
+    settings = MeasurementSettings()
+    assert settings.with_response is settings
+    unknown = msgspec.structs.replace(settings, edges=EdgeSettings(response="unknown")).with_response
+    assert unknown.consensus.edge_floor_px == pytest.approx(np.hypot(0.02, UNKNOWN_SIGMA_PX))
