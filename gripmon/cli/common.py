@@ -29,6 +29,10 @@ NETWORK_OPTIONS = f"""
 """
 """Options of the commands that join the network as a client; the placeholder says whose endpoint it is."""
 
+RESPONSE_OPTION = """
+--response          how grey levels follow the light: linear, srgb, or auto, as the images show it (default: auto)
+"""
+RESPONSE = {"choices": ("auto", "linear", "srgb"), "default": "auto"}
 _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")

@@ -8,7 +8,17 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory, positive_number
+from gripmon.cli.common import (
+    PAGE_PORT,
+    PORT_OPTIONS,
+    RESPONSE,
+    RESPONSE_OPTION,
+    Arguments,
+    Command,
+    announcer,
+    make_directory,
+    positive_number,
+)
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import image_paths
 
@@ -21,7 +31,7 @@ if TYPE_CHECKING:
     from gripmon.teach.session import TeachSession
     from gripmon.track.edges.taught import TaughtEdge
 
-_OPTIONS = """
+_OPTIONS = f"""
 [IMAGE...]          image file at the reference calibration, or a folder of them
 --config CONFIG     configuration (YAML); its source section is not used
 --out FILE          file to write (default: the configuration's `taught`, else taught.yaml beside it); with --page or
@@ -29,6 +39,7 @@ _OPTIONS = """
 --jaw-opening M     jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's
                     nominal opening if that is absent, else from a timestamps.csv beside each image
 --picture FILE.png  also draw the first image with the taught edges, offsets enlarged
+{RESPONSE_OPTION.strip()}
 --force             replace an existing file
 --into-config       also add the line `taught:` to the configuration
 """
@@ -81,7 +92,7 @@ def _key(text: str) -> str:
 @Command(
     "teach", "measure how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
-    camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT,
+    camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT, response=RESPONSE,
 )  # fmt: skip
 def teach(arguments: Arguments) -> None:
     """Measure where each edge of the gripper really appears, in images taken at the reference calibration,
@@ -117,11 +128,13 @@ def teach(arguments: Arguments) -> None:
         wrong = f"{config.path} names {config.taught_path} already; without it, or without --out"
         raise InputError(f"--into-config: {wrong}")
     arguments.check_outputs("out", "picture")
-    taught = teach(config, arguments.image, jaw_opening_m=arguments.jaw_opening, command=command)
+    given = {"jaw_opening_m": arguments.jaw_opening, "response": arguments.response}
+    taught = teach(config, arguments.image, **given, command=command)
     arguments.save("out", taught.text().encode())
     if arguments.into_config:
         config = name_taught(config, out)
-    print("\n".join([*_summary(config, taught.taught), *_kept_lines(taught), *_written(config, out)]))
+    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(taught)]
+    print("\n".join([*lines, *_written(config, out)]))
     arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
@@ -191,14 +204,14 @@ def _teach_by_hand(arguments: Arguments) -> None:
     inputs = read_inputs(
         images, command=arguments.command_line(), **files, live=arguments.live, source=arguments.source,
         jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
-        robot=arguments.robot, camera_name=arguments.camera_name,
+        robot=arguments.robot, camera_name=arguments.camera_name, response=arguments.response,
     )  # fmt: skip
     make_directory(inputs.folder)
     if arguments.page:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
-    print("\n".join(in_words(found)))
+    print("\n".join([*in_words(found), *(inputs.response.notes if inputs.response is not None else ())]))
     saved = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")

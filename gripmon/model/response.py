@@ -14,6 +14,7 @@ count as far as they move borders, which is what a measurement has to know.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -62,10 +63,20 @@ class ResponseSeen:
     """
 
     response: Response
-    gamma: float
-    low: float
-    high: float
     why: str
+    gamma: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def sigma_px(self) -> float:
+        """What not knowing it adds to an edge's standard deviation (px)."""
+        return UNKNOWN_SIGMA_PX if self.response == "unknown" else 0.0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """:meth:`text`, where it isn't what everybody takes for granted."""
+        return () if self.response == "linear" and not self.gamma > 0.0 else (self.text(),)
 
     def text(self) -> str:
         """One line for a person."""
@@ -110,7 +121,7 @@ def response_of(
         return find_response(images, openings_m)
     if asked not in ("linear", "srgb", "unknown"):
         raise InputError(f"'{asked}' is no response; auto, linear or srgb", "response")
-    return ResponseSeen(asked, np.nan, np.nan, np.nan, "as given")  # type: ignore[arg-type]
+    return ResponseSeen(asked, "as given")  # type: ignore[arg-type]
 
 
 def in_light(image: Image, response: Response) -> Image:
@@ -141,9 +152,9 @@ def find_response(images: Sequence[Image], openings_m: Sequence[float | None] | 
     seen = f"borders before different backgrounds show gamma {gamma:.1f}, {low:.1f} to {high:.1f} (95 %)"
     sound = _GAMMAS[1] <= gamma <= _GAMMAS[-2]
     if sound and high < BETWEEN_GAMMAS:
-        return ResponseSeen("linear", gamma, low, high, seen)
+        return ResponseSeen("linear", seen, gamma, low, high)
     if sound and low > BETWEEN_GAMMAS:
-        return ResponseSeen("srgb", gamma, low, high, seen)
+        return ResponseSeen("srgb", seen, gamma, low, high)
     return _untold(images, f"{seen}: neither linear nor sRGB for sure", gamma, low, high)
 
 
@@ -160,8 +171,8 @@ def _untold(
     images: Sequence[Image], why: str, gamma: float = np.nan, low: float = np.nan, high: float = np.nan
 ) -> ResponseSeen:
     if likely_linear(images) and not low > 1.0:
-        return ResponseSeen("linear", gamma, low, high, f"{why}; linear is assumed of images without colour")
-    return ResponseSeen("unknown", gamma, low, high, why)
+        return ResponseSeen("linear", f"{why}; linear is assumed of images without colour", gamma, low, high)
+    return ResponseSeen("unknown", why, gamma, low, high)
 
 
 def _levels(image: Image) -> NDArray[np.float32]:
@@ -175,7 +186,7 @@ def _borders(grey: Sequence[NDArray[np.float32]]) -> _Borders:
     import cv2
 
     steep = []
-    xx, xy, yy = (np.zeros_like(grey[0]) for _ in range(3))
+    xx, xy, yy = np.zeros((3, *grey[0].shape))
     for image in grey:
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
         dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, *order) / np.float32(8.0) for order in ((1, 0), (0, 1)))
