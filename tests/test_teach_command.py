@@ -232,7 +232,7 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
         ("alone.png", 2, "its jaw opening isn't known (jaw.source is frames); --jaw-opening M, or"),
         ("alone.png --jaw-opening 0.9", 2, "alone.png: jaw opening 0.9 m; the gripper's 0 to 0.06 m"),
         ("alone.png --jaw-opening 0.0605", 2, "jaw opening 0.0605 m; the gripper's 0 to 0.06 m"),
-        ("grey.png --jaw-opening 0.034", 3, "teach: the gripper isn't found: only 0 % of the outlines"),
+        ("grey.png --jaw-opening 0.034", 3, "teach: the gripper isn't found: only 0 % of the straight outlines"),
         ("alone.png --jaw-opening 0.0347", 3, "the image shows a jaw opening of 0.03"),
         ("alone.png --jaw-opening 0.034 --out first", 2, "--out {folder}/first: is a folder; a file"),
         ("alone.png --jaw-opening 0.034 --picture x.tiff", 2, "has no known ending"),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, positive_number, progress_bar
+from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, length, progress_bar
 
 _OPTIONS = f"""
 IMAGE...                image file, or folder with images
@@ -35,25 +33,9 @@ exit codes: 0 written; 2 wrong usage or files; 3 no gripper found in the images,
 nothing is written then"""
 
 
-def _length(text: str) -> tuple[float, float]:
-    value, colon, sigma = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
-        )
-    found = positive_number(value), positive_number(sigma)
-    if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
-    if found[1] > 0.5 * found[0]:
-        raise argparse.ArgumentTypeError(
-            f"'{text}': the standard deviation is more than half of the length; a smaller one"
-        )
-    return found
-
-
 @Command(
-    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=_length,
-    finger_width=_length, name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
+    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
+    finger_width=length, name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
     """Measure a gripper's outline, inner edges and pose in ten to a hundred images of the wrist camera: the

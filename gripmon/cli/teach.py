@@ -16,6 +16,7 @@ from gripmon.cli.common import (
     Arguments,
     Command,
     announcer,
+    length,
     make_directory,
     positive_number,
 )
@@ -46,7 +47,9 @@ _OPTIONS = f"""
 
 _BY_HAND = f"""
 --page              teach on a local web page
---corners FILE      without a page: rough corners, `corners: {{name: [u, v], …}}`
+--corners FILE      without a page: rough corners in the first image, `corners: {{name: [u, v], …}}`; three or more
+--distance M:SIGMA  without --reference: rough distance of the fingertips along the camera's axis, with its standard
+                    deviation (m)
 --live DEVICE       with --page: a camera instead of images, as in source.device
 --live-wait S       give up if the camera has sent no image for this long (s); default: never, the page reports the
                     fault
@@ -78,7 +81,9 @@ a new robot, without any configuration: drag corners onto the fingertips, on a p
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 no model from these images, with
 the reason: nothing is written then"""
 
-_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source")
+_NEED_CORNERS = (
+    "camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source", "distance",
+)  # fmt: skip
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
 
 
@@ -93,6 +98,7 @@ def _key(text: str) -> str:
     "teach", "measure how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
     camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT, response=RESPONSE,
+    distance=length,
 )  # fmt: skip
 def teach(arguments: Arguments) -> None:
     """Measure where each edge of the gripper really appears, in images taken at the reference calibration,
@@ -205,17 +211,21 @@ def _teach_by_hand(arguments: Arguments) -> None:
         images, command=arguments.command_line(), **files, live=arguments.live, source=arguments.source,
         jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
         robot=arguments.robot, camera_name=arguments.camera_name, response=arguments.response,
+        distance_m=arguments.distance,
     )  # fmt: skip
     make_directory(inputs.folder)
+    arguments.check_outputs("picture")
     if arguments.page:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
     print("\n".join([*in_words(found), *(inputs.response.notes if inputs.response is not None else ())]))
-    saved = save(arguments.force)
+    saved, picture = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
     _say(saved)
+    if picture is not None:
+        arguments.save("picture", lambda: picture(arguments.picture.suffix))
 
 
 def _misuse(arguments: Arguments) -> str:
@@ -231,16 +241,16 @@ def _misuse(arguments: Arguments) -> str:
         return "--live-wait: goes with --live"
     if not images and live is None:
         return "no image; image files, or --page --live DEVICE"
-    if arguments.corners is not None and len(images) > 1:
-        return f"{len(images)} images; with --corners one, the image in which they were marked"
     if arguments.into_config:
         return "--into-config: --page and --corners add the line anyway; leave it out"
-    if arguments.picture is not None:
-        return "--picture goes with --config alone; look at the page"
+    if arguments.picture is not None and page:
+        return "--picture: the page shows it; leave it out"
     if config is not None and arguments.jaw_source is not None:
         return "--jaw-source: --config gives the source of jaw openings; leave it out"
     if config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
         return "--config names camera, gripper and reference already; either it, or --camera and --gripper"
+    if arguments.distance is not None and (config is not None or arguments.reference is not None):
+        return "--distance: the reference says where the gripper is; leave one of them out"
     return ""
 
 

@@ -101,10 +101,18 @@ class Teaching:
 
     def picture(self, ending: str = ".png") -> bytes:
         """The first image used, with what was taught drawn, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
-        config = self.config
+        config, first = self.config, self.images[0]
         edges = TaughtEdges.of_model(self.model, config.gripper)
-        drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.images[0], edges, self.model)
-        return bytes(cv2.imencode(ending, drawn)[1].tobytes())
+        return picture_of(config.camera, config.gripper, config.cam_T_grip, first, edges, self.model, ending)
+
+
+def picture_of(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, first: TeachingImage, edges: TaughtEdges, model: TaughtModel,
+    ending: str,
+) -> bytes:  # fmt: skip
+    """The image with what was taught drawn, in the format of a file's ``ending``."""
+    drawn = draw_taught(camera, gripper, cam_T_grip, first, edges, model)
+    return bytes(cv2.imencode(ending, drawn)[1].tobytes())
 
 
 def teach(
@@ -150,7 +158,7 @@ def teach(
     try:
         taught = teach_images(Rig(config.camera, gripper, settings), config.reference, shown)
     except TeachingRefused as refused:
-        raise NoResultError(f"teach: {refused}") from None
+        raise NoResultError(f"teach: {refused}", refused.notes) from None
     model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)
     return Teaching(taught, model, config, tuple(taught.used(shown)), settings, seen)
 

@@ -78,11 +78,13 @@ def read_inputs(
     robot: str | None = None,
     camera_name: str | None = None,
     response: str = "auto",
+    distance_m: tuple[float, float] | None = None,
 ) -> Inputs:
     """Read and check the input: either ``config``, or ``gripper`` with ``camera`` or ``reference`` and values for the
     configuration to be written.  ``command``: for the files' provenance; ``live``: a camera instead of images;
     ``source``: of the configuration's frames (None: that camera, or the images' folder); ``response``: as in
-    :func:`gripmon.teach.api.teach`.
+    :func:`gripmon.teach.api.teach`; ``distance_m``: of the TCP, where there is no reference, with its standard
+    deviation.
     """
     cv2.setNumThreads(1)
     given = None
@@ -102,7 +104,7 @@ def read_inputs(
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
     said = None if given is None or not given.says_response else given.settings.monitor.corners.edges.response
     light = told_response(pictures, response, said)
-    setup = replace(setup, settings=setup.settings.with_response(light.response))
+    setup = replace(setup, settings=setup.settings.with_response(light.response), distance_m=distance_m)
     frames: SourceSettings
     try:
         if live is not None:

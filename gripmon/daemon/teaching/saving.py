@@ -23,13 +23,14 @@ from gripmon.daemon.teaching.written import config_text, with_taught
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.api import Picture, taught_model, to_yaml
+from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml
 from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
-from gripmon.track.edges import TaughtModel
+from gripmon.track.edges import TaughtEdges, TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
 
@@ -39,6 +40,8 @@ class FileSaving:
 
     def __init__(self, inputs: Inputs):
         self._inputs = inputs
+        self.picture: Callable[[str], bytes] | None = None
+        """The first image with what was taught, once that is saved, in the format of a file's ending."""
 
     @property
     def _paths(self) -> dict[str, Path]:
@@ -141,11 +144,15 @@ class FileSaving:
         try:
             taught, _ = setup.taught(reference, images)
         except TeachingRefused as refused:
-            raise SavingRefused(f"no taught model: {refused}; or save without it: on the page untick it") from None
+            why = f"no taught model: {refused}; or save without it: on the page untick it"
+            raise SavingRefused(why, refused.notes) from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
         model = taught_model(
             taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files
         )
+        pose, first = from_record(reference.cam_T_grip), taught.used(images)[0]
+        edges = TaughtEdges.of_model(model, setup.gripper)
+        self.picture = lambda ending: picture_of(setup.camera, setup.gripper, pose, first, edges, model, ending)
         return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
     def _corners(self, order: SaveOrder, found: Evaluation, image: str) -> str:
@@ -227,9 +234,11 @@ def page_session(inputs: Inputs) -> TeachSession:
     return TeachSession(inputs.setup, inputs.pictures, saving.labels(), saving, live)
 
 
-def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[bool], Saved]]:
-    """The evaluation of the corners in a file for the single picture, and a function that saves it (True: replace
-    existing files).
+def teach_from_file(
+    inputs: Inputs, path: Path
+) -> tuple[Evaluation, Callable[[bool], tuple[Saved, Callable[[str], bytes] | None]]]:
+    """The evaluation of the corners in a file for the first picture, and a function that teaches from all pictures and
+    saves it (True: replace existing files); this returns also what draws it (:attr:`FileSaving.picture`).
 
     Raises :class:`~gripmon.model.errors.InputError` for invalid corners, and
     :class:`~gripmon.model.errors.NoResultError` if nothing can be taught from them.
@@ -246,11 +255,12 @@ def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[b
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
     put = CornersRequest(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
 
-    def save(replace: bool) -> Saved:
+    def save(replace: bool) -> tuple[Saved, Callable[[str], bytes] | None]:
+        saving = FileSaving(inputs)
         order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=replace)
         try:
-            return FileSaving(inputs).save(order, found, 0, inputs.pictures)
+            return saving.save(order, found, 0, inputs.pictures), saving.picture
         except SavingRefused as refused:
-            raise NoResultError(f"teach: {refused}") from None
+            raise NoResultError(f"teach: {refused}", refused.notes) from None
 
     return found, save
