@@ -1,5 +1,5 @@
-"""The cases that ``gripmon teach`` must manage: one finger, curves, three corners, corners on a line with a rough distance,
-several images at once, images of several robot poses.
+"""The cases that ``gripmon teach`` must manage: one finger, curves, three corners, corners on a line with a rough
+distance, several images at once, images of several robot poses.
 """
 
 from __future__ import annotations
@@ -49,10 +49,11 @@ def one_finger() -> Gripper:
     """The left one of two boxes, which stands."""
     values = msgspec.to_builtins(box_gripper().model)
     values.pop("jaw")
-    values["fingers"] = {"L": {}}
-    values["points"] = {name: point for name, point in values["points"].items() if point["finger"] == "L"}
+    left = next(iter(values["fingers"]))
+    values["fingers"] = {left: {}}
+    values["points"] = {name: point for name, point in values["points"].items() if point["finger"] == left}
     values["edges"] = {name: edge for name, edge in values["edges"].items() if edge["from"] in values["points"]}
-    values["faces"] = [face for face in values["faces"] if face["finger"] == "L"]
+    values["faces"] = [face for face in values["faces"] if face["finger"] == left]
     return Gripper(msgspec.convert(values, GripperModel))
 
 
@@ -60,9 +61,8 @@ def test_one_finger():
     gripper, pose = one_finger(), nominal_cam_T_grip()
     images = images_of(moving_robot(31, "blobs", gripper=gripper), 5)
     shown_px = CAMERA.project(gripper.points_grip_m(None)[gripper.corner_points] @ pose[:3, :3].T + pose[:3, 3])
-    put = dict(
-        zip(gripper.corner_ids, shown_px + np.random.default_rng(1).normal(0.0, 3.0, shown_px.shape), strict=True)
-    )
+    rough_px = shown_px + np.random.default_rng(1).normal(0.0, 3.0, shown_px.shape)
+    put = dict(zip(gripper.corner_ids, rough_px, strict=True))
     setup = Setup(CAMERA, gripper, MonitorSettings(), None)
     found = setup.evaluate(images[0], put, (), None)
     assert found.reference is not None, found.no_reference
@@ -100,7 +100,7 @@ def test_curves(also: tuple[str, ...]):
 def test_a_gripper_without_straight_outlines_is_told_so():
     gripper, images = curved("left_side_a", "left_side_b", "right_side_a", "right_side_b")
     frames = [TeachingImage(images[0], gripper.jaw_nominal_m, "0.png")]
-    with pytest.raises(TeachingRefused, match="^no outline in view is straight"):
+    with pytest.raises(TeachingRefused, match=r"^no outline in view is straight"):
         teach(Measured(CAMERA, gripper, MonitorSettings()), reference(), frames)
 
 
