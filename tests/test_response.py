@@ -11,7 +11,14 @@ import pytest
 from support.changing_backgrounds import images_of, moving_robot
 
 from gripmon.model.errors import InputError
-from gripmon.model.response import UNKNOWN_SIGMA_PX, find_response, in_light, likely_linear, response_of
+from gripmon.model.response import (
+    TAUGHT_SIGMA_PX,
+    UNKNOWN_SIGMA_PX,
+    find_response,
+    in_light,
+    likely_linear,
+    response_of,
+)
 from gripmon.simulate.disturbance import srgb_dn
 from gripmon.simulate.scenario import Sensor
 from gripmon.track.edges import MeasurementSettings
@@ -81,6 +88,8 @@ def test_play_of_the_mount_is_not_taken_for_a_response():
 
 def test_an_unknown_response_is_in_the_standard_deviation_of_every_edge():
     settings = MeasurementSettings()
-    assert settings.with_response is settings
-    unknown = msgspec.structs.replace(settings, edges=EdgeSettings(response="unknown")).with_response
-    assert unknown.consensus.edge_floor_px == pytest.approx(np.hypot(0.02, UNKNOWN_SIGMA_PX))
+    assert settings.with_response(False) is settings
+    unknown = msgspec.structs.replace(settings, edges=EdgeSettings(response="unknown"))
+    for taught, sigma_px in ((False, UNKNOWN_SIGMA_PX), (True, TAUGHT_SIGMA_PX)):
+        floor_px = unknown.with_response(taught).consensus.edge_floor_px
+        assert floor_px == pytest.approx(np.hypot(0.02, sigma_px))

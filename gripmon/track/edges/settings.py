@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.response import UNKNOWN_SIGMA_PX, Response
+from gripmon.model.response import TAUGHT_SIGMA_PX, UNKNOWN_SIGMA_PX, Response
 
 
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -186,10 +186,11 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         ),
     ] = 1.0
 
-    @property
-    def with_response(self) -> MeasurementSettings:
-        """The same with what a response that isn't known adds to the standard deviation of every edge."""
+    def with_response(self, taught: bool) -> MeasurementSettings:
+        """The same with what a response that isn't known adds to the standard deviation of every edge, which was
+        ``taught`` or not.
+        """
         if self.edges.response != "unknown":
             return self
-        floor_px = min(math.hypot(self.consensus.edge_floor_px, UNKNOWN_SIGMA_PX), 1.0)
+        floor_px = math.hypot(self.consensus.edge_floor_px, TAUGHT_SIGMA_PX if taught else UNKNOWN_SIGMA_PX)
         return msgspec.structs.replace(self, consensus=msgspec.structs.replace(self.consensus, edge_floor_px=floor_px))

@@ -180,7 +180,7 @@ class Settler:
         taught: TaughtEdges | None = None,
     ):
         self._camera, self._gripper, self._taught = camera, gripper, taught
-        self._settings = settings.with_response
+        self._settings = settings.with_response(taught is not None)
         # What the gripper file says of an edge's polarity counts; teaching fills in the rest.
         known = gripper.edge_polarity
         self._polarity = known if taught is None else np.where(known, known, taught.polarity)
