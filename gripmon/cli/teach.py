@@ -219,7 +219,7 @@ def _teach_by_hand(arguments: Arguments) -> None:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
-    print("\n".join([*in_words(found), *(inputs.response.notes if inputs.response is not None else ())]))
+    print("\n".join(in_words(found)))
     saved, picture = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")

@@ -44,7 +44,8 @@ ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 @dataclass(frozen=True)
 class Inputs:
     """Everything but the corners.  ``folder``: where files are written; ``config``: the given configuration, if any;
-    ``calibrations``: files of ``gripmon calibrate`` that the configuration names instead of sections, by key.
+    ``response``: of the camera, None until a live one has sent images; ``calibrations``: files of ``gripmon calibrate``
+    that the configuration names instead of sections, by key.
     """
 
     setup: Setup
@@ -103,8 +104,12 @@ def read_inputs(
     depth = setup.settings.bit_depth
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
     said = None if given is None or not given.says_response else given.settings.monitor.corners.edges.response
-    light = told_response(pictures, response, said)
-    setup = replace(setup, settings=setup.settings.with_response(light.response), distance_m=distance_m)
+    # A live camera's images come later: FileSaving looks at those that are kept.
+    later = live is not None and said is None and response == "auto"
+    light = None if later else told_response(pictures, response, said)
+    setup = replace(setup, distance_m=distance_m)
+    if light is not None:
+        setup = replace(setup, settings=setup.settings.with_response(light.response))
     frames: SourceSettings
     try:
         if live is not None:

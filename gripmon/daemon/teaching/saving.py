@@ -25,7 +25,8 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml
+from gripmon.model.response import ResponseSeen
+from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
 from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
@@ -69,7 +70,7 @@ class FileSaving:
 
     def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
         """As :class:`gripmon.teach.session.Saving`."""
-        paths = self._paths
+        paths, light = self._paths, self._light(pictures)
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
         if not wanted:
@@ -97,7 +98,17 @@ class FileSaving:
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
         follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
-        return Saved(written=written, notes=tuple(notes), next=follows)
+        return Saved(written=written, notes=(*light.notes, *notes), next=follows)
+
+    def _light(self, pictures: Sequence[Picture]) -> ResponseSeen:
+        """The camera's response, a live one's from the images that are kept."""
+        inputs = self._inputs
+        if inputs.response is not None:
+            return inputs.response
+        light = told_response(pictures, "auto", None)
+        settings = inputs.setup.settings.with_response(light.response)
+        self._inputs = replace(inputs, setup=replace(inputs.setup, settings=settings))
+        return light
 
     def _names_it_already(self, order: SaveOrder) -> bool:
         """Whether the given configuration stays as it is: it names a taught model already, or none is saved."""
