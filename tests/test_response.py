@@ -8,8 +8,10 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from support.changing_backgrounds import images_of, moving_robot
+import yaml
+from support.changing_backgrounds import crossing_px, images_of, moving_robot
 
+from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.response import (
     TAUGHT_SIGMA_PX,
@@ -21,6 +23,7 @@ from gripmon.model.response import (
 )
 from gripmon.simulate.disturbance import srgb_dn
 from gripmon.simulate.scenario import Sensor
+from gripmon.teach.from_images import gripper_from_images
 from gripmon.track.edges import MeasurementSettings
 from gripmon.track.edges.settings import EdgeSettings
 
@@ -56,6 +59,29 @@ def test_pictures_by_another_ray_caster_tell_theirs(numbers: range):
         seen = find_response(images, openings_m)
         assert seen.response == response and seen.gamma == pytest.approx(GAMMA[response], abs=0.35)
         images = [in_light(image, "srgb") for image in images]
+
+
+@pytest.mark.skipif(not TEACH.is_dir(), reason="../shared/data/mesh_aloha is not there")
+def test_the_outline_of_dark_fingers_is_where_it_is_though_their_pictures_are_srgb():
+    """Taken as linear, all but one edge are 0.23 to 0.30 px inside."""
+    kept = yaml.safe_load((TEACH.parent / "hand_eye.yaml").read_text())
+    lens = msgspec.convert(kept["camera"], BrownConradyLens)
+    images = [cv2.imread(str(TEACH / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED) for k in range(24)]
+    openings_m = [0.055 if k < 12 else 0.035 for k in range(24)]
+    found = gripper_from_images(images, lens, openings_m=openings_m)
+    assert any(note.startswith("response: srgb") for note in found.notes)
+    file = "coverage_low.png" if found.opening_m == 0.035 else "coverage_high.png"
+    covered = cv2.imread(str(TEACH.parent / "truth" / file), cv2.IMREAD_UNCHANGED).astype(np.float32) / 65535.0
+    camera, away_px = make_camera(lens), []
+    for chain in (chain for finger in found.seen.fingers for chain in finger.chains):
+        for a, b in chain.pieces:
+            length = float(np.linalg.norm(chain.uv_px[b] - chain.uv_px[a]))
+            if length < 25.0:
+                continue
+            ends, share = camera.undistort(chain.uv_px[[a, b]]), np.linspace(3.0, length - 3.0, int(length)) / length
+            away_px.append(crossing_px(camera.distort(ends[0] + share[:, None] * (ends[1] - ends[0])), covered))
+    assert len(away_px) >= 6 and max(map(np.median, away_px)) < 0.1
+    assert np.quantile(np.concatenate(away_px), 0.95) < 0.3
 
 
 def test_what_does_not_tell_is_unknown_of_colour_cameras_and_linear_of_others():
