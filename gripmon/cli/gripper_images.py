@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
+from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, length, progress_bar
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, positive_number, progress_bar
-
-_OPTIONS = """
+_OPTIONS = f"""
 IMAGE...                image file, or folder with images
 --camera FILE.yaml      file of gripmon calibrate intrinsics
 --distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m),
@@ -15,6 +13,7 @@ IMAGE...                image file, or folder with images
                         width of a fingertip across the jaws, with its standard deviation (m)
 | --reference FILE.yaml
                         hand/eye calibration, of gripmon calibrate plane or another one: its frame is kept
+{RESPONSE_OPTION.strip()}
 --name NAME             the gripper's name (default: gripper)
 --out FILE.yaml         gripper file to write
 --reference-out FILE.yaml
@@ -34,25 +33,9 @@ exit codes: 0 written; 2 wrong usage or files; 3 no gripper found in the images,
 nothing is written then"""
 
 
-def _length(text: str) -> tuple[float, float]:
-    value, colon, sigma = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
-        )
-    found = positive_number(value), positive_number(sigma)
-    if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
-    if found[1] > 0.5 * found[0]:
-        raise argparse.ArgumentTypeError(
-            f"'{text}': the standard deviation is more than half of the length; a smaller one"
-        )
-    return found
-
-
 @Command(
-    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=_length,
-    finger_width=_length, name={"default": "gripper"}, out=REQUIRED,
+    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
+    finger_width=length, name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
     """Measure a gripper's outline, inner edges and pose in ten to a hundred images of the wrist camera: the
@@ -84,7 +67,7 @@ def from_images(arguments: Arguments) -> None:
     found = gripper_from_images(
         images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
         finger_width_m=arguments.finger_width, reference=given.reference, name=arguments.name, provenance=provenance,
-        progress=progress_bar,
+        response=arguments.response, progress=progress_bar,
     )  # fmt: skip
     arguments.save("out", gripper_values(found.gripper.model))
     arguments.save("reference_out", lambda: found.document(provenance))
