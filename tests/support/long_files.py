@@ -13,6 +13,7 @@ LONGEST = (
     "test_trust_shapes",
     "test_dataset",
     "test_check_findings",
+    "test_bench_real_images",
     "test_gripper_cad_tracked",
     "test_setup",
     "test_cli",

@@ -22,6 +22,8 @@ _DESCRIPTION = """\
 Stills of real grippers whose camera is screwed on and wasn't knocked: the true motion since the reference is zero in
 each of them.  They are replayed a second apart, untaught, and taught from every other still and judged on those
 between, at alert limits fixed here: what is measured, valid, how large the bounds are, and what contradicts them.
+With --from-images each gripper's file is made of the same images first, by `gripmon gripper from-images`: its words and
+exit code, how far its outline lies beside the one drawn by hand, and the same replays with that file.
 Exit code 1 if a target is missed."""
 
 FOLDER = ROOT.parent / "shared" / "data" / "real"
@@ -53,6 +55,8 @@ def add_parser(commands: Any) -> None:
         metavar="FOLDER",
         help="with stills and a config.yaml (default: all of ../shared/data/real)",
     )
+    parser.add_argument("--from-images", action="store_true", help="with gripper files made of these images")
+    parser.add_argument("--distance", metavar="M:SIGMA", help="for --from-images, of folders for which none is fixed")
     parser.add_argument("--against", metavar="REV", help="also replay with gripmon of this commit, beside it")
     parser.add_argument(
         "--limit", nargs=2, type=float, metavar=("MM", "DEGREES"), help="of folders for which no alert limit is fixed"
@@ -61,6 +65,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``tools/bench real``."""
+    if arguments.from_images:
+        return _run_from_images(arguments)
     try:
         sets = _sets(arguments)
         runs = dict(_replayed(sets, arguments.against))
@@ -78,9 +84,58 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if faults else 0
 
 
+def _run_from_images(arguments: argparse.Namespace) -> int:
+    """A set that is refused is a row, and doesn't keep the others from theirs."""
+    from tempfile import TemporaryDirectory
+
+    import msgspec
+
+    from benchmarks.real_figures import figures_of
+    from benchmarks.real_images import Task, made_from_images, missed_from_images, runs_of_made, table, tasks
+    from benchmarks.real_runs import runs_of
+
+    known = tasks(LIMITS, PLAY_M)
+    every, found, faults = [], [], []
+    with TemporaryDirectory(prefix="gripmon-real-") as temporary:
+        for folder in arguments.folder or sorted(FOLDER / name for name in known if (FOLDER / name).is_dir()):
+            name = folder.resolve().name
+            task = known.get(name)
+            if task is None:
+                try:
+                    limit = _limit(name, arguments)
+                except ValueError as error:
+                    print(f"tools/bench real: {error}", file=sys.stderr)
+                    return 2
+                options_given = ("--distance", arguments.distance) if arguments.distance else ()
+                task = Task(options_given, limit, 0.0, PLAY_M)
+            print(f"real, from images: {name}", file=sys.stderr)
+            for of_video in (False, True) if any(folder.glob("*.mp4")) else (False,):
+                made = made_from_images(name, folder, Path(temporary, f"{name}_{of_video}"), task, of_video)
+                every.append(made)
+                runs, play_m, refused = ([], 0.0, None) if of_video else runs_of_made(made, task, runs_of)
+                own = [(run, figures_of(run)) for run in runs]
+                faults += [f"{name}, from images: {refused}"] if refused else []
+                found += own
+                faults += missed_from_images(made, task, own, play_m)
+    text = "\n".join([*table(every), "", report({commit(): found}, faults)])
+    options.deliver(arguments, "real --from-images", text, msgspec.to_builtins([run for run, _ in found]))
+    return 1 if faults else 0
+
+
+def _limit(name: str, arguments: argparse.Namespace) -> Limit:
+    """A set's alert limit.  Raises ValueError if none is fixed for it and none given."""
+    from benchmarks.real_runs import Limit
+
+    if name in LIMITS:
+        return Limit(*LIMITS[name])
+    if arguments.limit is None:
+        raise ValueError(f"{name}: no alert limit is fixed for it; --limit MM DEGREES")
+    return Limit(1e-3 * arguments.limit[0], math.radians(arguments.limit[1]))
+
+
 def _sets(arguments: argparse.Namespace) -> dict[str, tuple[Path, Limit]]:
     """Folder and alert limit of each set.  Raises ValueError for one that can't be used."""
-    from benchmarks.real_runs import CONFIG, Limit
+    from benchmarks.real_runs import CONFIG
 
     folders = arguments.folder
     if not folders:
@@ -98,13 +153,7 @@ def _sets(arguments: argparse.Namespace) -> dict[str, tuple[Path, Limit]]:
             raise ValueError(f"{folder}: has no {CONFIG}; a folder with stills and a configuration")
         if name in out:
             raise ValueError(f"{folder}: another folder is called {name}; each under its own name")
-        if name in LIMITS:
-            limit = Limit(*LIMITS[name])
-        elif arguments.limit is None:
-            raise ValueError(f"{name}: no alert limit is fixed for it; --limit MM DEGREES")
-        else:
-            limit = Limit(1e-3 * arguments.limit[0], math.radians(arguments.limit[1]))
-        out[name] = folder, limit
+        out[name] = folder, _limit(name, arguments)
     return out
 
 
@@ -154,16 +203,23 @@ def missed(found: list[tuple[Run, Figures]]) -> list[str]:
         if most < LEAST_VALID.get(name, 0):
             out.append(f"{name}: at most {most} of {own[0][1].stills} stills valid; at least {LEAST_VALID[name]}")
         for run, figures in own:
-            what = f"{name}, {_way(run)}, {run.bound} bound"
-            far = [m for m, rad in figures.beyond if m > PLAY_M or rad > 0.0]
-            if far:
-                out.append(f"{what}: {len(far)} stills beyond their bound by more than play")
-            if figures.alerts:
-                out.append(f"{what}: alerts that the mount moved: {_counts(figures.alerts)}")
+            what = f"{name}, {way(run)}, {run.bound} bound"
+            out += [f"{what}: {each}" for each in untrue(figures, PLAY_M)]
             ratios = figures.proposed / figures.least
             if not all(PROPOSED[0] <= ratio <= PROPOSED[1] for ratio in ratios):
                 proposal = f"{ratios[0]:.2g} (position) and {ratios[1]:.2g} (rotation) of the limits that are needed"
                 out.append(f"{what}: check proposes {proposal}; {PROPOSED[0]:g} to {PROPOSED[1]:g}")
+    return out
+
+
+def untrue(figures: Figures, play_m: float) -> list[str]:
+    """What contradicts a true motion of at most the play (m)."""
+    out = []
+    far = [m for m, rad in figures.beyond if m > play_m or rad > 0.0]
+    if far:
+        out.append(f"{len(far)} stills beyond their bound by more than play")
+    if figures.alerts:
+        out.append(f"alerts that the mount moved: {_counts(figures.alerts)}")
     return out
 
 
@@ -196,7 +252,7 @@ def _row(run: Run, figures: Figures, revision: str) -> str:
     if run.bound == "reference":
         beyond += f", {len(figures.moved_beyond)} from the reference"
     cells = [
-        f"{run.name}, {_way(run)}",
+        f"{run.name}, {way(run)}",
         revision,
         run.bound,
         f"{figures.measured} of {figures.stills}",
@@ -215,7 +271,7 @@ def _row(run: Run, figures: Figures, revision: str) -> str:
 
 
 def _why(run: Run, figures: Figures, revision: str) -> list[str]:
-    what = f"{run.name}, {_way(run)}, {run.bound}, {revision}"
+    what = f"{run.name}, {way(run)}, {run.bound}, {revision}"
     out = []
     if figures.hypotheses:
         out.append(f"{what}: the bound is as large since it can't be excluded: {_counts(figures.hypotheses)}")
@@ -224,7 +280,8 @@ def _why(run: Run, figures: Figures, revision: str) -> list[str]:
     return out + [f"{what}: {each}" for each in figures.teaching]
 
 
-def _way(run: Run) -> str:
+def way(run: Run) -> str:
+    """In words."""
     return "taught" if run.taught else "untaught"
 
 

@@ -20,8 +20,6 @@ import gripmon
 from gripmon.model.images import image_paths
 from gripmon.model.records import FrameRecord, Protection, Verdict
 
-APART_S = 1.0
-"""Between two stills, as if one had followed the other."""
 CONFIG = "config.yaml"
 _STAMPS = "timestamps.csv"
 _EVERY = slice(None)
@@ -147,6 +145,7 @@ class _Project:
         self._openings = _openings(folder / _STAMPS)
         self._values = yaml.safe_load((folder / CONFIG).read_text())
         self._values.pop("taught", None)
+        self._apart_s = 1.0 / self._values["source"].get("fps", 1.0)
         self._models: dict[str, _Model | str] = {}  # or why there is none, by half
         for path in folder.iterdir():
             if path not in self._images and path.name not in (CONFIG, _STAMPS):
@@ -169,7 +168,7 @@ class _Project:
     def replayed(self, bound: str, judged: slice, promised: slice, uncounted: int, taught: Path | None = None) -> Part:
         """The stills one after another; ``promised``: those that ``check`` has."""
         images, config = self._images[judged], self.config(bound, taught)
-        with gripmon.open_source(self._stills(images), fps=1.0 / APART_S) as source:
+        with gripmon.open_source(self._stills(images), fps=1.0 / self._apart_s) as source:
             stills = tuple(_still(record) for record in gripmon.replay(source, config))
         proposed_m, proposed_rad = proposed_by_check(config, self._stills(self._images[promised]))
         names = tuple(path.name for path in images)
@@ -202,7 +201,7 @@ class _Project:
             for path in images:
                 (place / path.name).symlink_to(path.resolve())
             if self._openings:
-                rows = [(p.name, round(1e9 * APART_S * i), self._openings[p.name]) for i, p in enumerate(images)]
+                rows = [(p.name, round(1e9 * self._apart_s * i), self._openings[p.name]) for i, p in enumerate(images)]
                 with (place / _STAMPS).open("w", newline="") as table:
                     csv.writer(table).writerows([("file", "stamp_ns", "jaw_opening_m"), *rows])
         return place
