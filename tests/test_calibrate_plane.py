@@ -25,6 +25,7 @@ from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.targets import OtherSizeError, parse_target, refuse_other_size
+from gripmon.simulate.disturbance import srgb_dn
 from gripmon.track.edges.taught import gripper_digest
 
 TRUE = nominal_cam_T_grip()
@@ -110,6 +111,26 @@ def test_a_known_gripper_from_two_images(here: Path, capsys: pytest.CaptureFixtu
     assert picture.shape[0] > 1152 and picture.shape[1:] == (1536, 3)  # and the caption below
     colours = picture.reshape(-1, 3).astype(int)
     assert np.count_nonzero(np.ptp(colours, axis=1) > 100) > 2000, "points and corners are in colour"
+
+
+def test_a_colour_cameras_response_is_given_or_its_effect_is_in_the_covariance(
+    here: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Two images don't tell it."""
+    for name in ("p0.png", "p1.png"):
+        coded = np.rint(srgb_dn(cv2.imread(name, 0).astype(np.float32))).astype(np.uint8)
+        cv2.imwrite(f"colour_{name}", np.dstack([coded, coded, np.minimum(coded, 250) + 4]))
+    images = ["colour_p0.png", "colour_p1.png", *KNOWN, "--corners", "rough.yaml"]
+    assert plane(*images, "--response", "srgb", "--out", "said.yaml") == 0
+    assert "response: srgb (as given)" in capsys.readouterr().out
+    check_truth(hand_eye(here / "said.yaml"))
+    assert plane(*images, "--out", "unknown.yaml") == 0
+    assert "response: unknown: read as linear" in capsys.readouterr().out
+    said, unknown = (hand_eye(here / name) for name in ("said.yaml", "unknown.yaml"))
+    pixel_m = TRUE[2, 3] / PAPER_LENS.fx_px
+    assert np.sqrt(unknown.covariance[0]) > 0.2 * pixel_m > 2.0 * np.sqrt(said.covariance[0])
+    away = perturbation_between(from_record(unknown.cam_T_grip), TRUE)[:3]
+    assert away @ np.linalg.solve(np.reshape(unknown.covariance, (6, 6))[:3, :3], away) < chi2.ppf(0.999, 3)
 
 
 def test_the_file_says_where_it_comes_from(here: Path):

@@ -63,7 +63,7 @@ def test_both_fingers_in_one_file_are_told_apart(tmp_path: Path):
     known = sharp_gripper()
     path = tmp_path / "both.stl"
     trimesh.util.concatenate(box_meshes(known)).apply_scale(1e3).export(path)
-    made = gripper_from_cad([path], unit="mm", jaw_range_m=(0.0, 0.06))
+    made = gripper_from_cad([path], unit="mm", body="1,2", jaw_range_m=(0.0, 0.06))
     assert made.gripper.finger_ids == ("left", "right")
     np.testing.assert_allclose(ends_of(made.gripper), ends_of(known), atol=2 * MICROMETRE)
 
@@ -116,7 +116,7 @@ def test_an_arc_of_a_urdf_is_the_jaws_motion(tmp_path: Path):
 def test_fingers_that_turn_are_refused(tmp_path: Path):
     path = arc_urdf(tmp_path)
     path.write_text(path.read_text().replace('multiplier="-1"', 'multiplier="0.5"'))
-    with pytest.raises(InputError, match=r"its fingers turn by .* degrees while joint 'left_bar_joint' moves"):
+    with pytest.raises(InputError, match=r"finger 'left_bar' turns by .* while joint 'left_bar_joint' moves"):
         gripper_from_cad([path])
 
 

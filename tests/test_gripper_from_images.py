@@ -79,7 +79,7 @@ def test_the_outline_lies_within_a_fifth_of_a_pixel_of_the_true_silhouette(name:
 
 def test_fingers_are_told_apart_and_placed_in_space_by_their_perspective(box: tuple) -> None:
     _, found = box
-    assert found.gripper.finger_ids == ("left", "right") and not any("round" in note for note in found.notes)
+    assert found.gripper.finger_ids == ("left", "right") and not any("round fingertips" in note for note in found.notes)
     assert len(found.gripper.corner_ids) >= 5
     apart = perturbation_between(nominal_cam_T_grip(), found.cam_T_grip)
     # One length was given, so only its own error may be along the axis; here it was given exactly.

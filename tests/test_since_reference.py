@@ -305,7 +305,7 @@ def test_it_is_the_average_of_the_first_frames_that_proved_a_pose():
         kept.add(anchor, 0.03 + 1e-5 * number, 1000 + number)
         assert kept.changes == int(number >= FIRST_FRAMES - 1)
     at = kept.current
-    assert at is not None and (at.frames, at.since_ns, at.since) == (30, 1000, Since.FIRST_PROVED)
+    assert at is not None and (at.frames, at.since_ns, at.since) == (30, 1014, Since.FIRST_PROVED)
     assert at.cam_T_grip[0, 3] == pytest.approx(30e-6)
     assert at.jaw_opening_m == pytest.approx(0.03 + 1e-5 * 14.5)
 

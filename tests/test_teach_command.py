@@ -16,6 +16,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.changing_backgrounds import images_of, moving_robot
 from support.meters import moved
 from support.simulated import BOX_FINGERS, nominal_cam_T_grip
 from support.taught_scenes import OPENING_M, image_of, scene
@@ -26,6 +27,7 @@ from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.atomic import write_atomically
 from gripmon.model.geometry import to_record
+from gripmon.simulate.scenario import Sensor
 from gripmon.teach.api import to_yaml
 from gripmon.teach.drawing import Labels
 from gripmon.track.edges import TaughtModel
@@ -177,6 +179,42 @@ def test_replay_with_the_taught_model_is_right_where_it_was_off(rig: Path, taugh
     assert rms["config"] < rms["untaught"] / 10.0
 
 
+def test_a_colour_cameras_grey_levels_are_found_written_and_contradicted_by_nobody(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Of a configuration that doesn't say how they follow the light."""
+    (tmp_path / "stills").mkdir()
+    sensor = Sensor(response="srgb")
+    for n, image in enumerate(images_of(moving_robot(305, "chequer", opening_m=OPENING_M, sensor=sensor), 6)):
+        cv2.imwrite(str(tmp_path / "stills" / f"{n}.png"), np.dstack([image, image, np.minimum(image, 250) + 4]))
+    values = yaml.safe_load((rig / "untaught.yaml").read_text())
+    values.update(
+        gripper=str(BOX_FINGERS),
+        source={"kind": "folder", "path": "stills"},
+        jaw={"source": "fixed", "opening_m": OPENING_M},
+    )
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(values))
+    assert main(["check", str(path), "--json"]) == 0
+    assert "gripmon teach finds it" in capsys.readouterr().out
+    command = ["teach", str(tmp_path / "stills"), "--config", str(path), "--into-config"]
+    assert main(command) == 0
+    assert "response: srgb (borders before different backgrounds show gamma" in capsys.readouterr().out
+    config = load_config(path)
+    assert config.taught is not None and config.taught.edge_settings.response == "srgb"
+    assert config.settings.monitor.corners.edges.response == "srgb" and not config.says_response
+    assert main(["check", str(path), "--json"]) == 0
+    assert "response" not in capsys.readouterr().out
+    # Said there in another way than it was taught, it is refused; said by an option, too.
+    said = changed(path, tmp_path / "said.yaml", monitor__corners={"edges": {"response": "linear"}})
+    with pytest.raises(ConfigError, match=r"edge_settings.response: taught with srgb, the configuration has linear"):
+        load_config(said)
+    again = ["teach", tmp_path / "stills", "--config", said, "--force", "--response", "srgb"]
+    assert "--response srgb, and the configuration has monitor.corners.edges.response: linear" in fault(again, capsys)
+    assert main([*map(str, again[:-1]), "auto", "--out", str(tmp_path / "other.yaml")]) == 0
+    assert "response: linear (as configured, but borders" in capsys.readouterr().out
+
+
 def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["check", str(rig / "config.yaml"), "--verbose"]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("taught ")]
@@ -232,7 +270,7 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
         ("alone.png", 2, "its jaw opening isn't known (jaw.source is frames); --jaw-opening M, or"),
         ("alone.png --jaw-opening 0.9", 2, "alone.png: jaw opening 0.9 m; the gripper's 0 to 0.06 m"),
         ("alone.png --jaw-opening 0.0605", 2, "jaw opening 0.0605 m; the gripper's 0 to 0.06 m"),
-        ("grey.png --jaw-opening 0.034", 3, "teach: the gripper isn't found: only 0 % of the outlines"),
+        ("grey.png --jaw-opening 0.034", 3, "teach: the gripper isn't found: only 0 % of the straight outlines"),
         ("alone.png --jaw-opening 0.0347", 3, "the image shows a jaw opening of 0.03"),
         ("alone.png --jaw-opening 0.034 --out first", 2, "--out {folder}/first: is a folder; a file"),
         ("alone.png --jaw-opening 0.034 --picture x.tiff", 2, "has no known ending"),

@@ -203,9 +203,8 @@ def test_looks_are_the_levels_of_the_faces():
 def test_an_image_without_the_gripper_is_refused():
     empty = np.full((576, 768), 128, np.uint8)
     empty[::7] += 20
-    with pytest.raises(
-        TeachingRefused, match=r"^the gripper isn't found: only \d+ % of the outlines in view are seen as lines; at"
-    ):
+    said = r"^the gripper isn't found: only \d+ % of the straight outlines in view are seen as lines \(not .*; at"
+    with pytest.raises(TeachingRefused, match=said):
         taught_from(empty)
 
 
@@ -215,7 +214,7 @@ def test_a_reference_that_is_off_is_refused_and_the_measured_pose_is_named(shift
     off = moved(POSE, np.array([*(1e-3 * np.array(shift_mm)), 0.0, 0.0, 0.0]))
     with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
         taught_from(image_of(0.0), using=reference(off, 2e-5, 2e-4))
-    named = re.search(r"translation_m: \[(.*?)\]", str(refused.value))
+    named = re.search(r"translation_m: \[(.*?)\]", refused.value.notes[-1])
     assert named is not None
     away_m = np.abs(np.subtract([float(v) for v in named[1].split(",")], POSE[:3, 3]))
     assert away_m[:2].max() < 1e-5 and away_m[2] < 4e-5
@@ -227,9 +226,8 @@ def test_the_pose_that_is_named_states_what_bevels_do_to_it(shift_m: tuple[float
     off = moved(POSE, np.array([*shift_m, 0.0, 0.0, 0.0]))
     with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
         taught_from(image_of(bevel_m), using=reference(off, 2e-5, 2e-4))
-    named = re.search(
-        r"translation_m: \[(.*?)\].*position_sigma_m: (.*?), rotation_sigma_rad: (.*?)}", str(refused.value)
-    )
+    (note,) = refused.value.notes
+    named = re.search(r"translation_m: \[(.*?)\].*position_sigma_m: (.*?), rotation_sigma_rad: (.*?)}", note)
     assert named is not None
     away_m = np.subtract([float(v) for v in named[1].split(",")], POSE[:3, 3])
     assert np.linalg.norm(away_m) < 3.0 * float(named[2]) and float(named[2]) > 1e-4
@@ -342,14 +340,15 @@ def test_an_image_that_contradicts_most_others_is_left_out():
 def test_images_of_which_half_contradict_the_others_are_refused():
     away = [moved(POSE, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])) for x in (4e-4, 8e-4)]
     images = [image_of(0.0), image_of(0.0, scene(150.0)), *(image_of(0.0, None, pose) for pose in away)]
-    with pytest.raises(TeachingRefused, match=r"^\d\.png: the gripper appears .* left out before: \d\.png: the"):
+    with pytest.raises(TeachingRefused, match=r"^\d\.png: the gripper appears .* left out before: 1 image$") as refused:
         taught_from(*images, using=reference(None, 1e-3, 1e-2))
+    assert re.match(r"left out: \d\.png: the gripper appears", refused.value.notes[0]) and len(str(refused.value)) < 300
 
 
 def test_a_half_hidden_gripper_is_refused():
     image = image_of(0.0).copy()
     image[:, :430] = 128
-    with pytest.raises(TeachingRefused, match=r"the outlines|finger left isn't seen"):
+    with pytest.raises(TeachingRefused, match=r"the straight outlines|finger left isn't seen"):
         taught_from(image)
 
 

@@ -18,8 +18,7 @@ class CalibrationError(NoResultError, ValueError):
     """
 
     def __init__(self, text: str, details: Sequence[str] = ()):
-        super().__init__(text)
-        self.details = tuple(details)
+        super().__init__(text, details)
 
 
 @dataclass(frozen=True, slots=True)

@@ -195,5 +195,6 @@ def _in_words(error: InputError | NoResultError, arguments: Arguments) -> str:
                 values = tuple(map(str, given if isinstance(given, list) else [given]))
                 return f"{option} {error.wrong}" if error.wrong.startswith(values) else f"{option}: {error.wrong}"
         return str(error)
-    details = getattr(error, "details", None)  # of gripmon.calibrate.sighting.CalibrationError
-    return str(error) if details is None else "\n".join([*details, f"{command.prog}: {error}"])
+    if error.details is None:
+        return str(error)
+    return "\n".join([*error.details, f"{command.prog}: {str(error).removeprefix(f'{command.prog}: ')}"])

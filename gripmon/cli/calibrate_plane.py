@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, jaw_opening, jaw_range, note, progress_bar
+from gripmon.cli.common import (
+    REQUIRED,
+    RESPONSE,
+    RESPONSE_OPTION,
+    Arguments,
+    Command,
+    jaw_opening,
+    jaw_range,
+    note,
+    progress_bar,
+)
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.teach.hand_eye import HandEyeOnPlate
 
-_OPTIONS = """
+_OPTIONS = f"""
 IMAGE...                image file, or folder with images
 --target TARGET         the plate; see gripmon calibrate intrinsics
 --other-target          the plate is another one than the camera's, of the same pattern in another size
@@ -23,6 +33,7 @@ IMAGE...                image file, or folder with images
 --gripper-out FILE.yaml
                         with --infer: gripper file to write
 --jaw-range MIN:MAX     with --infer: range of the jaw opening (m)
+{RESPONSE_OPTION.strip()}
 --name NAME             with --infer: the gripper's name (default: gripper)
 --out FILE.yaml         file to write
 --picture FILE.png      also draw the first image with residuals, enlarged
@@ -44,7 +55,7 @@ nothing is written then"""
 
 @Command(
     "plane", "camera to gripper, from images of it on a plate", _OPTIONS, _EXAMPLES, target=REQUIRED,
-    jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED,
+    jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def plane(arguments: Arguments) -> None:
     """Measure the gripper's pose in the camera frame from an image of it standing on a calibration plate (the
@@ -83,9 +94,10 @@ def plane(arguments: Arguments) -> None:
         arguments.camera, arguments.gripper, arguments.config, arguments.corners or (), arguments.jaw_opening,
         infer=arguments.infer,
     )  # fmt: skip
+    response = given.response if arguments.response == "auto" else arguments.response
     found = calibrate_plane(
         paths, given.camera, given.gripper, target, corners=given.corners or None, jaw_opening_m=given.jaw_opening_m,
-        cam_T_grip=given.cam_T_grip, other_target=arguments.other_target, progress=progress_bar,
+        cam_T_grip=given.cam_T_grip, other_target=arguments.other_target, response=response, progress=progress_bar,
     )  # fmt: skip
     note(f"not used: {reason}" for reason in found.not_used)
     # In full even if a file named it: the hand/eye calibration records its target nowhere else.

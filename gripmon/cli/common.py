@@ -29,6 +29,10 @@ NETWORK_OPTIONS = f"""
 """
 """Options of the commands that join the network as a client; the placeholder says whose endpoint it is."""
 
+RESPONSE_OPTION = """
+--response          how grey levels follow the light: linear, srgb, or auto, as the images show it (default: auto)
+"""
+RESPONSE = {"choices": ("auto", "linear", "srgb"), "default": "auto"}
 _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -237,6 +241,23 @@ def positive_number(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text} is not above 0; a number above 0")
     return value
+
+
+def length(text: str) -> tuple[float, float]:
+    """An argument M:SIGMA, a length of a wrist camera's view and its standard deviation, m."""
+    value, colon, sigma = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
+        )
+    found = positive_number(value), positive_number(sigma)
+    if found[0] > 2.0:
+        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
+    if found[1] > 0.5 * found[0]:
+        raise argparse.ArgumentTypeError(
+            f"'{text}': the standard deviation is more than half of the length; a smaller one"
+        )
+    return found
 
 
 def jaw_opening(text: str) -> float:

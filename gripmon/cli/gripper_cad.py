@@ -17,16 +17,20 @@ from gripmon.cli.common import (
 from gripmon.model.errors import InputError
 
 _OPTIONS = """
-FILE...                 .stl, .obj, .ply, .cao: one per finger, or both in one; or one .urdf
+FILE...                 .stl, .obj, .ply, .dae, .cao: one per finger, or both in one; or one .urdf
 --out FILE.yaml         gripper file to write
---unit UNIT             unit of meshes: m, cm, mm or in
---approach AXIS         axis of the CAD frame that points out of the gripper: +x, -x, +y, -y, +z or -z (default: +z, for
-                        a URDF the direction of its fingers); write negative ones as --approach=-x
+--unit UNIT             unit of meshes: m, cm, mm or in (a .dae has its own)
+--body BODIES           for one mesh of several bodies: all (one finger), or their numbers, as 1,2 (two fingers) or
+                        1+3,2; for a URDF: the fingers' links, as link1,link2
+--approach AXIS[,AXIS]  axis of the CAD frame that points out of the gripper: +x, -x, +y, -y, +z or -z (default: +z, for
+                        a URDF the direction of its fingers), and the one from the left finger to the right one; write
+                        negative ones as --approach=-x
 --frame FRAME           tcp: origin between the fingertips; cad: the CAD's own (default tcp)
 --length M              use only this length of the fingers, from the tips (m)
---jaw-range MIN:MAX     for meshes: range of the jaw opening (m)
+--jaw-range MIN:MAX     range of the jaw opening (m); for a URDF: only this part of its joint's
 --jaw-opening M         reported opening of the jaws as drawn (default: the tips' distance, m)
---joint NAME            for a URDF: the joint that opens the jaws, if several are possible
+--joint NAME[=POS]      for a URDF: the joint that opens the jaws, if several are possible, or where it stands (m or
+                        rad); two of them with a comma
 --bevel M               width of the bevels on real edges that are sharp in the CAD (default: 0.0002 m); 0: the edges
                         are known to be sharp to 0.02 mm
 --camera FILE.yaml      the view's camera: a file of gripmon calibrate intrinsics, or a configuration
@@ -65,19 +69,19 @@ def _bevel(text: str) -> float:
 
 
 @Command(
-    "from-cad", "from STL, OBJ, PLY, URDF or .cao", _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
+    "from-cad", "from STL, OBJ, PLY, DAE, URDF or .cao", _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
     jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view, frame={"default": "tcp"},
     bevel=_bevel,
 )  # fmt: skip
 def from_cad(arguments: Arguments) -> None:
-    """Make a gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY) or ViSP .cao for each finger, one with
-    both, or one URDF.  Meshes need --unit; URDF and .cao are in metres.
+    """Make a gripper file from CAD.  FILE is one mesh (STL, OBJ, PLY, DAE) or ViSP .cao for each finger, one
+    with both, or one URDF.  Meshes need --unit; URDF, DAE and .cao have theirs.
 
-    The origin is the TCP, the middle of the four innermost fingertip corners: x across the jaws, z along
-    --approach, an axis of the CAD frame.  --frame cad keeps the CAD's axes.
+    The origin is the TCP, the middle of the four innermost fingertip corners: x across the jaws, from the
+    finger called left to the right one, z along --approach.  --frame cad keeps the CAD's axes.
 
-    The jaws' motion comes from the URDF's joint; for meshes, both fingers move by half of an opening in
-    --jaw-range.
+    The jaws' motion comes from the URDF's joint; for meshes, both fingers move straight by half of an opening
+    in --jaw-range.  What a URDF or a mesh of several bodies doesn't tell is asked for, with the option.
 
     Real edges are broken, by 0.1 to 0.3 mm if the drawing leaves it open (ISO 13715); CAD draws them sharp.
     --bevel states the width.  The default makes the bounds of an untaught gripper so wide that hardly any
@@ -103,7 +107,7 @@ def from_cad(arguments: Arguments) -> None:
     made = gripper_from_cad(
         arguments.file, unit=arguments.unit, name=name, camera=camera, cam_T_grip=cam_T_grip,
         jaw_range_m=arguments.jaw_range, jaw_opening_m=arguments.jaw_opening, joint=arguments.joint,
-        frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
+        body=arguments.body, frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
         bevel_m=UNTOLD_BEVEL_M if arguments.bevel is None else arguments.bevel,
         provenance=provenance_of(arguments.command_line(), arguments.file), progress=progress_bar,
     )  # fmt: skip

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from gripmon.cli.common import REQUIRED, Arguments, Command, positive_number, progress_bar
+from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, length, progress_bar
 
-_OPTIONS = """
+_OPTIONS = f"""
 IMAGE...                image file, or folder with images
 --camera FILE.yaml      file of gripmon calibrate intrinsics
 --distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m),
@@ -18,6 +18,7 @@ IMAGE...                image file, or folder with images
 --fingers {1,2}         how many fingers the images show; with 1, another one isn't expected (default: 2)
 --within LEFT,TOP,RIGHT,BOTTOM
                         where in the image the fingers are (px), if something else stays in it, too
+{RESPONSE_OPTION.strip()}
 --name NAME             the gripper's name (default: gripper)
 --out FILE.yaml         gripper file to write
 --reference-out FILE.yaml
@@ -37,38 +38,20 @@ exit codes: 0 written; 2 wrong usage or files; 3 no gripper found in the images,
 nothing is written then"""
 
 
-def _length(text: str) -> tuple[float, float]:
-    value, colon, sigma = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
-        )
-    found = positive_number(value), positive_number(sigma)
-    if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
-    if found[1] > 0.5 * found[0]:
-        raise argparse.ArgumentTypeError(
-            f"'{text}': the standard deviation is more than half of the length; a smaller one"
-        )
-    return found
-
-
 def _box(text: str) -> tuple[int, int, int, int]:
     try:
         left, top, right, bottom = (int(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' isn't LEFT,TOP,RIGHT,BOTTOM in pixels"
-        ) from None
+        raise argparse.ArgumentTypeError(f"'{text}' isn't LEFT,TOP,RIGHT,BOTTOM in pixels") from None
     if not (0 <= left < right and 0 <= top < bottom):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LEFT,TOP,RIGHT,BOTTOM in pixels, e.g. 100,200,500,479")
     return left, top, right, bottom
 
 
 @Command(
-    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=_length,
-    finger_width=_length, fingers={"type": int, "choices": (1, 2)}, within=_box, name={"default": "gripper"},
-    out=REQUIRED,
+    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
+    finger_width=length, fingers={"type": int, "choices": (1, 2)}, within=_box, name={"default": "gripper"},
+    out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
     """Measure a gripper's outline, inner edges and pose in five to a hundred images of the wrist camera: the
@@ -102,7 +85,8 @@ def from_images(arguments: Arguments) -> None:
         found = gripper_from_images(
             images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
             finger_width_m=arguments.finger_width, reference=given.reference, fingers=arguments.fingers,
-            within=arguments.within, name=arguments.name, provenance=provenance, progress=progress_bar,
+            within=arguments.within, name=arguments.name, provenance=provenance, response=arguments.response,
+            progress=progress_bar,
         )  # fmt: skip
     except UnclearPartsError as unclear:
         arguments.save("picture", unclear.picture(image_in(images[0])))

@@ -8,7 +8,18 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import PAGE_PORT, PORT_OPTIONS, Arguments, Command, announcer, make_directory, positive_number
+from gripmon.cli.common import (
+    PAGE_PORT,
+    PORT_OPTIONS,
+    RESPONSE,
+    RESPONSE_OPTION,
+    Arguments,
+    Command,
+    announcer,
+    length,
+    make_directory,
+    positive_number,
+)
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import image_paths
 
@@ -21,7 +32,7 @@ if TYPE_CHECKING:
     from gripmon.teach.session import TeachSession
     from gripmon.track.edges.taught import TaughtEdge
 
-_OPTIONS = """
+_OPTIONS = f"""
 [IMAGE...]          image file at the reference calibration, or a folder of them
 --config CONFIG     configuration (YAML); its source section is not used
 --out FILE          file to write (default: the configuration's `taught`, else taught.yaml beside it); with --page or
@@ -29,13 +40,16 @@ _OPTIONS = """
 --jaw-opening M     jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's
                     nominal opening if that is absent, else from a timestamps.csv beside each image
 --picture FILE.png  also draw the first image with the taught edges, offsets enlarged
+{RESPONSE_OPTION.strip()}
 --force             replace an existing file
 --into-config       also add the line `taught:` to the configuration
 """
 
 _BY_HAND = f"""
 --page              teach on a local web page
---corners FILE      without a page: rough corners, `corners: {{name: [u, v], …}}`
+--corners FILE      without a page: rough corners in the first image, `corners: {{name: [u, v], …}}`; three or more
+--distance M:SIGMA  without --reference: rough distance of the fingertips along the camera's axis, with its standard
+                    deviation (m)
 --live DEVICE       with --page: a camera instead of images, as in source.device
 --live-wait S       give up if the camera has sent no image for this long (s); default: never, the page reports the
                     fault
@@ -67,7 +81,9 @@ a new robot, without any configuration: drag corners onto the fingertips, on a p
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 no model from these images, with
 the reason: nothing is written then"""
 
-_NEED_CORNERS = ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source")
+_NEED_CORNERS = (
+    "camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source", "source", "distance",
+)  # fmt: skip
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
 
 
@@ -81,7 +97,8 @@ def _key(text: str) -> str:
 @Command(
     "teach", "measure how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
-    camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT,
+    camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT, response=RESPONSE,
+    distance=length,
 )  # fmt: skip
 def teach(arguments: Arguments) -> None:
     """Measure where each edge of the gripper really appears, in images taken at the reference calibration,
@@ -117,11 +134,13 @@ def teach(arguments: Arguments) -> None:
         wrong = f"{config.path} names {config.taught_path} already; without it, or without --out"
         raise InputError(f"--into-config: {wrong}")
     arguments.check_outputs("out", "picture")
-    taught = teach(config, arguments.image, jaw_opening_m=arguments.jaw_opening, command=command)
+    given = {"jaw_opening_m": arguments.jaw_opening, "response": arguments.response}
+    taught = teach(config, arguments.image, **given, command=command)
     arguments.save("out", taught.text().encode())
     if arguments.into_config:
         config = name_taught(config, out)
-    print("\n".join([*_summary(config, taught.taught), *_kept_lines(taught), *_written(config, out)]))
+    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(taught)]
+    print("\n".join([*lines, *_written(config, out)]))
     arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
@@ -191,18 +210,22 @@ def _teach_by_hand(arguments: Arguments) -> None:
     inputs = read_inputs(
         images, command=arguments.command_line(), **files, live=arguments.live, source=arguments.source,
         jaw_opening_m=arguments.jaw_opening, jaw_source=arguments.jaw_source,
-        robot=arguments.robot, camera_name=arguments.camera_name,
+        robot=arguments.robot, camera_name=arguments.camera_name, response=arguments.response,
+        distance_m=arguments.distance,
     )  # fmt: skip
     make_directory(inputs.folder)
+    arguments.check_outputs("picture")
     if arguments.page:
         _serve(arguments, page_session(inputs))
         return
     found, save = teach_from_file(inputs, arguments.corners)
     print("\n".join(in_words(found)))
-    saved = save(arguments.force)
+    saved, picture = save(arguments.force)
     if saved.exists:
         raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
     _say(saved)
+    if picture is not None:
+        arguments.save("picture", lambda: picture(arguments.picture.suffix))
 
 
 def _misuse(arguments: Arguments) -> str:
@@ -218,16 +241,16 @@ def _misuse(arguments: Arguments) -> str:
         return "--live-wait: goes with --live"
     if not images and live is None:
         return "no image; image files, or --page --live DEVICE"
-    if arguments.corners is not None and len(images) > 1:
-        return f"{len(images)} images; with --corners one, the image in which they were marked"
     if arguments.into_config:
         return "--into-config: --page and --corners add the line anyway; leave it out"
-    if arguments.picture is not None:
-        return "--picture goes with --config alone; look at the page"
+    if arguments.picture is not None and page:
+        return "--picture: the page shows it; leave it out"
     if config is not None and arguments.jaw_source is not None:
         return "--jaw-source: --config gives the source of jaw openings; leave it out"
     if config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
         return "--config names camera, gripper and reference already; either it, or --camera and --gripper"
+    if arguments.distance is not None and (config is not None or arguments.reference is not None):
+        return "--distance: the reference says where the gripper is; leave one of them out"
     return ""
 
 

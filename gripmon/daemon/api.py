@@ -9,8 +9,6 @@ import dataclasses
 from collections.abc import Sized
 from pathlib import Path
 
-import numpy as np
-
 from gripmon import monitor
 from gripmon.daemon.config import Config, ConfigError, SecondConfig
 from gripmon.io.sources import (
@@ -29,6 +27,7 @@ from gripmon.io.wire import Keys, Link
 from gripmon.judge.references import Keep
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Frame, FrameRecord, Image, MonitorState
+from gripmon.model.response import likely_linear
 
 
 class Monitor(monitor.Monitor):
@@ -90,10 +89,6 @@ def open_configured(config: Config | SecondConfig, link: Link | None = None) -> 
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 
 
-COLOURED_LEVELS = 1.0
-"""Mean difference between the largest and the smallest channel of an 8-bit image's pixels, in grey levels, above which
-it is a colour image: a codec makes less of a grey one."""
-
 ROUNDED_OPENING_M = 1e-6
 """By how much an opening in a table differs from the same one in a configuration at most, m: both are written with six
 digits."""
@@ -132,14 +127,12 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
 
 
 def unlike_light(config: Config, image: Image) -> str | None:
-    """What is odd about an image's grey levels: a colour camera's, of which the configuration doesn't say how they
-    follow the light.
+    """What is odd about an image's grey levels: a colour camera's, of which neither the configuration nor a taught
+    model says how they follow the light.
     """
-    told = config.settings.monitor.corners.edges.response != "linear"
-    if told or image.ndim < 3 or image.dtype != np.uint8 or float(np.ptp(image, axis=2).mean()) < COLOURED_LEVELS:
+    if config.says_response or config.settings.taught is not None or likely_linear([image]):
         return None
-    known = "monitor.corners.edges.response: srgb, unless its gamma is 1"
-    return f"grey levels of a colour camera mostly aren't in proportion to the light: {known}"
+    return "nothing says how the grey levels of this colour camera follow the light: gripmon teach finds it"
 
 
 def _unused_opening(config: Config, frame: Frame) -> str | None:

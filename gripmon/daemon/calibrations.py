@@ -210,7 +210,7 @@ def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> Non
 @dataclass(frozen=True)
 class PlaneInputs:
     """The inputs of :func:`gripmon.calibrate_plane` besides images and target; ``notes``: assumptions; ``files``: the
-    files that were read.
+    files that were read; ``response``: of the camera, auto if no configuration says it.
     """
 
     camera: GivenCamera
@@ -220,6 +220,7 @@ class PlaneInputs:
     cam_T_grip: Array | None
     notes: tuple[str, ...]
     files: tuple[Path, ...]
+    response: str
 
 
 def plane_inputs(
@@ -258,7 +259,14 @@ def plane_inputs(
         None if loaded is None or infer else loaded.cam_T_grip,
         notes,
         tuple(files),
+        "auto" if loaded is None else said_response(loaded),
     )
+
+
+def said_response(config: Config) -> str:
+    """How grey levels follow the light by a configuration or what it was taught with; auto if neither says it."""
+    said = config.says_response or config.taught is not None
+    return config.settings.monitor.corners.edges.response if said else "auto"
 
 
 def measure_again(
@@ -290,7 +298,10 @@ def measure_again(
             jaw_opening_m=opening_m, taught_edges=config.taught_edges,
         )  # fmt: skip
     else:
-        found = calibrate_plane(paths, lens, config.gripper, target, jaw_opening_m=opening_m, cam_T_grip=expected[0])
+        found = calibrate_plane(
+            paths, lens, config.gripper, target, jaw_opening_m=opening_m, cam_T_grip=expected[0],
+            response=said_response(config),
+        )  # fmt: skip
         if found.not_used:
             raise CalibrationError(found.not_used[0])
         cam_T_grip, covariance, doubts = found.cam_T_grip, found.covariance, found.fit.warnings

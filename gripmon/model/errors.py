@@ -6,7 +6,7 @@ command line prints that line and exits with the exit code.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -26,9 +26,16 @@ class InputError(ValueError):
 
 
 class NoResultError(RuntimeError):
-    """The input is sound, but there is no result: no usable frame, or a calibration that is rejected."""
+    """The input is sound, but there is no result: no usable frame, or a calibration that is rejected.
+
+    ``details``: what doesn't fit into the line; the command line prints them before it, a line each.
+    """
 
     exit_code = 3
+
+    def __init__(self, text: str = "", details: Sequence[str] | None = None) -> None:
+        super().__init__(text)
+        self.details = None if details is None else tuple(details)
 
 
 @contextmanager

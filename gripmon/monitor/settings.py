@@ -13,6 +13,7 @@ from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.judge.smoothing import SmoothingSettings
 from gripmon.judge.stream import StreamSettings
+from gripmon.model.response import Response
 from gripmon.track.edges import MeasurementSettings
 
 
@@ -83,3 +84,8 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     causes: CauseSettings = CauseSettings()
     stream: StreamSettings = StreamSettings()
     recalibration: RecalibrationSettings = RecalibrationSettings()
+
+    def with_response(self, response: Response) -> MonitorSettings:
+        """The same with another ``corners.edges.response``."""
+        edges = msgspec.structs.replace(self.corners.edges, response=response)
+        return msgspec.structs.replace(self, corners=msgspec.structs.replace(self.corners, edges=edges))

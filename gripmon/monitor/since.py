@@ -313,10 +313,13 @@ class AtReferences:
             self._end()  # the mount was knocked
             return
         if growing is not anchor:
-            self._growing, self._since_ns, self._openings_m = anchor, stamp_ns, []
+            self._growing, self._stamps_ns, self._openings_m = anchor, [], []
+        self._stamps_ns.append(stamp_ns)
         self._openings_m.append(jaw_opening_m)
+        # A mount that creeps meanwhile stands at the average's place in the middle of its frames.
+        since_ns = self._stamps_ns[(len(self._stamps_ns) - 1) // 2]
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
-        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, self._since_ns, anchor.misread, anchor.proven)
+        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, since_ns, anchor.misread, anchor.proven)
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +24,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.model.response import Response, ResponseSeen, response_of
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.drawing import draw_taught
 from gripmon.teach.kept import Kept, as_frames, kept, with_help
@@ -64,18 +65,22 @@ class Configured(Protocol):
     def jaw_opening_m(self) -> float | None: ...
     @property
     def settings(self) -> _Settings: ...
+    @property
+    def says_response(self) -> bool: ...
 
 
 @dataclass(frozen=True)
 class Teaching:
     """How every edge looks in the images (``taught``), and the ``model`` that a configuration names; ``images``: those
-    that were taught from.
+    that were taught from; ``settings``: of the monitor, with the ``response`` of the camera.
     """
 
     taught: Taught
     model: TaughtModel
     config: Configured
     images: tuple[TeachingImage, ...]
+    settings: MonitorSettings
+    response: ResponseSeen
 
     @property
     def edges(self) -> TaughtEdges:
@@ -85,7 +90,7 @@ class Teaching:
     def kept(self) -> tuple[Kept, Kept]:
         """What a monitor says over the images without what was taught, and with it."""
         config, frames = self.config, as_frames(self.images)
-        untaught = Rig(config.camera, config.gripper, config.settings.monitor)
+        untaught = Rig(config.camera, config.gripper, self.settings)
         taught = untaught._replace(taught=self.edges)
         before, after = (kept(rig, config.reference, frames) for rig in (untaught, taught))
         return before, with_help(after, taught, config.reference, lambda: frames)
@@ -96,10 +101,18 @@ class Teaching:
 
     def picture(self, ending: str = ".png") -> bytes:
         """The first image used, with what was taught drawn, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
-        config = self.config
+        config, first = self.config, self.images[0]
         edges = TaughtEdges.of_model(self.model, config.gripper)
-        drawn = draw_taught(config.camera, config.gripper, config.cam_T_grip, self.images[0], edges, self.model)
-        return bytes(cv2.imencode(ending, drawn)[1].tobytes())
+        return picture_of(config.camera, config.gripper, config.cam_T_grip, first, edges, self.model, ending)
+
+
+def picture_of(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, first: TeachingImage, edges: TaughtEdges, model: TaughtModel,
+    ending: str,
+) -> bytes:  # fmt: skip
+    """The image with what was taught drawn, in the format of a file's ``ending``."""
+    drawn = draw_taught(camera, gripper, cam_T_grip, first, edges, model)
+    return bytes(cv2.imencode(ending, drawn)[1].tobytes())
 
 
 def teach(
@@ -107,13 +120,15 @@ def teach(
     images: Sequence[str | Path],
     *,
     jaw_opening_m: float | None = None,
+    response: str = "auto",
     command: str = "gripmon.teach.api.teach",
 ) -> Teaching:
     """Measure how the gripper's edges look in image files taken at the reference calibration; of a folder, all images.
 
     ``config``: load it without a taught model (``with_taught=False``).  ``jaw_opening_m``: the opening in all images
-    (m); if None, the configuration's fixed one, else that in a ``timestamps.csv`` beside each image.  ``command`` is
-    written into the model's provenance.
+    (m); if None, the configuration's fixed one, else that in a ``timestamps.csv`` beside each image.  ``response``:
+    linear or srgb; auto: as the configuration says, else as the images show.  ``command`` is written into the model's
+    provenance.
 
     Raises :class:`~gripmon.model.errors.InputError` for images that can't be used,
     :class:`~gripmon.model.errors.NoResultError` if nothing can be taught from them.
@@ -138,12 +153,29 @@ def teach(
     shown = [
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures
     ]
+    seen = told_response(pictures, response, settings.corners.edges.response if config.says_response else None)
+    settings = settings.with_response(seen.response)
     try:
         taught = teach_images(Rig(config.camera, gripper, settings), config.reference, shown)
     except TeachingRefused as refused:
-        raise NoResultError(f"teach: {refused}") from None
+        raise NoResultError(f"teach: {refused}", refused.notes) from None
     model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)
-    return Teaching(taught, model, config, tuple(taught.used(shown)))
+    return Teaching(taught, model, config, tuple(taught.used(shown)), settings, seen)
+
+
+def told_response(pictures: Sequence[Picture], asked: str, configured: Response | None) -> ResponseSeen:
+    """The response that is ``asked`` for; for auto the one that is ``configured`` (None: not said), else what the
+    pictures show.  Raises :class:`~gripmon.model.errors.InputError` where what is asked contradicts what is configured.
+    """
+    if configured is not None:
+        if asked not in ("auto", configured):
+            wrong = f"{asked}, and the configuration has monitor.corners.edges.response: {configured}"
+            raise InputError(f"{wrong}; the same, or leave one of them out", "response")
+        found = response_of([p.image for p in pictures], "auto", [p.jaw_opening_m for p in pictures])
+        against = found.gamma > 0.0 and "unknown" not in (found.response, configured) and found.response != configured
+        why = f"as configured, but {found.why}" if against else "as configured"
+        return replace(found, response=configured, why=why) if against else ResponseSeen(configured, why)
+    return response_of([p.image for p in pictures], asked, [p.jaw_opening_m for p in pictures])
 
 
 def _check_different(pictures: Sequence[Picture]) -> None:

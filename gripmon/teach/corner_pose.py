@@ -249,15 +249,18 @@ def prior_of(reference: ReferenceRecord) -> Prior:
     return Prior(from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6)))
 
 
-def usual_view(camera: Camera, gripper: Gripper, jaw_opening_m: float | None) -> Prior:
+def usual_view(
+    camera: Camera, gripper: Gripper, jaw_opening_m: float | None, distance_m: tuple[float, float] | None = None
+) -> Prior:
     """A camera that looks at the fingertips from the gripper's near side (-y), close enough for them to fill a good
-    part of the image; its turn about its own axis is free.
+    part of the image, or as far away as it is said to be; its turn about its own axis is free.
     """
     corners_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     extent_m = float(np.ptp(corners_m, axis=0).max())
     depth_m = extent_m * camera.fx_px / (_GRIPPER_SPAN * camera.width_px)
+    depth_m, depth_sigma_m = (depth_m, 0.4 * depth_m) if distance_m is None else distance_m
     cam_T_grip = make_transform(exp_rotation(np.array([_TILT_RAD, 0.0, 0.0])), np.array([0.0, 0.0, depth_m]))
-    sigma = [0.3 * depth_m, 0.3 * depth_m, 0.4 * depth_m, 0.4, 0.4, 2.0]
+    sigma = [0.3 * depth_m, 0.3 * depth_m, depth_sigma_m, 0.4, 0.4, 2.0]
     return Prior(cam_T_grip, np.diag(np.square(sigma)))
 
 

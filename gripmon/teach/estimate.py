@@ -26,8 +26,8 @@ from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 from gripmon.teach.inset import INSET_SIGMA_M
-from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
-from gripmon.teach.views import SampledEdge, TeachingRefused, View, Viewer
+from gripmon.teach.lines import FEWEST_POINTS, SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
+from gripmon.teach.views import TAKE_MEASURED, SampledEdge, TeachingRefused, View, Viewer
 from gripmon.track.edges.roles import along_fingers
 from gripmon.track.edges.taught import PoseOffset, TaughtEdge, sight_axes
 
@@ -251,22 +251,35 @@ NOTED_PX = 1.0
 """Offset of the reference above which there is a note: in a view turned by 3° a twentieth of it becomes an error."""
 
 TAUGHT_SHARE = 0.5
-"""Least part of the outlines in view, by search lines, that must be seen: with less, something hides the gripper."""
+"""Least part of the straight outlines in view, by search lines, that must be seen: with less, something hides the
+gripper."""
+
+_NAMED = 3  # edges that a refusal names; more make no line that anybody reads
 
 LOST_SHARE = 0.25
 """Part below which the gripper, or a finger, counts as absent."""
 
 
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
-    """Refuse if too little of the gripper, or of one finger, is seen."""
+    """Refuse if too little of the gripper, or of one finger, is seen: of what can be seen as lines, straight outlines
+    that are long enough for one.
+    """
     profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
+    profiles = np.where(viewer.gripper.edge_curved | (profiles < FEWEST_POINTS * len(views)), 0, profiles)
+    if not profiles.any():
+        raise TeachingRefused(
+            "no outline in view is straight, and only straight edges are taught; the gripper file without teaching"
+        )
     seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
     share = seen.sum() / max(profiles.sum(), 1)
     if share < TAUGHT_SHARE:
         found = "the gripper isn't found: " if share < LOST_SHARE else ""
+        missing = [viewer.gripper.edge_ids[e] for e in np.flatnonzero((profiles > 0) & (seen == 0)).tolist()]
+        more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
         raise TeachingRefused(
-            f"{found}only {100.0 * share:.0f} % of the outlines in view are seen as lines; at least "
-            f"{100.0 * TAUGHT_SHARE:.0f} %: images in focus, at the reference and their jaw openings, the fingers free"
+            f"{found}only {100.0 * share:.0f} % of the straight outlines in view are seen as lines (not "
+            f"{', '.join(missing[:_NAMED])}{more}); at least {100.0 * TAUGHT_SHARE:.0f} %: images in focus, at the "
+            "reference and their jaw openings, the fingers free"
         )
     for finger, name in enumerate(viewer.gripper.finger_ids):
         own = viewer.gripper.edge_finger == finger
@@ -300,13 +313,14 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
     jaw_m, jaw_sigma_m = float(opened.common[6]), float(np.sqrt(opened.common_covariance[6, 6] + stated[6, 6]))
     # Bevels on the inner sides alone look like a wider opening.
     allowed_m = JAW_SIGMAS * jaw_sigma_m + SHAPE_M
-    faults = []
+    faults, measured = [], []
     if pose_square > GATE_SQUARE:
         times = np.sqrt(pose_square / GATE_SQUARE)
         faults.append(
             f"the gripper is off the reference, {viewer.distance(pose)}, {times:.1f} times what "
-            f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose, covariance)}"
+            f"position_sigma_m and rotation_sigma_rad allow: {TAKE_MEASURED}"
         )
+        measured = [viewer.measured_note(pose, covariance)]
     if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:
         faults.append(
             f"the image shows a jaw opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m is "
@@ -315,7 +329,7 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
         )
     if faults:
         likelier_first = faults if moved.usual_own_m[0] <= opened.usual_own_m[0] else faults[::-1]
-        raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}")
+        raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}", measured)
     away_px = max(float(np.abs(e.sampled.rows[:, :6] @ pose).max()) * e.sampled.per_m for e in lines.values())
     turn = pose[3:]
     if turn @ np.linalg.solve(covariance[3:, 3:], turn) <= chi_square_limit(0.05, 3):

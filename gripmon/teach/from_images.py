@@ -25,6 +25,7 @@ from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
+from gripmon.model.response import in_light, response_of
 from gripmon.teach.finger_depth import PlacedOutlines, place
 from gripmon.teach.image_drawing import draw_outlines
 from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines, tip_width
@@ -133,6 +134,7 @@ def gripper_from_images(
     within: tuple[int, int, int, int] | None = None,
     name: str = "gripper",
     provenance: Provenance | None = None,
+    response: str = "auto",
     progress: Progress = quiet,
 ) -> GripperFromImages:
     """A gripper and its reference from five to some hundred ``images`` in front of changing backgrounds.
@@ -141,7 +143,8 @@ def gripper_from_images(
     opening with fewer than five images isn't used.  ``fingers``: how many are seen, 1 or 2 (default: 2, and anything
     else is refused); ``within`` (left, top, right, bottom): where in the image they are, px.  The scale comes from
     ``distance_m`` (of the fingertips from the camera, along the optical axis), ``finger_width_m`` (of a fingertip,
-    across the jaws), a ``reference`` calibration, or from several openings.
+    across the jaws), a ``reference`` calibration, or from several openings.  ``response``: how grey levels follow the
+    light, linear or srgb; auto: as the images show it.
 
     Raises :class:`~gripmon.model.errors.InputError` for wrong arguments,
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
@@ -152,9 +155,10 @@ def gripper_from_images(
     for file, image in taken:
         check_size(file, image, camera.width_px, camera.height_px)
     least = smallest_noise(taken[0][1])
-    grey = [grey_levels(image) for _, image in taken]
+    light = response_of([image for _, image in taken], response, openings_m)
+    grey = [grey_levels(in_light(image, light.response)) for _, image in taken]
     groups = _groups(openings_m, grey, least)
-    notes: list[str] = []
+    notes = [*light.notes]
     left_out: dict[str, str] = {}
     with progress(None, "step") as step:
         see = partial(see_opening, made, least_noise=least, step=step, fingers=fingers, within=within)
@@ -196,7 +200,8 @@ def gripper_from_images(
     shown = taken[groups[first][seen.matte.kept[0]]][1]
     names = tuple(outline.name for outline in outlines)
     return GripperFromImages(
-        gripper, cam_T_grip, covariance, opening_m, float(np.median(sigmas)), used, left_out, tuple(notes), camera,
+        gripper, cam_T_grip, covariance, opening_m, float(np.hypot(np.median(sigmas), light.sigma_px)), used, left_out,
+        tuple(notes), camera,
         seen,
         shown, names, float(np.sqrt(np.square(rms).mean())),
     )  # fmt: skip

@@ -31,6 +31,7 @@ from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
+from gripmon.model.response import in_light, response_of
 from gripmon.model.targets import Target, TargetError, parse_target, refuse_other_size
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
@@ -248,6 +249,7 @@ def calibrate_plane(
     jaw_opening_m: float | None = None,
     cam_T_grip: Array | None = None,
     other_target: bool = False,
+    response: str = "auto",
     progress: Progress = quiet,
 ) -> HandEyeOnPlate:
     """``cam_T_grip`` from images of the gripper standing on a calibration plate (the Plane Coincidence Constraint).
@@ -255,6 +257,7 @@ def calibrate_plane(
     Where to look for the gripper: rough ``corners`` (name: (u, v) in px; for all images or for each), or a rough
     calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, named as in
     :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.
+    ``response``: how grey levels follow the light, linear or srgb; auto: as the images show it.
     :class:`~gripmon.model.targets.OtherSizeError` for the pattern of the camera's target in another size, unless
     ``other_target`` confirms it.
     """
@@ -267,13 +270,15 @@ def calibrate_plane(
         else KnownGripper(given, gripper, checked_opening(gripper, jaw_opening_m), cam_T_grip)
     )
     taken = _of_camera(images, given.lens)
+    light = response_of([image for _, image in taken], response)
     used: list[ImageOnPlate] = []
     shown: Image | None = None
     not_used = []
     with progress(len(taken), "image") as step:
         for (name, image), rough in zip(taken, _for_each(corners, len(taken)), strict=True):
             try:
-                used.append(method.measure(image, _sighting(image, target, name), rough))
+                lit = in_light(image, light.response)
+                used.append(method.measure(lit, _sighting(image, target, name), rough))
                 shown = image if shown is None else shown
             except CalibrationError as error:
                 not_used.append(f"{name}: {error}")
@@ -282,7 +287,10 @@ def calibrate_plane(
         more = f" (and {len(not_used) - 1} more images)" if len(not_used) > 1 else ""
         raise CalibrationError(f"{not_used[0]}{more}")
     fit = average([image.coincidence for image in used], gripper is None)
-    return HandEyeOnPlate(fit, method, tuple(used), tuple(not_used), _notes(method, jaw_opening_m), shown)
+    sigma_m = light.sigma_px * float(fit.cam_T_grip[2, 3]) / given.lens.fx_px
+    fit = replace(fit, covariance=fit.covariance + np.diag([sigma_m**2] * 3 + [0.0] * 3))
+    notes = (*_notes(method, jaw_opening_m), *light.notes)
+    return HandEyeOnPlate(fit, method, tuple(used), tuple(not_used), notes, shown)
 
 
 def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamera:

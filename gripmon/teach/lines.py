@@ -19,7 +19,7 @@ _START_PX = 1.0  # half width of a line in the search: two lines closer than thi
 _FLOOR_PX = 0.05  # least assumed scatter of edge points: pixels are that coarse
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
-_FEWEST_POINTS = 6
+FEWEST_POINTS = 6  # edge points of a line
 _ROUNDS = 20
 _SETTLED_PX = 1e-4
 
@@ -64,7 +64,7 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
 
     Of two lines supported equally well, the one closer to the expected line is taken.
     """
-    if len(points.way) < _FEWEST_POINTS:
+    if len(points.way) < FEWEST_POINTS:
         return None
     shifts = np.arange(-round(reach_px / _STEP_PX), round(reach_px / _STEP_PX) + 1) * _STEP_PX
     starts = np.array([expected_px + s + 0.5 * t * np.array([-1.0, 1.0]) for s in shifts for t in _TILTS_PX])
@@ -95,7 +95,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
         residual = root * (points.offset_px - design @ ends_px)
         weight = tukey_weights(np.abs(residual), width)
         near = np.abs(residual) < width
-        if np.count_nonzero(near) < _FEWEST_POINTS:
+        if np.count_nonzero(near) < FEWEST_POINTS:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
         width = min(TUKEY * scale, _START_PX)
@@ -109,7 +109,7 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
             break
     residual = root * (points.offset_px - design @ ends_px)
     inlier = np.abs(residual) < width
-    if np.count_nonzero(inlier) < _FEWEST_POINTS:
+    if np.count_nonzero(inlier) < FEWEST_POINTS:
         return None
     # Neighbours see the same pixels and the same texture: a whole stretch of them counts as one point.
     rms_px = float(np.sqrt(np.mean(np.square(residual[inlier]))))

@@ -35,6 +35,7 @@ from gripmon.teach.lines import find_line, of_image, settle_line
 from gripmon.teach.play import with_play
 from gripmon.teach.views import (
     REMEDIES,
+    TAKE_MEASURED,
     ImageRefused,
     SampledEdge,
     TeachingImage,
@@ -109,10 +110,12 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
 
 
 def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
-    """The refusal, with the images that were left out before, each with its reason."""
+    """The refusal, with the images that were left out before, each with its reason, as notes."""
     if not left_out:
         return refused
-    return TeachingRefused(f"{refused}; and left out before: {'; '.join(left_out.values())}")
+    count = f"{len(left_out)} image{'s' * (len(left_out) > 1)}"
+    reasons = [f"left out: {why}" for why in left_out.values()]
+    return TeachingRefused(f"{refused}; and left out before: {count}", [*reasons, *refused.notes])
 
 
 def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
@@ -124,12 +127,12 @@ def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequ
     except TeachingRefused:
         for image, fit in zip(images, fits, strict=True):
             if fit is None and (found := viewer.elsewhere(image)) is not None:
-                raise ImageRefused(image, _elsewhere(viewer, image, found)) from None
+                raise _elsewhere(viewer, image, found) from None
         raise
 
 
-def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
-    """Why an image that shows the gripper elsewhere is refused, and what to do; the pose to take allows for bevels."""
+def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> ImageRefused:
+    """The refusal of an image that shows the gripper elsewhere; the pose to take, in its notes, allows for bevels."""
     there = viewer.at(found.cam_T_grip, image)
     views = [there.view(image, there.fitted(image))]
     lines, _ = _lines(there, views, search=True)
@@ -137,16 +140,14 @@ def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> str:
     try:
         check_enough(there, views, lines)
     except TeachingRefused:
-        remedies = REMEDIES
+        remedies, notes = REMEDIES, []
     else:
         moved = found_off(there, lines)
         pose = perturb(found.cam_T_grip, moved.common[:6])
         motion = perturbation_between(viewer.ref_cam_T_grip, pose)
-        remedies = viewer.advice(motion, moved.common_covariance[:6, :6])
-    return (
-        f"the gripper is {viewer.off_reference_px(found):.1f} px off the reference, {viewer.distance(motion)}; at most "
-        f"{viewer.reach_px:g} px: {remedies}"
-    )
+        remedies, notes = TAKE_MEASURED, [viewer.measured_note(motion, moved.common_covariance[:6, :6])]
+    why = f"the gripper is {viewer.off_reference_px(found):.1f} px off the reference, {viewer.distance(motion)}"
+    return ImageRefused(image, f"{why}; at most {viewer.reach_px:g} px: {remedies}", notes)
 
 
 def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:

@@ -4,6 +4,7 @@ radians, image coordinates in px (centre of the first pixel: 0, 0), as everywher
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import cv2
@@ -24,7 +25,11 @@ class BadRequest(ValueError):
 
 
 class SavingRefused(Exception):
-    """Nothing was written; the text gives the reason in one line."""
+    """Nothing was written; the text gives the reason in one line, ``notes`` the rest."""
+
+    def __init__(self, text: str, notes: Sequence[str] = ()):
+        super().__init__(text)
+        self.notes = tuple(notes)
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

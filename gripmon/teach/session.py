@@ -84,19 +84,22 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known before teaching; ``reference`` None before the hand/eye calibration."""
+    """What is known before teaching; ``reference`` None before the hand/eye calibration; ``distance_m``: rough distance
+    of the TCP along the camera's axis, with its standard deviation.
+    """
 
     camera: Camera
     gripper: Gripper
     settings: MonitorSettings
     reference: ReferenceRecord | None
     camera_error: CameraError | None = None
+    distance_m: tuple[float, float] | None = None
 
     def prior(self, jaw_opening_m: float | None) -> Prior:
         """The expected pose of the gripper before any corner is set."""
         if self.reference is not None:
             return prior_of(self.reference)
-        return usual_view(self.camera, self.gripper, jaw_opening_m)
+        return usual_view(self.camera, self.gripper, jaw_opening_m, self.distance_m)
 
     def first_places(self, jaw_opening_m: float | None) -> dict[str, Array]:
         """Positions at which the page first shows the corners, px."""

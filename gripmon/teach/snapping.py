@@ -20,8 +20,9 @@ from gripmon.teach.views import NARROW
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 from gripmon.track.edges.settling import ZOOMS, Expected
 
-FEWEST_PUT = 4
-"""Corners that must be set by hand before edges are searched for, where there is no reference."""
+FEWEST_PUT = 3
+"""Corners that must be set by hand before edges are searched for, where there is no reference: three leave up to four
+poses (Grunert, 1841), of which the edges tell the right one."""
 
 SURE_SHARE = 0.8
 """Inlier ratio from which no other pose is tried."""
@@ -43,8 +44,8 @@ _OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; gain
 _TWIN_MISFIT = 0.25  # largest misfit of mirrored corners, over the smallest distance between two
 
 ON_A_LINE = (
-    "the corners lie on a line: the gripper's rotation about it is undetermined; one more corner beside it, or "
-    "a hand/eye calibration (--reference FILE)"
+    "the corners lie on a line, and no edges show the gripper's rotation about it; one more corner beside it, the "
+    "rough distance (--distance M:SIGMA), or a hand/eye calibration (--reference FILE)"
 )
 MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
 NOTHING_SEEN = "no fingers are seen here; corners nearer to the tips"

@@ -33,19 +33,24 @@ from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 _CLEAR_SHARE = 0.9  # inlier ratio where the gripper was expected; below it it is searched for elsewhere
 _DENSE = 4096  # search lines: as many as there are pixels along the edges
 REMEDIES = "images at the reference; or correct gripper file or jaw opening; or calibrate again"
+TAKE_MEASURED = f"{REMEDIES}, or take the measured pose"
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 
 
 class TeachingRefused(ValueError):
-    """These images can't be taught from; the text is ``what is wrong; what would be right``."""
+    """These images can't be taught from; the text is ``what is wrong; what would be right``, ``notes`` the rest."""
+
+    def __init__(self, text: str, notes: Sequence[str] = ()):
+        super().__init__(text)
+        self.notes = tuple(notes)
 
 
 class ImageRefused(TeachingRefused):
     """This image can't be taught from; others may be."""
 
-    def __init__(self, image: TeachingImage, why: str):
-        super().__init__(f"{image.name}: {why}")
+    def __init__(self, image: TeachingImage, why: str, notes: Sequence[str] = ()):
+        super().__init__(f"{image.name}: {why}", notes)
         self.image = image
 
 
@@ -224,11 +229,11 @@ class Viewer:
             f"position_sigma_m: {sigma[:3].max():.2g}, rotation_sigma_rad: {sigma[3:].max():.2g}}}"
         )
 
-    def advice(self, motion: Array, covariance: Array) -> str:
-        """What to do about a reference with an error of a motion (6,), known with the covariance (6, 6), which bevels
-        have to be part of.
+    def measured_note(self, motion: Array, covariance: Array) -> str:
+        """The note with the pose to take for a reference with an error of a motion (6,), known with the covariance
+        (6, 6), which bevels have to be part of.
         """
-        return f"{REMEDIES}, or take the measured pose with its standard deviations as {self.pose(motion, covariance)}"
+        return f"note: the measured pose with its standard deviations: {self.pose(motion, covariance)}"
 
 
 class SampledEdge(NamedTuple):

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.daemon.config.checks import (
@@ -72,6 +74,8 @@ class Config:
     reference: ReferenceRecord
     taught: TaughtModel | None = None
     calibrated: CalibrationFiles = field(default_factory=CalibrationFiles)
+    says_response: bool = True
+    """Whether the file itself says ``monitor.corners.edges.response``; else a taught model does."""
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
@@ -153,7 +157,8 @@ def load_config(
     gripper_path = named_file(path, "gripper", settings.gripper, "a gripper file")
     gripper = read_gripper(gripper_path)
     reference = _reference(path, settings, gripper, calibrated)
-    config = Config(path, settings, camera, gripper, gripper_path, reference, calibrated=calibrated)
+    said = "response" in _within(values, "monitor", "corners", "edges")
+    config = Config(path, settings, camera, gripper, gripper_path, reference, None, calibrated, said)
     fault = (
         monitor_fault(settings.monitor)
         or order_fault(settings)
@@ -168,7 +173,14 @@ def load_config(
             load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
         raise ConfigError.of(path, fault)
-    return replace(config, taught=_taught(config)) if with_taught else config
+    return _with_taught(config) if with_taught else config
+
+
+def _within(values: object, *keys: str) -> dict[str, object]:
+    """The section at these keys, one within the other; empty if it isn't there."""
+    for key in keys:
+        values = values.get(key) if isinstance(values, dict) else None
+    return values if isinstance(values, dict) else {}
 
 
 def check_network(config: Config | SecondConfig) -> Joining | None:
@@ -223,17 +235,23 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
     return configured(to_record(cam_T_grip), covariance, settings.reference.id)
 
 
-def _taught(config: Config) -> TaughtModel | None:
-    """The configuration's taught model; refused unless it was taught with the same camera, gripper and settings."""
-    if config.settings.taught is None:
-        return None
-    path = named_file(config.path, "taught", config.settings.taught, "a file of gripmon teach")
+def _with_taught(config: Config) -> Config:
+    """The configuration with its taught model, if it names one; refused unless it was taught with the same camera,
+    gripper and settings.  What the file doesn't say of the grey levels' response holds as taught.
+    """
+    settings = config.settings
+    if settings.taught is None:
+        return config
+    path = named_file(config.path, "taught", settings.taught, "a file of gripmon teach")
     model = read_settings(path, TaughtModel)
-    edges = config.settings.monitor.corners.edges
+    if not config.says_response:
+        monitor = settings.monitor.with_response(model.edge_settings.response)
+        settings = msgspec.structs.replace(settings, monitor=monitor)
+    edges = settings.monitor.corners.edges
     fault = mismatch(model, config.camera, config.gripper, config.cam_T_grip, edges)
     if fault is not None:
         raise ConfigError(path, *fault)
-    return model
+    return replace(config, settings=settings, taught=model)
 
 
 def _ros2_fault(settings: Settings) -> Fault | None:

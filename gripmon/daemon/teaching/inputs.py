@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,9 @@ from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import check_size, image_in
 from gripmon.model.records import ReferenceRecord, Transform
+from gripmon.model.response import ResponseSeen
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.api import Picture, read_picture
+from gripmon.teach.api import Picture, read_picture, told_response
 from gripmon.teach.corner_pose import CameraError, corners_fault
 from gripmon.teach.outlines import RoughCorners
 from gripmon.teach.page_server import OutlineSession
@@ -43,7 +44,8 @@ ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 @dataclass(frozen=True)
 class Inputs:
     """Everything but the corners.  ``folder``: where files are written; ``config``: the given configuration, if any;
-    ``calibrations``: files of ``gripmon calibrate`` that the configuration names instead of sections, by key.
+    ``response``: of the camera, None until a live one has sent images; ``calibrations``: files of ``gripmon calibrate``
+    that the configuration names instead of sections, by key.
     """
 
     setup: Setup
@@ -58,6 +60,7 @@ class Inputs:
     live: str | None
     calibrations: dict[str, Path]
     jaw_source: str | None = None
+    response: ResponseSeen | None = None
 
 
 def read_inputs(
@@ -75,10 +78,14 @@ def read_inputs(
     jaw_source: str | None = None,
     robot: str | None = None,
     camera_name: str | None = None,
+    response: str = "auto",
+    distance_m: tuple[float, float] | None = None,
 ) -> Inputs:
     """Read and check the input: either ``config``, or ``gripper`` with ``camera`` or ``reference`` and values for the
     configuration to be written.  ``command``: for the files' provenance; ``live``: a camera instead of images;
-    ``source``: of the configuration's frames (None: that camera, or the images' folder).
+    ``source``: of the configuration's frames (None: that camera, or the images' folder); ``response``: as in
+    :func:`gripmon.teach.api.teach`; ``distance_m``: of the TCP, where there is no reference, with its standard
+    deviation.
     """
     cv2.setNumThreads(1)
     given = None
@@ -96,6 +103,13 @@ def read_inputs(
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = setup.settings.bit_depth
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
+    said = None if given is None or not given.says_response else given.settings.monitor.corners.edges.response
+    # A live camera's images come later: FileSaving looks at those that are kept.
+    later = live is not None and said is None and response == "auto"
+    light = None if later else told_response(pictures, response, said)
+    setup = replace(setup, distance_m=distance_m)
+    if light is not None:
+        setup = replace(setup, settings=setup.settings.with_response(light.response))
     frames: SourceSettings
     try:
         if live is not None:
@@ -120,6 +134,7 @@ def read_inputs(
         live=live,
         calibrations={key: path for key, path in calibrations.items() if path and "schema" in read_yaml(path)},
         jaw_source=jaw_source,
+        response=light,
     )
 
 

@@ -23,13 +23,15 @@ from gripmon.daemon.teaching.written import config_text, with_taught
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.api import Picture, taught_model, to_yaml
+from gripmon.model.response import ResponseSeen
+from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
 from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
-from gripmon.track.edges import TaughtModel
+from gripmon.track.edges import TaughtEdges, TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
 
@@ -39,6 +41,8 @@ class FileSaving:
 
     def __init__(self, inputs: Inputs):
         self._inputs = inputs
+        self.picture: Callable[[str], bytes] | None = None
+        """The first image with what was taught, once that is saved, in the format of a file's ending."""
 
     @property
     def _paths(self) -> dict[str, Path]:
@@ -66,7 +70,7 @@ class FileSaving:
 
     def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
         """As :class:`gripmon.teach.session.Saving`."""
-        paths = self._paths
+        paths, light = self._paths, self._light(pictures)
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
         if not wanted:
@@ -94,7 +98,17 @@ class FileSaving:
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
         follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
-        return Saved(written=written, notes=tuple(notes), next=follows)
+        return Saved(written=written, notes=(*light.notes, *notes), next=follows)
+
+    def _light(self, pictures: Sequence[Picture]) -> ResponseSeen:
+        """The camera's response, a live one's from the images that are kept."""
+        inputs = self._inputs
+        if inputs.response is not None:
+            return inputs.response
+        light = told_response(pictures, "auto", None)
+        settings = inputs.setup.settings.with_response(light.response)
+        self._inputs = replace(inputs, setup=replace(inputs.setup, settings=settings))
+        return light
 
     def _names_it_already(self, order: SaveOrder) -> bool:
         """Whether the given configuration stays as it is: it names a taught model already, or none is saved."""
@@ -141,11 +155,15 @@ class FileSaving:
         try:
             taught, _ = setup.taught(reference, images)
         except TeachingRefused as refused:
-            raise SavingRefused(f"no taught model: {refused}; or save without it: on the page untick it") from None
+            why = f"no taught model: {refused}; or save without it: on the page untick it"
+            raise SavingRefused(why, refused.notes) from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
         model = taught_model(
             taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files
         )
+        pose, first = from_record(reference.cam_T_grip), taught.used(images)[0]
+        edges = TaughtEdges.of_model(model, setup.gripper)
+        self.picture = lambda ending: picture_of(setup.camera, setup.gripper, pose, first, edges, model, ending)
         return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
     def _corners(self, order: SaveOrder, found: Evaluation, image: str) -> str:
@@ -227,9 +245,11 @@ def page_session(inputs: Inputs) -> TeachSession:
     return TeachSession(inputs.setup, inputs.pictures, saving.labels(), saving, live)
 
 
-def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[bool], Saved]]:
-    """The evaluation of the corners in a file for the single picture, and a function that saves it (True: replace
-    existing files).
+def teach_from_file(
+    inputs: Inputs, path: Path
+) -> tuple[Evaluation, Callable[[bool], tuple[Saved, Callable[[str], bytes] | None]]]:
+    """The evaluation of the corners in a file for the first picture, and a function that teaches from all pictures and
+    saves it (True: replace existing files); this returns also what draws it (:attr:`FileSaving.picture`).
 
     Raises :class:`~gripmon.model.errors.InputError` for invalid corners, and
     :class:`~gripmon.model.errors.NoResultError` if nothing can be taught from them.
@@ -246,11 +266,12 @@ def teach_from_file(inputs: Inputs, path: Path) -> tuple[Evaluation, Callable[[b
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
     put = CornersRequest(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
 
-    def save(replace: bool) -> Saved:
+    def save(replace: bool) -> tuple[Saved, Callable[[str], bytes] | None]:
+        saving = FileSaving(inputs)
         order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=replace)
         try:
-            return FileSaving(inputs).save(order, found, 0, inputs.pictures)
+            return saving.save(order, found, 0, inputs.pictures), saving.picture
         except SavingRefused as refused:
-            raise NoResultError(f"teach: {refused}") from None
+            raise NoResultError(f"teach: {refused}", refused.notes) from None
 
     return found, save

@@ -7,7 +7,7 @@ defaults as commented-out lines.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -21,6 +21,7 @@ from gripmon.io.sources.files import opening_beside
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
+from gripmon.monitor import MonitorSettings
 from gripmon.teach.corner_pose import CornerPose
 from gripmon.teach.messages import SaveOrder
 from gripmon.teach.session import Evaluation
@@ -62,7 +63,7 @@ def config_text(
         parts.append(lines_of(source, 2))
     if inputs.setup.gripper.has_jaw:
         parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
-    parts += ["", _defaults()]
+    parts += ["", _defaults(inputs.setup.settings)]
     return "\n".join(parts) + "\n"
 
 
@@ -145,12 +146,25 @@ def _in_table(inputs: Inputs) -> bool:
         return False
 
 
-def _defaults() -> str:
-    """The defaults, commented out."""
+def _defaults(monitor: MonitorSettings) -> str:
+    """The defaults, commented out but for the response of the camera as it was found."""
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
     ]
     for field in msgspec.structs.fields(Settings):
         if field.name in _DEFAULT_SECTIONS:
-            lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
+            value = monitor if field.name == "monitor" else field.default
+            section = [f"# {field.name}:", *lines_of(value, 2, off=True).splitlines()]
+            lines += _on(section, "corners", "edges", "response") if value is monitor else section
     return "\n".join(lines)
+
+
+def _on(section: Sequence[str], *keys: str) -> list[str]:
+    """A section that is commented out with the key at this path taken back in."""
+    out, level = list(section), 0
+    for number, line in enumerate(section):
+        if line.startswith(f"# {'  ' * level}{('monitor', *keys)[level]}:"):
+            out[number], level = line.removeprefix("# "), level + 1
+            if level > len(keys):
+                break
+    return out

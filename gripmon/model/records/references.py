@@ -73,7 +73,10 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     frames: Annotated[int, Meta(description="how many of them were averaged")]
     since: Since
     since_ns: Annotated[
-        int, Meta(description="stamp of the newest of its own frames, or of the first proved one, Unix ns")
+        int,
+        Meta(
+            description="stamp of the newest of its own frames, or of the middle one of the first proved ones, Unix ns"
+        ),
     ]
     misread: Annotated[
         float, Meta(description="probability that what looked like the fingers' ends in all of them was something else")

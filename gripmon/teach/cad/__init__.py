@@ -1,7 +1,8 @@
-"""A gripper file from CAD: meshes (STL, OBJ, PLY), URDF with its joints, ViSP's .cao.
+"""A gripper file from CAD: meshes (STL, OBJ, PLY, DAE), URDF with its joints, ViSP's .cao.
 
-``files`` and ``urdf`` read bodies in metres, ``surface`` finds their flat faces, sharp edges and roundings, ``frame``
-places the TCP, ``solid`` and ``outline`` make points and edges of them, ``build`` the gripper file.
+``files`` and ``urdf`` read bodies in metres, ``linkage`` tells which of them move, ``parts`` which are fingers,
+``frame`` places the TCP, ``surface`` finds flat faces, sharp edges and roundings, ``solid`` and ``outline`` make points
+and edges of them, ``jaw`` their motion, ``build`` the gripper file.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from gripmon.model.records import Array
 Triangles = NDArray[np.intp]
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-MESHES = (".stl", ".obj", ".ply")
+MESHES = (".stl", ".obj", ".ply", ".dae")
 LARGEST_TRIANGLES = 5_000_000
 """Most triangles: finding neighbours then takes about 2 GB of memory; no CAD export of a gripper needs more."""
 
@@ -54,20 +55,25 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
     """Read a mesh in metres; ``unit`` is one of :data:`UNITS_M`.  ``size``: refuse one that can't be a gripper's.
 
     Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit wasn't given:
-    none of these formats contains it.
+    of these formats only DAE contains it.  Its up axis is ignored, as ROS does.
     """
     trimesh = mesh_library(str(path))
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; a mesh ({', '.join(MESHES)}), URDF or .cao")
+    collada = path.suffix.lower() == ".dae"
+    if collada and importlib.util.find_spec("collada") is None:
+        raise InputError(f"{path}: needs the package pycollada; pip install 'gripmon[cad]'")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
+        if collada:
+            mesh.apply_scale(trimesh.units.unit_conversion(mesh.units or "meters", "meters"))
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.intp)
     except Exception as error:  # noqa: BLE001  trimesh raises anything for a damaged file
         # A binary STL that is cut off is tried as text, for which trimesh wants one more library.
         cut_off = isinstance(error, ModuleNotFoundError)
         why = "it is damaged or cut off" if cut_off else f"{one_line(error):.120}"
-        raise InputError(f"{path}: can't be read as a mesh ({why}); STL, OBJ or PLY with triangles") from None
+        raise InputError(f"{path}: can't be read as a mesh ({why}); {', '.join(MESHES)} with triangles") from None
     if not len(triangles):
         raise InputError(f"{path}: has no triangles, or is cut off; a mesh of the fingers' surface")
     if len(triangles) > LARGEST_TRIANGLES:
@@ -75,6 +81,7 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
     if not np.isfinite(points[triangles]).all():
         raise InputError(f"{path}: holds a coordinate that is not finite; ordinary numbers")
     extent = np.ptp(points[np.unique(triangles)], axis=0)
+    unit = "m" if collada else unit
     if unit is None:
         raise InputError(f"is missing: {path} has no unit; {_as_units(extent)}", "unit")
     body = Body(path.stem, points * UNITS_M[unit], triangles, np.zeros((0, 2), np.intp))

@@ -17,6 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from gripmon.model.gripper.rounds import LARGEST_RADIUS_M
 from gripmon.model.records import Array
 from gripmon.teach.cad.curves import Curve, curves_of, pieces_of
 from gripmon.teach.cad.depth import DepthMap, Pinhole
@@ -157,6 +158,9 @@ def _edges(run: _Run, view: Pinhole) -> Iterator[_Edge]:
     for first, last, straight in _parts(run.px):
         length_px = float(np.linalg.norm(np.diff(run.px[first : last + 1], axis=0), axis=1).sum())
         ends, bridge = [first, last], length_px < SHORTEST_PX
+        # On what is nearly flat an outline runs away with the least turn of the view.
+        if (np.linalg.norm(run.points_m[ends] - run.centre_m[ends], axis=1) > LARGEST_RADIUS_M).any():
+            continue
         if bridge and np.linalg.norm(run.points_m[last] - run.points_m[first]) <= SHORTEST_M:
             continue
         count = 0 if straight or bridge else int(np.clip(length_px / VIA_PX, 1, MOST_VIA))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,19 @@ class Shape:
     round_m: dict[int, tuple[Array, Array]] = field(default_factory=dict)
     spread_m: list[float] = field(default_factory=list)
     via_m: list[Array] = field(default_factory=list)
+
+    def moved(self, to_T_shape: Array) -> Shape:
+        """The same in another frame (4, 4)."""
+        rotation, translation = to_T_shape[:3, :3], to_T_shape[:3, 3]
+        rounds: dict[int, tuple[Array, Array]] = {
+            k: (centre @ rotation.T + translation, axis @ rotation.T) for k, (centre, axis) in self.round_m.items()
+        }
+        return replace(
+            self,
+            points_m=self.points_m @ rotation.T + translation,
+            round_m=rounds,
+            via_m=[via @ rotation.T + translation for via in self.via_m],
+        )
 
 
 def is_solid(surface: Surface) -> bool:

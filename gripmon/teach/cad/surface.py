@@ -70,7 +70,7 @@ class Surface:
 
 def surface_of(body: Body) -> Surface:
     """A body's surface: its points merged, triangles without area left out; a solid turned inside out is corrected."""
-    body = _welded(body)
+    body = welded(body)
     a, b, c = np.moveaxis(body.points_m[body.triangles] - body.points_m.mean(axis=0), 1, 0)
     if np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0:
         body = replace(body, triangles=body.triangles[:, ::-1])
@@ -113,7 +113,7 @@ def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[
     return np.column_stack([low[first], high[first]]), sides, alike | ~paired
 
 
-def _welded(body: Body) -> Body:
+def welded(body: Body) -> Body:
     """The body with coinciding points on borders merged."""
     edges, sides, _ = _neighbours(body.triangles)
     border = np.unique(edges[sides[:, 1] < 0])

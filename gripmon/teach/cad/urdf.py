@@ -1,4 +1,4 @@
-"""Reads a gripper's URDF: which links its joint moves, and their positions at every opening.
+"""Reads a URDF's links and joints.
 
 https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geometry, else ``collision``.
 """
@@ -6,7 +6,7 @@ https://wiki.ros.org/urdf/XML: metres and radians; of a link its ``visual`` geom
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +17,17 @@ from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 from gripmon.teach.cad.files import MESHES, Body, joined, mesh_library, read_mesh
 
-STEPS = 41
-"""Number of joint positions that are evaluated: an arc of 57 mm over 0.8 rad is 2.8 um off a table of 41 rows."""
 
-TURNS_RAD = 1e-3
-"""Largest turn, over the joint's range, of a link that counts as not turning: 0.02 mm at 20 mm."""
+class NoMeshError(InputError):
+    """A link's mesh isn't there, or nothing here reads it."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Joint:
+class Joint:
+    """``parent_T_child`` at zero is ``origin`` (4, 4); ``axis`` (3,) in the child's frame; ``mimic``: the joint that it
+    follows, factor, offset.
+    """
+
     name: str
     kind: str
     parent: str
@@ -35,8 +37,12 @@ class _Joint:
     limits: tuple[float, float]
     mimic: tuple[str, float, float] | None
 
+    @property
+    def range(self) -> float:
+        return self.limits[1] - self.limits[0]
+
     def placed(self, values: dict[str, float]) -> Array:
-        """``parent_T_child`` (4, 4) with the driving joints at ``values``."""
+        """``parent_T_child`` (4, 4) with the joints at ``values``; those that it doesn't name at zero."""
         name, times, plus = self.mimic or (self.name, 1.0, 0.0)
         value = times * values.get(name, 0.0) + plus
         moved = np.eye(4)
@@ -47,43 +53,63 @@ class _Joint:
         return self.origin @ moved
 
 
-@dataclass(frozen=True, slots=True)
-class LinkGroup:
-    """A group of links that move together: ``body`` in the base's frame at the middle of the joint's range, ``path_m``
-    (s, 3) its shifts from there, and ``turns_rad``, its largest turn over the range.
-    """
+class Urdf:
+    """A file's links and joints.  :class:`InputError` for a file that isn't a URDF."""
 
-    body: Body
-    path_m: Array
-    turns_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class Linkage:
-    """A URDF gripper: the bodies that the joint moves, the fixed one (``base``), and the driving ``joint``."""
-
-    moving: list[LinkGroup]
-    base: Body | None
-    joint: str
-    notes: list[str] = field(default_factory=list)
-
-
-class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.notes: list[str] = []
         try:
-            self.root = ElementTree.parse(path).getroot()
+            root = ElementTree.parse(path).getroot()
         except (OSError, ElementTree.ParseError) as error:
             raise InputError(f"{path}: can't be read as URDF ({error}); XML, xacro expanded") from None
-        if self.root.tag != "robot":
-            raise InputError(f"{path}: its root is <{self.root.tag}>; <robot>, a URDF")
-        if any(
-            "xacro" in part.tag or part.tag.endswith("}macro") or "${" in str(part.attrib) for part in self.root.iter()
-        ):
+        if root.tag != "robot":
+            raise InputError(f"{path}: its root is <{root.tag}>; <robot>, a URDF")
+        if any("xacro" in part.tag or part.tag.endswith("}macro") or "${" in str(part.attrib) for part in root.iter()):
             raise InputError(f"{path}: holds xacro macros; expand it first: xacro {path} > {path.stem}.urdf")
+        self._links = {link.get("name", "?"): link for link in root.findall("link")}
+        self.joints = [self._joint(part) for part in root.findall("joint")]
+        self._holding = {joint.child: joint for joint in self.joints}
+        leading = {joint.name for joint in self.joints if joint.mimic is None}
+        for joint in self.joints:
+            if joint.mimic is not None and joint.mimic[0] not in leading:
+                raise self.refuse(f"joint '{joint.name}'", f"follows '{joint.mimic[0]}'; a joint that follows no other")
+        self.shown = [n for n, link in self._links.items() if link.findall("visual") or link.findall("collision")]
+        if not self.shown:
+            raise InputError(f"{path}: no link has a geometry; visual meshes or boxes")
 
     def refuse(self, where: str, wrong: str) -> InputError:
         return InputError(f"{self.path}: {where}: {wrong}")
+
+    def base_of(self, link: str) -> str:
+        """The link that carries ``link`` rigidly, and that no fixed joint carries further."""
+        seen = {link}
+        while (joint := self._holding.get(link)) is not None and joint.kind == "fixed" and joint.parent not in seen:
+            link = joint.parent
+            seen.add(link)
+        return link
+
+    def moved_by(self, joint: Joint) -> list[str]:
+        """The links with a geometry that a joint moves, and those that follow it."""
+        ends = {joint.child, *(j.child for j in self.joints if j.mimic and j.mimic[0] == joint.name)}
+        return [name for name in self.shown if ends & set(self.up(name))]
+
+    def placed(self, base: str, values: dict[str, float]) -> dict[str, Array]:
+        """``base_T_link`` of every link with a geometry that ``base`` carries, the joints at ``values``."""
+        out = {}
+        for name in self.shown:
+            way = self.up(name)
+            if base in way:
+                carried = [self._holding[link].placed(values) for link in way[: way.index(base)]]
+                out[name] = np.linalg.multi_dot([np.eye(4), *reversed(carried), np.eye(4)])
+        return out
+
+    def up(self, link: str) -> list[str]:
+        """The link, its parent, and so on."""
+        way = [link]
+        while (joint := self._holding.get(way[-1])) is not None and joint.parent not in way:
+            way.append(joint.parent)
+        return way
 
     def numbers(self, part: ElementTree.Element | None, key: str, default: str, where: str, count: int = 3) -> Array:
         text = default if part is None else part.get(key, default)
@@ -95,24 +121,23 @@ class _Reader:
             raise self.refuse(where, f"{key} is '{text}'; {count} ordinary numbers")
         return values
 
-    def origin(self, part: ElementTree.Element, where: str) -> Array:
+    def _origin(self, part: ElementTree.Element, where: str) -> Array:
         given = part.find("origin")
         turn = Rotation.from_euler("xyz", self.numbers(given, "rpy", "0 0 0", where)).as_matrix()
         return make_transform(turn, self.numbers(given, "xyz", "0 0 0", where))
 
-    def joints(self) -> list[_Joint]:
-        return [self._joint(part) for part in self.root.findall("joint")]
-
-    def _joint(self, part: ElementTree.Element) -> _Joint:
+    def _joint(self, part: ElementTree.Element) -> Joint:
         name, kind = part.get("name", "?"), part.get("type", "?")
         where = f"joint '{name}'"
         if kind not in ("fixed", "prismatic", "revolute", "continuous"):
             raise self.refuse(where, f"is of type '{kind}'; fixed, prismatic, revolute or continuous")
         parent, child = (str(end.get("link")) if (end := part.find(k)) is not None else "" for k in ("parent", "child"))
+        if not (parent and child):
+            raise self.refuse(where, "has no parent or no child; a link each")
         axis = self.numbers(part.find("axis"), "xyz", "1 0 0", where)
         if kind != "fixed" and not np.linalg.norm(axis) > 0.0:
             raise self.refuse(where, "has an axis without direction; a unit vector")
-        limit = part.find("limit")
+        limit = next((each for each in part.findall("limit") if each.get("lower") or each.get("upper")), None)
         low, high = (float(self.numbers(limit, key, "0", where, 1)[0]) for key in ("lower", "upper"))
         mimic = part.find("mimic")
         follows = None
@@ -120,18 +145,24 @@ class _Reader:
             times, plus = (self.numbers(mimic, k, d, where, 1)[0] for k, d in (("multiplier", "1"), ("offset", "0")))
             follows = (str(mimic.get("joint")), float(times), float(plus))
         axis = axis / max(float(np.linalg.norm(axis)), 1e-30)
-        return _Joint(name, kind, parent, child, self.origin(part, where), axis, (low, high), follows)
+        return Joint(name, kind, parent, child, self._origin(part, where), axis, (low, high), follows)
 
-    def bodies(self) -> dict[str, Body]:
-        """Each link's geometry in its own frame; links without any are left out."""
-        out = {}
-        for link in self.root.findall("link"):
-            name = link.get("name", "?")
-            shown = link.findall("visual") or link.findall("collision")
-            parts = [self._geometry(part, f"link '{name}'") for part in shown]
-            if parts:
-                out[name] = joined(parts, name)
-        return out
+    def body(self, name: str) -> Body:
+        """A link's geometry in its own frame.  A visual mesh that can't be read is replaced by the collision's, with a
+        note: that may be coarser.
+        """
+        visual, collision = self._links[name].findall("visual"), self._links[name].findall("collision")
+        try:
+            return joined([self._geometry(part, f"link '{name}'") for part in visual or collision], name)
+        except NoMeshError as error:
+            if not (visual and collision):
+                raise
+            try:
+                body = joined([self._geometry(part, f"link '{name}'") for part in collision], name)
+            except NoMeshError:
+                raise error from None
+            self.notes.append(f"link '{name}': its collision mesh is used, which may be coarser; {error.wrong}")
+            return body
 
     def _geometry(self, part: ElementTree.Element, where: str) -> Body:
         geometry = part.find("geometry")
@@ -139,18 +170,20 @@ class _Reader:
         if shape is None:
             raise self.refuse(where, "has no geometry; a mesh, box, cylinder or sphere")
         body = self._mesh(shape, where) if shape.tag == "mesh" else self._primitive(shape, where)
-        return body.moved(self.origin(part, where))
+        return body.moved(self._origin(part, where))
 
     def _mesh(self, shape: ElementTree.Element, where: str) -> Body:
         name, scale = shape.get("filename", ""), self.numbers(shape, "scale", "1 1 1", where)
         path = self._find(name)
         if path is None:
-            raise self.refuse(
-                where, f"its mesh '{name}' isn't there; the file beside the URDF, or the package's folder"
-            )
+            right = "the file beside the URDF, or the package's folder"
+            raise NoMeshError(f"{self.path}: {where}: its mesh '{name}' isn't there; {right}")
         if path.suffix.lower() not in MESHES:
-            raise self.refuse(where, f"its mesh is '{path.name}'; {', '.join(MESHES)}: convert it")
-        return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
+            raise NoMeshError(f"{self.path}: {where}: its mesh is '{path.name}'; {', '.join(MESHES)}: convert it")
+        try:
+            return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
+        except InputError as error:
+            raise NoMeshError(error.wrong) from None
 
     def _find(self, name: str) -> Path | None:
         """Find a mesh file; ``package://NAME/…`` is searched for from the URDF's folder upwards."""
@@ -174,78 +207,3 @@ class _Reader:
             raise self.refuse(where, f"has a <{shape.tag}>; a mesh, box, cylinder or sphere")
         triangles = np.asarray(mesh.faces, dtype=np.intp)
         return Body(shape.tag, np.asarray(mesh.vertices, dtype=float), triangles, np.zeros((0, 2), np.intp))
-
-
-def read_urdf(path: Path, joint: str | None) -> Linkage:
-    """Read a URDF's gripper, moved by ``joint``.  None: by the only joint that moves and mimics no other, or by two
-    such joints of one kind and range on one link, together.
-
-    Raises :class:`InputError` for a file that isn't a URDF, or whose joints don't determine which one opens the jaws.
-    """
-    reader = _Reader(path)
-    joints, bodies = reader.joints(), reader.bodies()
-    if not bodies:
-        raise InputError(f"{path}: no link has a geometry; visual meshes or boxes")
-    driving, together = _driving(reader, joints, joint)
-    lowest, highest = driving.limits
-    if not highest > lowest:
-        raise reader.refuse(f"joint '{driving.name}'", f"moves from {lowest:g} to {highest:g}; limit lower < upper")
-    values = np.linspace(lowest, highest, STEPS)
-    poses = [_placed(joints, {name: share * v for name, share in together.items()}) for v in values.tolist()]
-    groups: dict[bytes, list[str]] = {}
-    for name in bodies:
-        way = np.array([pose.get(name, np.eye(4)) for pose in poses])
-        middle = np.linalg.inv(way[STEPS // 2])
-        # Links with the same motion are one body.
-        groups.setdefault(np.round(way @ middle, 9).tobytes(), []).append(name)
-    moving, base = [], None
-    for names in groups.values():
-        way = np.array([pose.get(names[0], np.eye(4)) for pose in poses])
-        body = joined([bodies[name].moved(poses[STEPS // 2].get(name, np.eye(4))) for name in names], names[0])
-        if np.abs(way - way[0]).max() < 1e-9:
-            base = body
-            continue
-        turned = Rotation.from_matrix(way[:, :3, :3]) * Rotation.from_matrix(way[STEPS // 2, :3, :3]).inv()
-        turns_rad = float(turned.magnitude().max())
-        moving.append(LinkGroup(body, way[:, :3, 3] - way[STEPS // 2, :3, 3], turns_rad))
-    if not moving:
-        raise reader.refuse(f"joint '{driving.name}'", "moves no link that has a geometry; the joint of the jaws")
-    return Linkage(moving, base, driving.name)
-
-
-def _driving(reader: _Reader, joints: list[_Joint], name: str | None) -> tuple[_Joint, dict[str, float]]:
-    """The jaws' joint, and the joints driven with it, by name: the ratio of their values to its value."""
-    free = [j for j in joints if j.kind != "fixed" and j.mimic is None]
-    if name is not None:
-        chosen = [j for j in free if j.name == name]
-        if not chosen:
-            names = ", ".join(j.name for j in free) or "none"
-            raise InputError(f"{name}: {reader.path} has no such joint that drives others; one of {names}", "joint")
-        return chosen[0], {name: 1.0}
-    if not free:
-        raise InputError(f"{reader.path}: no joint moves; prismatic or revolute joints, or its meshes by themselves")
-    alike = all(j.kind == free[0].kind and j.limits == free[0].limits for j in free)
-    if len(free) == 1 or (len(free) == 2 and alike and free[0].parent == free[1].parent):
-        return free[0], {j.name: 1.0 for j in free}
-    names = ", ".join(j.name for j in free)
-    raise InputError(
-        f"is missing: {reader.path} has {len(free)} joints that move by themselves; one of {names}", "joint"
-    )
-
-
-def _placed(joints: list[_Joint], values: dict[str, float]) -> dict[str, Array]:
-    """``base_T_link`` of every link held by a joint; a link without one is at the base."""
-    children = {j.child: j for j in joints}
-    out: dict[str, Array] = {}
-
-    def at(link: str, seen: tuple[str, ...]) -> Array:
-        joint = children.get(link)
-        if joint is None or link in seen:
-            return np.eye(4)
-        if link not in out:
-            out[link] = at(joint.parent, (*seen, link)) @ joint.placed(values)
-        return out[link]
-
-    for link in children:
-        at(link, ())
-    return out

@@ -44,7 +44,7 @@ def model_of(
             via = tuple(map(_rounded, shape.via_m[k - 1])) if shape.via_m else ()
             edges[f"{finger}_e{k}"] = EdgeModel(start=names[a], end=names[b], kind=kind, bevel_m=width_m, via=via)
         faces += [FaceModel(finger=finger, points=tuple(names[p] for p in loop)) for loop in shape.loops]
-    fingers = {finger: FingerModel(motion=None if jaw is None else jaw.motion[finger]) for finger in shapes}
+    fingers = {finger: FingerModel(motion=None if jaw is None else jaw.motion(finger)) for finger in shapes}
     return GripperModel(
         name=name,
         fingers=fingers,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array, Image
+from gripmon.model.response import as_light
 from gripmon.track.edges import profile_kernel
 from gripmon.track.edges.kernel import FEWEST_AGREEING
 from gripmon.track.edges.prediction import STEP_PX, Prediction
@@ -94,11 +95,7 @@ def read_profiles(
         np.ascontiguousarray(map_y, np.float32),
         _largest(image.dtype),
     )
-    if response == "linear":
-        return profiles
-    encoded = np.maximum(profiles / full_scale(image), 0.0)
-    light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return np.asarray(full_scale(image) * light)
+    return as_light(profiles, full_scale(image)) if response == "srgb" else profiles
 
 
 def _pixels(image: Image) -> Image:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
+
+from gripmon.model.response import TAUGHT_SIGMA_PX, UNKNOWN_SIGMA_PX, Response
 
 
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,10 +42,11 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         float, Meta(ge=2.0, le=50.0, description="smallest edge response in standard deviations of its noise")
     ] = 3.0
     response: Annotated[
-        Literal["linear", "srgb"],
+        Response,
         Meta(
             description="how grey levels follow the light: linear, as of industrial cameras without gamma; srgb, as of "
-            "most colour cameras, JPEG and video, whose blurred edges would appear 0.1 to 0.4 px too far into the dark"
+            "most colour cameras, JPEG and video, whose blurred edges would appear 0.1 to 0.4 px too far into the "
+            "dark; unknown: larger bounds; if left out, as gripmon teach found it"
         ),
     ] = "linear"
     contrast_fraction: Annotated[
@@ -181,3 +185,12 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
             description="motion away from the prediction beyond which the prediction is computed again (px)",
         ),
     ] = 1.0
+
+    def with_response(self, taught: bool) -> MeasurementSettings:
+        """The same with what a response that isn't known adds to the standard deviation of every edge, which was
+        ``taught`` or not.
+        """
+        if self.edges.response != "unknown":
+            return self
+        floor_px = math.hypot(self.consensus.edge_floor_px, TAUGHT_SIGMA_PX if taught else UNKNOWN_SIGMA_PX)
+        return msgspec.structs.replace(self, consensus=msgspec.structs.replace(self.consensus, edge_floor_px=floor_px))

@@ -179,7 +179,8 @@ class Settler:
         jaw_sigma_m: float,
         taught: TaughtEdges | None = None,
     ):
-        self._camera, self._gripper, self._settings, self._taught = camera, gripper, settings, taught
+        self._camera, self._gripper, self._taught = camera, gripper, taught
+        self._settings = settings.with_response(taught is not None)
         # What the gripper file says of an edge's polarity counts; teaching fills in the rest.
         known = gripper.edge_polarity
         self._polarity = known if taught is None else np.where(known, known, taught.polarity)
