@@ -142,7 +142,7 @@ def _smaller(image: Plane, shrink: int) -> Plane:
 def _grown(mask: Bits, shape: tuple[int, ...]) -> Bits:
     """A mask at the images' size, without specks and small holes."""
     soft = cv2.resize(mask.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    out = cv2.morphologyEx((soft > 0.5).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    out = cv2.medianBlur((soft > 0.5).astype(np.uint8), 5)
     for value in (1, 0):
         count, labels, stats, _ = cv2.connectedComponentsWithStats((out == value).astype(np.uint8), connectivity=4)
         for k in range(1, count):
@@ -316,7 +316,7 @@ def _differ(features: Plane, one: list[int], other: list[int]) -> bool:
     if min(len(one), len(other)) < FEWEST_IMAGES:
         return False
     least = min(_staying_energy(features[one]), _staying_energy(features[other]))
-    return least > 1.2 * _staying_energy(features[one + other])
+    return least > _staying_energy(features[one + other])
 
 
 def _staying_energy(features: Plane) -> float:

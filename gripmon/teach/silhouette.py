@@ -34,8 +34,8 @@ MOST_RELIGHT = 0.5
 FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
-FROM_BORDER_PX = 4.0
-"""Least distance of a search line from the image's border: there the smoothed contour turns along the border."""
+FROM_BORDER_PX = 6.0
+"""Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
 _WIDE_PX, _NARROW_PX = 8.0, 5.0
 _GRID_PX = 0.125

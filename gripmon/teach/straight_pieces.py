@@ -198,9 +198,11 @@ def fit_chain(
             k = max(k - 1, 0)
         else:
             k += 1
-    if not found:
+    if not found or (closed and len(found) < 3):
         return None
     found = _without_rounding(camera, images, noise, ideal, outward, blur_px, found, closed)
+    if closed and len(found) < 3:
+        return None
     return _joined(camera, ideal, [line for _, line in found], [span for span, _ in found], closed)
 
 
