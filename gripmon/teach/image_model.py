@@ -36,8 +36,8 @@ LONGEST_SHARE = 0.25
 
 @dataclass(frozen=True)
 class MeasuredGripper:
-    """What images show of a gripper.  ``depth_m`` of the TCP, with the standard deviation ``depth_sigma_m``; ``moved``:
-    by opening, each finger's motion.
+    """What images show of a gripper.  ``depth_m`` of the TCP and ``scale_sigma``, of the gripper file; ``moved``: by
+    opening, each finger's motion; ``jaw_range_m``: that of the jaws, if it is known.
     """
 
     camera: Camera
@@ -46,8 +46,9 @@ class MeasuredGripper:
     placed: PlacedOutlines
     moved: Mapping[float, Sequence[FingerMoved]]
     depth_m: float
-    depth_sigma_m: float
+    scale_sigma: float
     opening_m: float | None
+    jaw_range_m: tuple[float, float] | None = None
 
 
 def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
@@ -147,10 +148,10 @@ def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None,
             f"{inner_dropped} inner edges aren't used: they don't start from a corner, so their depth isn't known"
         )
     fingers, jaw = _jaw(seen)
-    scale_sigma = float(f"{seen.depth_sigma_m / seen.depth_m:.2g}")
     return GripperModel(
-        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=scale_sigma, provenance=provenance
-    )
+        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=seen.scale_sigma,
+        provenance=provenance,
+    )  # fmt: skip
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:

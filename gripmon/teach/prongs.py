@@ -39,15 +39,15 @@ def apart_by_motion(camera: Camera, seen: OpeningSeen, around: Iterable[OpeningS
             near = cv2.dilate(body, np.ones((3, 3), np.uint8)) > 0
             roots = [np.argwhere(prong & near)[:, ::-1].mean(axis=0) for prong in cut]
             to_tip = [outwards_from(prong, root) for prong, root in zip(cut, roots, strict=True)]
-            if any(_against_each_other(cut, to_tip, seen, other) for other in others):
+            if any(_against_each_other(cut, to_tip, other) for other in others):
                 own, of_own, found = cut, to_tip, True
         parts += own
         ways += of_own
     return see_parts(camera, seen, parts, ways) if found else None
 
 
-def _against_each_other(own: list[NDArray[np.bool_]], ways: list[Array], seen: OpeningSeen, other: OpeningSeen) -> bool:
-    shifts = [rough_shift_px(prong, way, seen, other) for prong, way in zip(own, ways, strict=True)]
+def _against_each_other(own: list[NDArray[np.bool_]], ways: list[Array], other: OpeningSeen) -> bool:
+    shifts = [rough_shift_px(prong, way, other) for prong, way in zip(own, ways, strict=True)]
     apart = np.ptp(np.array(shifts), axis=0)
     return bool(np.linalg.norm(apart) > 2.0 * ROUGH_STEP_PX)
 

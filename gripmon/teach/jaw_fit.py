@@ -1,0 +1,438 @@
+"""Two fingers in space and their motion with the jaws, from outlines at several openings; what gives the distance, too.
+
+Where a finger moves by T, a point of it moves by ``T / depth`` in the image, so its outline across T shows its depth.
+One least-squares fit over all openings has as unknowns the inverse depth of every vertex, the direction u of the jaws'
+relative travel, its length at each opening, the motion that both fingers have in common (tips on arcs go back while
+they open), and how far each finger turns.  What one camera can't tell from another place or size is assumed with a
+standard deviation, which reaches the result's covariance:
+
+* both fingers move equally far along u (:data:`UNEQUAL`), and neither to the side (:data:`SIDEWAYS`);
+* their tips, mirror images of each other, lie along u (:data:`BESIDE`);
+* a finger's outline lies near a plane (:data:`OFF_PLANE`).
+
+Each piece of an outline counts as two measurements, an offset and a turn, since its points err together.  Edges that
+move along themselves show no depth; they are placed near the plane of the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
+from gripmon.teach.finger_depth import Outline, PlacedOutlines
+from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact, rough_shift_px
+from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.straight_pieces import LONGEST_CUT_PX, STRAIGHT_PX, WORST_RMS_PX
+
+LARGEST_COMMON_MOTION = 0.2
+"""Largest common motion along the jaws' travel, over the relative one: 0.5 if one jaw is fixed, a few hundredths for
+tips at different depths that move equally far."""
+STRAIGHT = np.array([0.01, 0.01, 0.01])
+"""Standard deviations of the common motion along the travel, square to travel and fingers, and along the fingers, over
+the relative one: jaws that a rack, gears or a linkage moves on guides are equal to a per cent, 0.1 mm in 10 mm."""
+ON_ARCS = np.array([0.01, 0.01, 1.0])
+"""The same where tips move on arcs: 1 at 45 degrees."""
+LOOSE = np.array([1.0, 1.0, 1.0])
+"""The same of fingers that move each on its own."""
+BESIDE = 0.05
+"""Standard deviation (rad) of the angle between the travel and the connection of two tips' vertices that correspond:
+2 mm of 40, e.g. where one of them lies on a bevel."""
+BESIDE_ROUGHLY = 0.15
+"""The same of the tips' middles, where no vertices correspond: 5 mm, half of a finger's thickness, of 35."""
+CORRESPOND_RAD = math.radians(3.0)
+"""Largest angle in the image between the travel and the connection of vertices that correspond: 2 px of 40, the
+shortest gap at which a tip is told from its neighbour."""
+OFF_PLANE = 0.05
+"""Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
+away."""
+AS_PLACED = 0.01
+"""Standard deviation of an outline's points, over their distance, from where perspective places them."""
+LEAST_TRAVEL_PX = 4.0
+"""Least motion of the fingers against each other: twice what a rough shift resolves."""
+MORE_CHI2 = 9.0
+"""Least decrease of the fit's chi-squared by which tips move on arcs, or fingers turn: three standard deviations."""
+LEAST_TURN_RAD = math.radians(0.5)
+"""Least turn that matters: at the root of a finger as long as the distance is six times as large, it is a twentieth of
+a millimetre at its tip."""
+STATIONS = 20
+"""Number of stations on each piece."""
+_PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
+"""Parts of a finger's length, from its tip, whose motions start the search."""
+_REACH_PX = (40.0, 25.0, 15.0, 8.0, 5.0, 3.0, 3.0, 3.0)
+"""Distances within which an outline is looked for, in turn: a start is known to a few tenths of a motion of 100 px."""
+_SAME_WAY = math.cos(math.radians(30.0))
+_PER_PIECE = 2.0
+
+
+def fit_motion(
+    camera: Camera,
+    fingers: Sequence[Outline],
+    seen: OpeningSeen,
+    around: Mapping[float, OpeningSeen],
+    *,
+    placed: PlacedOutlines | None = None,
+    travel: Mapping[float, tuple[float, float]] | None = None,
+    direction: Array | None = None,
+    loose: bool = False,
+) -> JawMotion:
+    """The motion from the ``seen`` opening to those ``around``.  ``placed``: where perspective places the fingers, or
+    an assumption; ``travel``: their relative motion, over the TCP's depth, with its standard deviation, and
+    ``direction`` (3,), where a calibration tells both.  ``loose``: how one finger, or each of two, moves, whatever that
+    is; ``placed`` is needed then.  Raises :class:`Unfit`.
+    """
+    fit = _Fit(camera, fingers, seen, around, placed, travel, direction, loose=loose)
+    if loose:
+        return fit.result(fit.checked(fit.solve(LOOSE)), turned=False)
+    best = fit.solve(STRAIGHT)
+    on_arcs = fit.solve(ON_ARCS, start=best)
+    turning = fit.solve(ON_ARCS, turning=True, start=on_arcs)
+    turned = on_arcs.chi2 - turning.chi2 > MORE_CHI2 and float(np.abs(turning.turns).max()) > LEAST_TURN_RAD
+    if turned:
+        best = turning
+    elif best.chi2 - on_arcs.chi2 > MORE_CHI2:
+        best = on_arcs
+    return fit.result(fit.checked(best), turned)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    unknowns: Array
+    covariance: Array
+    turns: Array
+    chi2: float
+    rms_px: float
+
+
+class _Fit:
+    """The unknowns, in turn: inverse depths; three of each finger's plane, or its factor on what perspective says; the
+    travel's direction, two; at each opening its logarithm, the common motion (3,) over it, and the fingers' turns.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        fingers: Sequence[Outline],
+        seen: OpeningSeen,
+        around: Mapping[float, OpeningSeen],
+        placed: PlacedOutlines | None,
+        travel: Mapping[float, tuple[float, float]] | None,
+        direction: Array | None,
+        *,
+        loose: bool,
+    ):
+        if len(fingers) > 2 or (len(fingers) < 2 and not loose):
+            raise Unfit("it takes two fingers")
+        self.loose, self.sides = loose, np.array([-0.5, 0.5] if len(fingers) == 2 else [1.0])
+        self.focal, self.fingers, self.openings = camera.fx_px, fingers, tuple(around)
+        self.placed, self.travel, self.direction = placed, travel, direction
+        self.first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
+        self.rays = np.vstack([np.column_stack([f.xy, np.ones(len(f.xy))]) for f in fingers])
+        self.finger = np.repeat(np.arange(len(fingers)), np.diff(self.first))
+        self._stations()
+        self.each = 4 + len(fingers)
+        self.others = [_lines(camera, other) for other in around.values()]
+        self._start(camera, seen, around)
+
+    def _stations(self) -> None:
+        ends, finger = [], []
+        for k, outline in enumerate(self.fingers):
+            kept = outline.pieces if self.placed is None else self.placed.kept[k]
+            ends += [(a + self.first[k], b + self.first[k]) for a, b in kept]
+            finger += [k] * len(kept)
+        lengths = np.linalg.norm(np.subtract(*self.rays[np.reshape(ends, (-1, 2)).T]), axis=1)
+        self.length_px = self.focal * lengths
+        self.ends = np.repeat(np.reshape(ends, (-1, 2)).astype(int), STATIONS, axis=0)
+        self.piece = np.repeat(np.arange(len(ends)), STATIONS)
+        self.of_finger = np.repeat(np.array(finger), STATIONS)
+        self.share = np.tile(np.linspace(0.05, 0.95, STATIONS), len(ends))[:, None]
+        self.ray = (1.0 - self.share) * self.rays[self.ends[:, 0]] + self.share * self.rays[self.ends[:, 1]]
+
+    def _start(self, camera: Camera, seen: OpeningSeen, around: Mapping[float, OpeningSeen]) -> None:
+        rough = np.array([
+            [[rough_shift_px(f.mask, f.outwards, other, part) for part in _PARTS] for f in seen.fingers]
+            for other in around.values()
+        ]) / camera.fx_px  # fmt: skip
+        tips = rough[:, :, 0]
+        apart = tips[:, 1] - tips[:, 0] if len(self.fingers) == 2 else tips[:, 0]
+        common = tips.mean(axis=1) if len(self.fingers) == 2 else 0.0 * apart
+        length = np.linalg.norm(apart, axis=1)
+        if not length.min() > LEAST_TRAVEL_PX / camera.fx_px:
+            raise Unfit("the fingers don't move against each other")
+        far = int(length.argmax())
+        way = apart[far] / length[far]
+        foremost = [f.xy[(f.xy @ f.outwards).argmax()] for f in self.fingers]
+        if len(foremost) == 2:
+            way = way * np.sign(float(way @ (foremost[1] - foremost[0])))
+        self.tips = [first + own for first, own in zip(self.first, contact(self.fingers, way)[0], strict=False)]
+        self.sign = np.sign(apart @ way)
+        along = common @ way / length
+        if np.abs(along).max() > LARGEST_COMMON_MOTION and not self.loose:
+            raise Unfit("one finger moves farther than the other")
+        if self.placed is None:
+            q = np.concatenate([
+                _roughly(f, s * 0.5 * apart[far], shifts)
+                for f, s, shifts in zip(self.fingers, (-1.0, 1.0), rough[far], strict=True)
+            ])  # fmt: skip
+        else:
+            depth = np.concatenate([p[:, 2] for p in self.placed.points])
+            q = np.where(np.isfinite(depth), 1.0 / depth, 1.0)
+        self.pairs = self._corresponding(way) if len(self.fingers) == 2 else np.zeros((0, 2), int)
+        self.shape = q
+        self.extra = 6 if self.placed is None else 2
+        tail = np.zeros((len(self.openings), self.each))
+        tail[:, 0] = np.log(length)
+        tail[:, 1] = self.sign * along
+        outwards = np.sum([f.outwards for f in self.fingers], axis=0)
+        outwards -= way * float(way @ outwards)
+        tail[:, 3] = self.sign * (common @ outwards) / float(np.linalg.norm(outwards)) / length
+        self.start = np.concatenate([q, self._planes(q), [math.atan2(way[1], way[0]), 0.0], tail.ravel()])
+
+    def _corresponding(self, way: Array) -> NDArray[np.intp]:
+        """Pairs (p, 2) of the tips' vertices that lie beside each other along the travel, a direction (2,)."""
+        off = self.rays[self.tips[1], :2][None] - self.rays[self.tips[0], :2][:, None]
+        angle = np.abs(np.arctan2(off[..., 0] * way[1] - off[..., 1] * way[0], off @ way))
+        nearest = [(i, int(j)) for i, j in enumerate(angle.argmin(axis=1)) if angle[i, j] < CORRESPOND_RAD]
+        pairs = [(i, j) for i, j in nearest if angle[:, j].argmin() == i]
+        return np.array([(self.tips[0][i], self.tips[1][j]) for i, j in pairs], int).reshape(-1, 2)
+
+    def _planes(self, q: Array) -> Array:
+        if self.placed is not None:
+            return np.ones(len(self.fingers))
+        return np.concatenate([np.linalg.lstsq(self._plane(k), q[self.finger == k], rcond=None)[0] for k in range(2)])
+
+    def _plane(self, k: int) -> Array:
+        xy = self.fingers[k].xy
+        return np.column_stack([np.ones(len(xy)), xy - xy.mean(axis=0)])
+
+    def _split(self, unknowns: Array) -> tuple[Array, Array, Array, Array]:
+        """Inverse depths, what they are expected to be, the travel's direction (3,), and a row of each opening."""
+        count = len(self.rays)
+        q, extra = unknowns[:count], unknowns[count : count + self.extra]
+        angle, rise = unknowns[count + self.extra : count + self.extra + 2]
+        if self.placed is None:
+            expected = np.concatenate([self._plane(k) @ extra[3 * k : 3 * k + 3] for k in range(2)])
+        else:
+            expected = self.shape * extra[self.finger]
+        way = np.array([math.cos(angle), math.sin(angle), rise])
+        return (
+            q,
+            expected,
+            way / np.linalg.norm(way),
+            unknowns[count + self.extra + 2 :].reshape(len(self.openings), -1),
+        )
+
+    def _frame(self, unknowns: Array) -> tuple[Array, Array]:
+        """Directions (3,) along the fingers, and square to them and to the travel."""
+        q, _, way, _ = self._split(unknowns)
+        points = self.rays / q[:, None]
+        along = np.sum([along_finger(f, points[self.finger == k])[0] for k, f in enumerate(self.fingers)], axis=0)
+        along = along - way * float(along @ way)
+        along /= np.linalg.norm(along)
+        return along, np.cross(along, way)
+
+    def _moved(self, unknowns: Array, frame: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Motions (o, 2, 3) of the fingers' tips, and all stations (o, n, 3) where they have moved to."""
+        q, _, way, tail = self._split(unknowns)
+        along, square = frame
+        travel = self.sign * np.exp(tail[:, 0])
+        common = tail[:, 1:2] * way + tail[:, 2:3] * square + tail[:, 3:4] * along
+        motion = travel[:, None, None] * (self.sides[None, :, None] * way + common[:, None])
+        here = (1.0 - self.share) * q[self.ends[:, :1]] + self.share * q[self.ends[:, 1:]]
+        points = self.ray / here
+        pivot = np.array([(self.rays[tip] / q[tip, None]).mean(axis=0) for tip in self.tips])[self.of_finger]
+        arm = points - pivot
+        turn = tail[:, 4:][:, self.of_finger, None]
+        turned = (
+            arm * np.cos(turn)
+            + np.cross(square, arm) * np.sin(turn)
+            + square * (arm @ square)[:, None] * (1.0 - np.cos(turn))
+        )
+        return motion, pivot + turned + motion[:, self.of_finger]
+
+    def solve(self, common: Array, *, turning: bool = False, start: _Solved | None = None) -> _Solved:
+        """``common`` (3,): standard deviations of the common motion."""
+        self.common = common
+        unknowns = self.start.copy() if start is None else start.unknowns.copy()
+        count, openings = len(unknowns), len(self.openings)
+        free = np.ones(count, bool)
+        if not turning:
+            free[count - self.each * openings :].reshape(openings, -1)[:, 4:] = False
+        for reach_px in _REACH_PX if start is None else _REACH_PX[-6:]:
+            frame = self._frame(unknowns)
+            found = self._match(self._moved(unknowns, frame)[1], reach_px)
+            unknowns, residual, jacobian = self._least_squares(unknowns, free, frame, found)
+        normal = jacobian.T @ jacobian
+        covariance = np.zeros((count, count))
+        covariance[np.ix_(free, free)] = np.linalg.pinv(normal, hermitian=True)
+        off = self._off_px(unknowns, frame, found)
+        return _Solved(
+            unknowns, covariance, self._split(unknowns)[3][:, 4:], float(np.square(residual).sum()),
+            float(np.sqrt(np.square(off).mean())),
+        )  # fmt: skip
+
+    def checked(self, best: _Solved) -> _Solved:
+        """Raises :class:`Unfit` where the outlines contradict it."""
+        if best.rms_px > WORST_RMS_PX:
+            raise Unfit(f"the outlines differ by {best.rms_px:.1f} px besides any motion of rigid fingers")
+        return best
+
+    def _match(self, moved: Array, reach_px: float) -> list[tuple[NDArray[np.intp], Array, Array]]:
+        """For each opening: the stations that meet an outline, a point of its line (m, 2), and its normal (m, 2)."""
+        out = []
+        ways = self.rays[self.ends[:, 1]] - self.rays[self.ends[:, 0]]
+        for opening, points, (start, end) in zip(self.openings, moved, self.others, strict=True):
+            xy = points[:, :2] / points[:, 2:]
+            own = np.gradient(xy.reshape(-1, STATIONS, 2), axis=1).reshape(-1, 2)
+            own = own / np.maximum(np.linalg.norm(own, axis=1), 1e-12)[:, None]
+            own = own * np.sign((own * ways[:, :2]).sum(axis=1))[:, None]
+            length = np.linalg.norm(end - start, axis=1)
+            way = (end - start) / length[:, None]
+            normal = np.column_stack([-way[:, 1], way[:, 0]])
+            off = xy[:, None] - start
+            across, ahead = (off * normal).sum(axis=2), (off * way).sum(axis=2)
+            margin = np.minimum(2.0 / self.focal, 0.25 * length)
+            fits = (own @ way.T > _SAME_WAY) & (ahead > -margin) & (ahead < length + margin)
+            away = np.where(fits, np.abs(across), np.inf)
+            best = away.argmin(axis=1)
+            met = np.flatnonzero(away.min(axis=1) < reach_px / self.focal)
+            if any(np.count_nonzero(self.of_finger[met] == k) < STATIONS for k in range(len(self.fingers))):
+                raise Unfit("a finger of the first one isn't found there", opening)
+            out.append((met, start[best[met]], normal[best[met]]))
+        return out
+
+    def _off_px(
+        self, unknowns: Array, frame: tuple[Array, Array], found: list[tuple[NDArray[np.intp], Array, Array]]
+    ) -> Array:
+        moved = self._moved(unknowns, frame)[1]
+        out = []
+        for points, (met, at, normal) in zip(moved, found, strict=True):
+            xy = points[met, :2] / points[met, 2:]
+            out.append(((xy - at) * normal).sum(axis=1) * self.focal)
+        return np.concatenate(out)
+
+    def _least_squares(
+        self,
+        unknowns: Array,
+        free: NDArray[np.bool_],
+        frame: tuple[Array, Array],
+        found: list[tuple[NDArray[np.intp], Array, Array]],
+    ) -> tuple[Array, Array, Array]:
+        off = self._off_px(unknowns, frame, found)
+        piece = np.concatenate([self.piece[met] + k * (self.piece[-1] + 1) for k, (met, _, _) in enumerate(found)])
+        each = np.ones(len(off))
+
+        def at(part: Array) -> Array:
+            full = unknowns.copy()
+            full[free] = part
+            return full
+
+        def residuals(part: Array) -> Array:
+            full = at(part)
+            return np.concatenate([self._off_px(full, frame, found) * each, *self._expected(full)])
+
+        for _ in range(3):
+            each = self._worth(off, piece)
+            solved = least_squares(residuals, unknowns[free], method="trf", max_nfev=12)
+            unknowns = at(solved.x)
+            off = self._off_px(unknowns, frame, found)
+        return unknowns, solved.fun, solved.jac
+
+    def _worth(self, off: Array, piece: NDArray[np.intp]) -> Array:
+        """Square root of each station's weight, 1/px: pieces that the rest contradicts count less (Huber), and so do
+        those that may only cut a corner off.
+        """
+        count = np.bincount(piece)
+        rms = np.sqrt(np.bincount(piece, off**2) / np.maximum(count, 1))
+        scatter = max(1.4826 * float(np.median(rms[count > 0])), STRAIGHT_PX)
+        share = np.minimum(self.length_px[piece % len(self.length_px)] / LONGEST_CUT_PX, 1.0)
+        doubt = np.maximum(rms[piece] / (2.0 * scatter), 1.0)
+        return np.asarray(np.sqrt(_PER_PIECE * share / (STATIONS * doubt)) / scatter)
+
+    def _expected(self, unknowns: Array) -> list[Array]:
+        """What is assumed, over its standard deviation."""
+        q, expected, way, tail = self._split(unknowns)
+        out = [
+            (q - expected) / (OFF_PLANE if self.placed is None else AS_PLACED),
+            self._off_beside(self.rays / q[:, None], way),
+            (tail[:, 1:4] / self.common).ravel(),
+        ]
+        if self.travel is None:
+            mean = (
+                np.mean([1.0 / q[tip].mean() for tip in self.tips])
+                if self.placed is None
+                else np.mean(expected / self.shape)
+            )
+            out.append(np.array([1e3 * (mean - 1.0)]))
+        else:
+            known = np.array([self.travel[opening] for opening in self.openings])
+            out.append((np.exp(tail[:, 0]) - known[:, 0]) / known[:, 1])
+        if self.direction is not None:
+            out.append(np.cross(self.direction, way) / (0.2 * BESIDE))
+        return out
+
+    def _off_beside(self, points: Array, way: Array) -> Array:
+        """How far the tips aren't beside each other along the travel; of one finger, how far that isn't across the line
+        of sight.
+        """
+        if len(self.fingers) == 1:
+            return way[2:] / BESIDE_ROUGHLY
+        if len(self.pairs):
+            between, sigma = points[self.pairs[:, 1]] - points[self.pairs[:, 0]], BESIDE
+        else:
+            first, last = (points[tip].mean(axis=0) for tip in self.tips)
+            between, sigma = (last - first)[None], BESIDE_ROUGHLY
+        between /= np.linalg.norm(between, axis=1)[:, None]
+        return np.asarray(np.cross(between, way).ravel() / sigma)
+
+    def result(self, best: _Solved, turned: bool) -> JawMotion:
+        q, _, way, tail = self._split(best.unknowns)
+        frame = self._frame(best.unknowns)
+        motions = self._moved(best.unknowns, frame)[0]
+        moved = {
+            opening: tuple(FingerMoved(m, float(t)) for m, t in zip(motion, turns, strict=True))
+            for opening, motion, turns in zip(self.openings, motions, best.turns, strict=True)
+        }
+        travel = np.exp(tail[:, 0])
+        at = len(best.unknowns) - self.each * (len(travel) - np.arange(len(travel)))
+        covariance = best.covariance[np.ix_(at, at)] * np.outer(travel, travel)
+        of_each = [q[self.finger == k] for k in range(len(self.fingers))]
+        slopes = []
+        for k in range(len(self.fingers)):
+            own = np.flatnonzero(self.finger == k)
+            fit = np.linalg.pinv(self._plane(k))[1:]
+            slopes.append(np.diag(fit @ best.covariance[np.ix_(own, own)] @ fit.T))
+        slope_sigma = np.sqrt(np.mean(slopes, axis=0))
+        # The TCP is the mean over the tips of the mean of their vertices, each at its ray over q.
+        at_q = np.zeros((3, len(best.unknowns)))
+        for tip in self.tips:
+            at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
+        tcp = at_q @ best.covariance @ at_q.T
+        return JawMotion(tuple(of_each), moved, travel, covariance, way, slope_sigma, tcp, turned, best.rms_px)
+
+
+def _lines(camera: Camera, seen: OpeningSeen) -> tuple[Array, Array]:
+    """Both ends (n, 2) of all pieces of outlines, ideal coordinates."""
+    starts, ends = [], []
+    for finger in seen.fingers:
+        for chain in finger.chains:
+            xy = camera.undistort(chain.uv_px)
+            pieces = np.reshape(chain.pieces, (-1, 2)).astype(int)
+            starts.append(xy[pieces[:, 0]])
+            ends.append(xy[pieces[:, 1]])
+    return np.vstack(starts), np.vstack(ends)
+
+
+def _roughly(finger: Outline, shift: Array, of_parts: Array) -> Array:
+    """Inverse depths (v,), linear along the finger, from its parts' motions (p, 2) over the tip's ``shift`` (2,)."""
+    middles = [0.5 * (near + far) for near, far in _PARTS]
+    by_part = of_parts @ shift / float(shift @ shift)
+    slope, at_tip = np.polyfit(middles, by_part, 1)
+    ahead = finger.xy @ finger.outwards
+    return np.clip(at_tip + slope * (ahead.max() - ahead) / float(np.ptp(ahead)), 0.5, 2.0)
