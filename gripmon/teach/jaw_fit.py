@@ -37,13 +37,15 @@ tips at different depths that move equally far."""
 STRAIGHT = np.array([0.01, 0.01, 0.01])
 """Standard deviations of the common motion along the travel, square to travel and fingers, and along the fingers, over
 the relative one: jaws that a rack, gears or a linkage moves on guides are equal to a per cent, 0.1 mm in 10 mm."""
-ON_ARCS = np.array([0.01, 0.01, 1.0])
-"""The same where tips move on arcs: 1 at 45 degrees."""
+ON_ARCS = np.array([0.01, 0.1, 1.0])
+"""The same where tips move on arcs: 1 at 45 degrees, along fingers whose direction is known to 6 degrees."""
+UNEQUAL = np.array([0.3, 0.01, 0.01])
+"""The same of jaws that move unequally far: 0.5 if one stands."""
 LOOSE = np.array([1.0, 1.0, 1.0])
 """The same of fingers that move each on its own."""
-BESIDE = 0.05
+BESIDE = 0.1
 """Standard deviation (rad) of the angle between the travel and the connection of two tips' vertices that correspond:
-2 mm of 40, e.g. where one of them lies on a bevel."""
+4 mm of 40, where the front edge of one and the back edge of the other are seen."""
 BESIDE_ROUGHLY = 0.15
 """The same of the tips' middles, where no vertices correspond: 5 mm, half of a finger's thickness, of 35."""
 CORRESPOND_RAD = math.radians(3.0)
@@ -61,7 +63,7 @@ MORE_CHI2 = 9.0
 LEAST_TURN_RAD = math.radians(0.5)
 """Least turn that matters: at the root of a finger as long as the distance is six times as large, it is a twentieth of
 a millimetre at its tip."""
-STATIONS = 20
+STATIONS = 12
 """Number of stations on each piece."""
 _PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
 """Parts of a finger's length, from its tip, whose motions start the search."""
@@ -69,6 +71,7 @@ _REACH_PX = (40.0, 25.0, 15.0, 8.0, 5.0, 3.0, 3.0, 3.0)
 """Distances within which an outline is looked for, in turn: a start is known to a few tenths of a motion of 100 px."""
 _SAME_WAY = math.cos(math.radians(30.0))
 _PER_PIECE = 2.0
+_STEPS = 5
 
 
 def fit_motion(
@@ -91,14 +94,13 @@ def fit_motion(
     if loose:
         return fit.result(fit.checked(fit.solve(LOOSE)), turned=False)
     best = fit.solve(STRAIGHT)
-    on_arcs = fit.solve(ON_ARCS, start=best)
-    turning = fit.solve(ON_ARCS, turning=True, start=on_arcs)
-    turned = on_arcs.chi2 - turning.chi2 > MORE_CHI2 and float(np.abs(turning.turns).max()) > LEAST_TURN_RAD
-    if turned:
-        best = turning
-    elif best.chi2 - on_arcs.chi2 > MORE_CHI2:
-        best = on_arcs
-    return fit.result(fit.checked(best), turned)
+    others = fit.solve(ON_ARCS), fit.solve(UNEQUAL)
+    other = min(others, key=lambda solved: solved.chi2)
+    if best.chi2 - other.chi2 > MORE_CHI2:
+        best = other
+    turning = fit.solve(best.common, turning=True, start=best)
+    turned = best.chi2 - turning.chi2 > MORE_CHI2 and float(np.abs(turning.turns).max()) > LEAST_TURN_RAD
+    return fit.result(fit.checked(turning if turned else best), turned)
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class _Solved:
     turns: Array
     chi2: float
     rms_px: float
+    common: Array
 
 
 class _Fit:
@@ -271,11 +274,11 @@ class _Fit:
         normal = jacobian.T @ jacobian
         covariance = np.zeros((count, count))
         covariance[np.ix_(free, free)] = np.linalg.pinv(normal, hermitian=True)
-        off = self._off_px(unknowns, frame, found)
-        return _Solved(
-            unknowns, covariance, self._split(unknowns)[3][:, 4:], float(np.square(residual).sum()),
-            float(np.sqrt(np.square(off).mean())),
-        )  # fmt: skip
+        off, piece = self._off_px(unknowns, frame, found), self._pieces(found)
+        weight = np.square(self._worth(off, piece))
+        rms_px = float(np.sqrt(np.average(np.square(off), weights=weight)))
+        turns = self._split(unknowns)[3][:, 4:]
+        return _Solved(unknowns, covariance, turns, float(np.square(residual).sum()), rms_px, common)
 
     def checked(self, best: _Solved) -> _Solved:
         """Raises :class:`Unfit` where the outlines contradict it."""
@@ -324,10 +327,6 @@ class _Fit:
         frame: tuple[Array, Array],
         found: list[tuple[NDArray[np.intp], Array, Array]],
     ) -> tuple[Array, Array, Array]:
-        off = self._off_px(unknowns, frame, found)
-        piece = np.concatenate([self.piece[met] + k * (self.piece[-1] + 1) for k, (met, _, _) in enumerate(found)])
-        each = np.ones(len(off))
-
         def at(part: Array) -> Array:
             full = unknowns.copy()
             full[free] = part
@@ -337,12 +336,13 @@ class _Fit:
             full = at(part)
             return np.concatenate([self._off_px(full, frame, found) * each, *self._expected(full)])
 
-        for _ in range(3):
-            each = self._worth(off, piece)
-            solved = least_squares(residuals, unknowns[free], method="trf", max_nfev=12)
-            unknowns = at(solved.x)
-            off = self._off_px(unknowns, frame, found)
-        return unknowns, solved.fun, solved.jac
+        each = self._worth(self._off_px(unknowns, frame, found), self._pieces(found))
+        solved = least_squares(residuals, unknowns[free], max_nfev=_STEPS)
+        return at(solved.x), np.asarray(solved.fun), np.asarray(solved.jac)
+
+    def _pieces(self, found: list[tuple[NDArray[np.intp], Array, Array]]) -> NDArray[np.intp]:
+        """Which piece, at which opening, each matched station is of."""
+        return np.concatenate([self.piece[met] + k * len(self.length_px) for k, (met, _, _) in enumerate(found)])
 
     def _worth(self, off: Array, piece: NDArray[np.intp]) -> Array:
         """Square root of each station's weight, 1/px: pieces that the rest contradicts count less (Huber), and so do
