@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, invert, log_rotation, skew
+from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
     Absolute,
@@ -210,7 +211,8 @@ class AtReference(NamedTuple):
         if common is not None:
             more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
             off = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
-            longer = common.scale_sigma * (lever @ off)[None]
+            # Of unknown size, lengths are in units of the distance, of which the motion is exact.
+            longer = (common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0) * (lever @ off)[None]
         unmoved = perturbation_between(motion @ reference_T, reference_T)
         return Differences(self.fits, lever, turn, more, longer, unmoved)
 

@@ -145,6 +145,7 @@ def gripper_from_images(
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
     """
     _check(distance_m, finger_width_m, reference, openings_m, len(images))
+    _check_range(jaw_range_m, openings_m)
     made = make_camera(camera)
     taken = list(images_of_one_camera(images))
     for file, image in taken:
@@ -257,6 +258,16 @@ def _check(
             raise InputError(f"{len(openings_m)} for {count} images; one for each", "openings_m")
         if any(opening is None for opening in openings_m):
             raise InputError("some images have one and others don't; of all images or of none", "openings_m")
+
+
+def _check_range(jaw_range_m: tuple[float, float] | None, openings_m: Sequence[float | None] | None) -> None:
+    shown = [opening for opening in openings_m or () if opening is not None]
+    if jaw_range_m is not None and shown and not (jaw_range_m[0] <= min(shown) and max(shown) <= jaw_range_m[1]):
+        raise InputError(
+            f"is {jaw_range_m[0]:g} to {jaw_range_m[1]:g} m, but the images show openings of {min(shown):g} to "
+            f"{max(shown):g} m; a range that holds them",
+            "jaw_range",
+        )
 
 
 def _groups(

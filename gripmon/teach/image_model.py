@@ -276,12 +276,15 @@ def _add_inner(
 
 
 def _jaw(seen: MeasuredGripper) -> tuple[dict[str, FingerModel], JawModel | None]:
-    """Motion of the fingers as a table over the openings."""
+    """Motion of the fingers as a table over the openings seen, and the range of the jaws."""
     names = [outline.name for outline in seen.outlines]
     if seen.opening_m is None or not seen.moved:
         return {name: FingerModel() for name in names}, None
     openings = sorted([seen.opening_m, *seen.moved])
-    jaw = JawModel(nominal_m=seen.opening_m, min_m=openings[0], max_m=openings[-1])
+    low, high = openings[0], openings[-1]
+    # Beyond what the images show the motion is less certain, but possible: as far again, unless the range is known.
+    least, most = seen.jaw_range_m or (max(2.0 * low - high, 0.0), 2.0 * high - low)
+    jaw = JawModel(nominal_m=seen.opening_m, min_m=min(least, low), max_m=max(most, high))
     fingers = {}
     for number, name in enumerate(names):
         rows = []

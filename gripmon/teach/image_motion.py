@@ -42,8 +42,8 @@ class FingerMoved:
 class JawMotion:
     """``q`` of each finger (v,): inverse depths of its vertices; ``moved`` by opening: each finger's motion over the
     tips' depth; ``travel`` (o,) of the fingers against each other, over that depth, with its ``covariance`` (o, o);
-    ``direction`` (3,) of the travel, ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3) of
-    the tips' middle over that depth; ``turned``: the fingers turn while they move; ``rms_px`` of the outlines about the fit.
+    ``direction`` (3,) of the travel, ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3)
+    of the tips' middle over that depth; ``turned``: the fingers turn while they move.
     """
 
     q: tuple[Array, ...]
@@ -54,7 +54,6 @@ class JawMotion:
     slope_sigma: Array
     tcp_covariance: Array
     turned: bool
-    rms_px: float
 
     def over(self, depth: float) -> JawMotion:
         """The same over another depth, given over this one."""

@@ -28,16 +28,17 @@ from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import Outline, PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact, rough_shift_px
-from gripmon.teach.image_outline import OpeningSeen
-from gripmon.teach.straight_pieces import LONGEST_CUT_PX, STRAIGHT_PX, WORST_RMS_PX
+from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
+from gripmon.teach.silhouette import in_image
+from gripmon.teach.straight_pieces import LONGEST_CUT_PX, STRAIGHT_PX
 
 LARGEST_COMMON_MOTION = 0.2
 """Largest common motion along the jaws' travel, over the relative one: 0.5 if one jaw is fixed, a few hundredths for
 tips at different depths that move equally far."""
-STRAIGHT = np.array([0.01, 0.01, 0.01])
+STRAIGHT = np.array([0.02, 0.01, 0.01])
 """Standard deviations of the common motion along the travel, square to travel and fingers, and along the fingers, over
-the relative one: jaws that a rack, gears or a linkage moves on guides are equal to a per cent, 0.1 mm in 10 mm."""
-ON_ARCS = np.array([0.01, 0.1, 1.0])
+the relative one: jaws that a rack, gears or a linkage moves on guides: 0.2 and 0.1 mm in 10 mm."""
+ON_ARCS = np.array([0.02, 0.1, 1.0])
 """The same where tips move on arcs: 1 at 45 degrees, along fingers whose direction is known to 6 degrees."""
 UNEQUAL = np.array([0.3, 0.01, 0.01])
 """The same of jaws that move unequally far: 0.5 if one stands."""
@@ -46,16 +47,19 @@ LOOSE = np.array([1.0, 1.0, 1.0])
 BESIDE = 0.1
 """Standard deviation (rad) of the angle between the travel and the connection of two tips' vertices that correspond:
 4 mm of 40, where the front edge of one and the back edge of the other are seen."""
-BESIDE_ROUGHLY = 0.15
-"""The same of the tips' middles, where no vertices correspond: 5 mm, half of a finger's thickness, of 35."""
+SQUARE = 0.2
+"""Standard deviation (rad) of the travel's angle with the image plane: cameras face the middle of the jaws."""
+BESIDE_ROUGHLY = 0.4
+"""The same of the tips' innermost vertices where none correspond: 16 mm, the thickness of a finger, of 40."""
 CORRESPOND_RAD = math.radians(3.0)
 """Largest angle in the image between the travel and the connection of vertices that correspond: 2 px of 40, the
 shortest gap at which a tip is told from its neighbour."""
 OFF_PLANE = 0.05
 """Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
 away."""
-AS_PLACED = 0.01
-"""Standard deviation of an outline's points, over their distance, from where perspective places them."""
+AS_PLACED = 0.03
+"""Standard deviation of an outline's points, over their distance, from where perspective places them: 2 degrees of the
+fingers' direction, seen 45 degrees from it."""
 LEAST_TRAVEL_PX = 4.0
 """Least motion of the fingers against each other: twice what a rough shift resolves."""
 MORE_CHI2 = 9.0
@@ -67,8 +71,13 @@ STATIONS = 12
 """Number of stations on each piece."""
 _PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
 """Parts of a finger's length, from its tip, whose motions start the search."""
-_REACH_PX = (40.0, 25.0, 15.0, 8.0, 5.0, 3.0, 3.0, 3.0)
-"""Distances within which an outline is looked for, in turn: a start is known to a few tenths of a motion of 100 px."""
+_ROUNDS = ((40.0, 5.0), (25.0, 3.0), (15.0, 2.0), (8.0, 1.0), (5.0, 0.5), (3.0, STRAIGHT_PX), (3.0, STRAIGHT_PX))
+"""Distances within which an outline is looked for, and its scatter (px), in turn: a start is known to a few tenths of a
+motion of 100 px."""
+CONTRADICTS = 3.0
+"""Scatters by which a piece contradicts the rest."""
+AGREEING = 0.8
+"""Least part of the outlines in view that agrees: of two fingers with four edges each, one or two may be others."""
 _SAME_WAY = math.cos(math.radians(30.0))
 _PER_PIECE = 2.0
 _STEPS = 5
@@ -109,7 +118,7 @@ class _Solved:
     covariance: Array
     turns: Array
     chi2: float
-    rms_px: float
+    agreeing: float
     common: Array
 
 
@@ -133,7 +142,8 @@ class _Fit:
         if len(fingers) > 2 or (len(fingers) < 2 and not loose):
             raise Unfit("it takes two fingers")
         self.loose, self.sides = loose, np.array([-0.5, 0.5] if len(fingers) == 2 else [1.0])
-        self.focal, self.fingers, self.openings = camera.fx_px, fingers, tuple(around)
+        self.camera, self.focal, self.fingers, self.openings = camera, camera.fx_px, fingers, tuple(around)
+        self.shape_px = seen.fingers[0].mask.shape
         self.placed, self.travel, self.direction = placed, travel, direction
         self.first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
         self.rays = np.vstack([np.column_stack([f.xy, np.ones(len(f.xy))]) for f in fingers])
@@ -267,23 +277,41 @@ class _Fit:
         free = np.ones(count, bool)
         if not turning:
             free[count - self.each * openings :].reshape(openings, -1)[:, 4:] = False
-        for reach_px in _REACH_PX if start is None else _REACH_PX[-6:]:
+        for reach_px, scatter_px in _ROUNDS if start is None else _ROUNDS[3:]:
+            self.scatter_px = scatter_px
             frame = self._frame(unknowns)
             found = self._match(self._moved(unknowns, frame)[1], reach_px)
-            unknowns, residual, jacobian = self._least_squares(unknowns, free, frame, found)
+            unknowns, jacobian = self._least_squares(unknowns, free, frame, found)
         normal = jacobian.T @ jacobian
         covariance = np.zeros((count, count))
         covariance[np.ix_(free, free)] = np.linalg.pinv(normal, hermitian=True)
+        cost, agreeing = self._cost(unknowns, frame)
+        chi2 = cost + float(np.square(np.concatenate(self._expected(unknowns))).sum())
+        return _Solved(unknowns, covariance, self._split(unknowns)[3][:, 4:], chi2, agreeing, common)
+
+    def _cost(self, unknowns: Array, frame: tuple[Array, Array]) -> tuple[float, float]:
+        """The outlines' part of chi-squared, to which a piece that contradicts or isn't found adds a limited one, and
+        which part of them agrees.
+        """
+        moved = self._moved(unknowns, frame)[1]
+        found = self._match(moved, _ROUNDS[-1][0])
         off, piece = self._off_px(unknowns, frame, found), self._pieces(found)
-        weight = np.square(self._worth(off, piece))
-        rms_px = float(np.sqrt(np.average(np.square(off), weights=weight)))
-        turns = self._split(unknowns)[3][:, 4:]
-        return _Solved(unknowns, covariance, turns, float(np.square(residual).sum()), rms_px, common)
+        rms = self._rms(off, piece)[piece] / self.scatter_px
+        most = CONTRADICTS**2
+        each = _PER_PIECE * self._share(piece) / STATIONS
+        cost = float(np.sum(each * rms**2 / (1.0 + rms**2 / most)))
+        agreeing, total = float(np.sum(each[rms < CONTRADICTS])), float(np.sum(each))
+        for k, (points, (met, _, _)) in enumerate(zip(moved, found, strict=True)):
+            in_view = in_image(self.camera.project(points), self.shape_px, 2.0 * BORDER_PX)
+            in_view[met] = False
+            lost = _PER_PIECE / STATIONS * float(self._share(self.piece[in_view] + k * len(self.length_px)).sum())
+            cost, total = cost + most * lost, total + lost
+        return cost, agreeing / total
 
     def checked(self, best: _Solved) -> _Solved:
         """Raises :class:`Unfit` where the outlines contradict it."""
-        if best.rms_px > WORST_RMS_PX:
-            raise Unfit(f"the outlines differ by {best.rms_px:.1f} px besides any motion of rigid fingers")
+        if best.agreeing < AGREEING:
+            raise Unfit(f"only {100.0 * best.agreeing:.0f} % of the outlines move as those of two rigid fingers would")
         return best
 
     def _match(self, moved: Array, reach_px: float) -> list[tuple[NDArray[np.intp], Array, Array]]:
@@ -326,7 +354,7 @@ class _Fit:
         free: NDArray[np.bool_],
         frame: tuple[Array, Array],
         found: list[tuple[NDArray[np.intp], Array, Array]],
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array]:
         def at(part: Array) -> Array:
             full = unknowns.copy()
             full[free] = part
@@ -338,22 +366,27 @@ class _Fit:
 
         each = self._worth(self._off_px(unknowns, frame, found), self._pieces(found))
         solved = least_squares(residuals, unknowns[free], max_nfev=_STEPS)
-        return at(solved.x), np.asarray(solved.fun), np.asarray(solved.jac)
+        return at(solved.x), np.asarray(solved.jac)
 
     def _pieces(self, found: list[tuple[NDArray[np.intp], Array, Array]]) -> NDArray[np.intp]:
         """Which piece, at which opening, each matched station is of."""
         return np.concatenate([self.piece[met] + k * len(self.length_px) for k, (met, _, _) in enumerate(found)])
 
     def _worth(self, off: Array, piece: NDArray[np.intp]) -> Array:
-        """Square root of each station's weight, 1/px: pieces that the rest contradicts count less (Huber), and so do
-        those that may only cut a corner off.
+        """Square root of each station's weight, 1/px: pieces that the rest contradicts hardly count (Geman and McClure
+        1987), e.g. where a face turns and another of its edges is seen, and those that may only cut a corner off less.
         """
-        count = np.bincount(piece)
-        rms = np.sqrt(np.bincount(piece, off**2) / np.maximum(count, 1))
-        scatter = max(1.4826 * float(np.median(rms[count > 0])), STRAIGHT_PX)
-        share = np.minimum(self.length_px[piece % len(self.length_px)] / LONGEST_CUT_PX, 1.0)
-        doubt = np.maximum(rms[piece] / (2.0 * scatter), 1.0)
-        return np.asarray(np.sqrt(_PER_PIECE * share / (STATIONS * doubt)) / scatter)
+        agrees = 1.0 / (1.0 + np.square(self._rms(off, piece)[piece] / (CONTRADICTS * self.scatter_px)))
+        return np.asarray(np.sqrt(_PER_PIECE * self._share(piece) / STATIONS) * agrees / self.scatter_px)
+
+    def _share(self, piece: NDArray[np.intp]) -> Array:
+        """How much pieces count: less if they may only cut a corner off."""
+        return np.minimum(self.length_px[piece % len(self.length_px)] / LONGEST_CUT_PX, 1.0)
+
+    @staticmethod
+    def _rms(off: Array, piece: NDArray[np.intp]) -> Array:
+        """Of each piece's stations."""
+        return np.asarray(np.sqrt(np.bincount(piece, off**2) / np.maximum(np.bincount(piece), 1)))
 
     def _expected(self, unknowns: Array) -> list[Array]:
         """What is assumed, over its standard deviation."""
@@ -361,6 +394,7 @@ class _Fit:
         out = [
             (q - expected) / (OFF_PLANE if self.placed is None else AS_PLACED),
             self._off_beside(self.rays / q[:, None], way),
+            way[2:] / SQUARE,
             (tail[:, 1:4] / self.common).ravel(),
         ]
         if self.travel is None:
@@ -378,11 +412,9 @@ class _Fit:
         return out
 
     def _off_beside(self, points: Array, way: Array) -> Array:
-        """How far the tips aren't beside each other along the travel; of one finger, how far that isn't across the line
-        of sight.
-        """
+        """How far two tips aren't beside each other along the travel."""
         if len(self.fingers) == 1:
-            return way[2:] / BESIDE_ROUGHLY
+            return np.zeros(0)
         if len(self.pairs):
             between, sigma = points[self.pairs[:, 1]] - points[self.pairs[:, 0]], BESIDE
         else:
@@ -414,7 +446,7 @@ class _Fit:
         for tip in self.tips:
             at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
         tcp = at_q @ best.covariance @ at_q.T
-        return JawMotion(tuple(of_each), moved, travel, covariance, way, slope_sigma, tcp, turned, best.rms_px)
+        return JawMotion(tuple(of_each), moved, travel, covariance, way, slope_sigma, tcp, turned)
 
 
 def _lines(camera: Camera, seen: OpeningSeen) -> tuple[Array, Array]:

@@ -62,7 +62,9 @@ def _finger(
     kept = [k for k, piece in enumerate(pieces) if piece is not None]
     # Begin after the stretch that the border hides.
     count = len(pieces)
-    first = next(k for k in kept if pieces[k - 1] is None or np.linalg.norm(pieces[k][0] - pieces[k - 1][1]) > 1e-6)
+    after = [k for k in kept if pieces[k - 1] is None or np.linalg.norm(pieces[k][0] - pieces[k - 1][1]) > 1e-6]
+    assert after, "a finger that the image's border doesn't cut"
+    first = after[0]
     order = [(first + i) % count for i in range(count) if (first + i) % count in kept]
     vertices = np.array([pieces[order[0]][0], *(pieces[k][1] for k in order)])
     corner = np.array([False, *[True] * (len(vertices) - 2), False])

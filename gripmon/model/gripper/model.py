@@ -21,6 +21,8 @@ class GripperError(InputError):
 
 
 class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``nominal_m``: where the file's coordinates hold; openings beyond ``min_m`` to ``max_m`` are impossible."""
+
     nominal_m: Opening
     min_m: Opening
     max_m: Opening
@@ -33,7 +35,9 @@ class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Rows ``opening_m, dx_m, dy_m, dz_m`` with ascending openings; linear between rows."""
+    """Rows ``opening_m, dx_m, dy_m, dz_m`` with ascending openings; linear between rows, and beyond them, where what
+    an arc would deviate is in every bound.
+    """
 
     table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
 
