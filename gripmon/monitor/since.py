@@ -123,6 +123,10 @@ class CommonError(NamedTuple):
         (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
         """
         rows = np.vstack([self.taught, self.offset])
+        if self.scale_sigma >= SIZE_UNKNOWN:
+            # Along the line of sight it is the size, of which the motion is a part.
+            sight = at_T[:3, 3] / np.linalg.norm(at_T[:3, 3])
+            rows[:, :3] -= np.outer(rows[:, :3] @ sight, sight)
         share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
         moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
         return np.diag(share * np.repeat([moved, turned], 3))

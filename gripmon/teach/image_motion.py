@@ -43,7 +43,7 @@ class JawMotion:
     """``q`` of each finger (v,): inverse depths of its vertices; ``moved`` by opening: each finger's motion over the
     tips' depth; ``travel`` (o,) of the fingers against each other, over that depth, with its ``covariance`` (o, o);
     ``direction`` (3,) of the travel, ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3)
-    of the tips' middle over that depth; ``turned``: the fingers turn while they move.
+    of the tips' middle over that depth; ``turned``: why they turn while they move, if they do.
     """
 
     q: tuple[Array, ...]
@@ -53,7 +53,7 @@ class JawMotion:
     direction: Array
     slope_sigma: Array
     tcp_covariance: Array
-    turned: bool
+    turned: str
 
     def over(self, depth: float) -> JawMotion:
         """The same over another depth, given over this one."""
@@ -68,11 +68,6 @@ class JawMotion:
             covariance=self.covariance / depth**2,
             tcp_covariance=self.tcp_covariance / depth**2,
         )
-
-    @property
-    def degrees(self) -> float:
-        """The largest turn of a finger."""
-        return math.degrees(max(abs(finger.turn_rad) for own in self.moved.values() for finger in own))
 
 
 class Unfit(ValueError):

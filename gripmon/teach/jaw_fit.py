@@ -100,16 +100,12 @@ def fit_motion(
     is; ``placed`` is needed then.  Raises :class:`Unfit`.
     """
     fit = _Fit(camera, fingers, seen, around, placed, travel, direction, loose=loose)
-    if loose:
-        return fit.result(fit.checked(fit.solve(LOOSE)), turned=False)
-    best = fit.solve(STRAIGHT)
-    others = fit.solve(ON_ARCS), fit.solve(UNEQUAL)
-    other = min(others, key=lambda solved: solved.chi2)
-    if best.chi2 - other.chi2 > MORE_CHI2:
-        best = other
-    turning = fit.solve(best.common, turning=True, start=best)
-    turned = best.chi2 - turning.chi2 > MORE_CHI2 and float(np.abs(turning.turns).max()) > LEAST_TURN_RAD
-    return fit.result(fit.checked(turning if turned else best), turned)
+    best = fit.solve(LOOSE if loose else STRAIGHT)
+    if not loose:
+        other = min((fit.solve(ON_ARCS), fit.solve(UNEQUAL)), key=lambda solved: solved.chi2)
+        if best.chi2 - other.chi2 > MORE_CHI2:
+            best = other
+    return fit.result(fit.checked(best), fit.turned(best))
 
 
 @dataclass(frozen=True)
@@ -289,6 +285,18 @@ class _Fit:
         chi2 = cost + float(np.square(np.concatenate(self._expected(unknowns))).sum())
         return _Solved(unknowns, covariance, self._split(unknowns)[3][:, 4:], chi2, agreeing, common)
 
+    def turned(self, best: _Solved) -> str:
+        """Why fingers turn while they move, if they do."""
+        turning = self.solve(best.common, turning=True, start=best)
+        turn = float(np.abs(turning.turns).max())
+        if best.chi2 - turning.chi2 > MORE_CHI2 and turn > LEAST_TURN_RAD:
+            return f"the fingers turn by {math.degrees(turn):.1f} degrees while they move"
+        along = self._frame(best.unknowns)[0]
+        if self.placed is None and float(along @ self.rays[np.concatenate(self.tips)].mean(axis=0)) < 0.0:
+            # As if they pointed at the camera, which looks along them: roots are nearer, and would move farther.
+            return "the fingers' tips move farther than their roots, so that they turn"
+        return ""
+
     def _cost(self, unknowns: Array, frame: tuple[Array, Array]) -> tuple[float, float]:
         """The outlines' part of chi-squared, to which a piece that contradicts or isn't found adds a limited one, and
         which part of them agrees.
@@ -423,7 +431,7 @@ class _Fit:
         between /= np.linalg.norm(between, axis=1)[:, None]
         return np.asarray(np.cross(between, way).ravel() / sigma)
 
-    def result(self, best: _Solved, turned: bool) -> JawMotion:
+    def result(self, best: _Solved, turned: str) -> JawMotion:
         q, _, way, tail = self._split(best.unknowns)
         frame = self._frame(best.unknowns)
         motions = self._moved(best.unknowns, frame)[0]

@@ -94,7 +94,7 @@ def _move(
             found = fit_motion(camera, fingers, seen, around, placed=placed)
         if found.turned:
             # Which of its points' distance the jaws report isn't known, and a gripper file's fingers don't turn.
-            return placed, Moved({}, None, f"the fingers turn by {found.degrees:.1f} degrees while they move")
+            return placed, Moved({}, None, found.turned)
         if placed.flat:
             placed, found = place_by_motion(fingers, found, pose, absolute=travel is not None)
         return placed, Moved(found.moved, found)
@@ -103,6 +103,8 @@ def _move(
             raise
         why = str(unfit)
     found = fit_motion(camera, fingers, seen, around, placed=placed, loose=True)
+    if found.turned:
+        return placed, Moved({}, None, found.turned)
     if placed.flat or len(fingers) == 1:
         return placed, Moved(found.moved, None, why)
     return placed, Moved(found.moved, found)
