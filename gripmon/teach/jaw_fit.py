@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ from gripmon.model.records import Array
 from gripmon.teach.finger_depth import Outline, PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact, rough_shift_px
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
-from gripmon.teach.silhouette import in_image
-from gripmon.teach.straight_pieces import LONGEST_CUT_PX, STRAIGHT_PX
+from gripmon.teach.silhouette import Stations, in_image, measure_transitions
+from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, LONGEST_CUT_PX, STRAIGHT_PX
 
 LARGEST_COMMON_MOTION = 0.2
 """Largest common motion along the jaws' travel, over the relative one: 0.5 if one jaw is fixed, a few hundredths for
@@ -74,6 +74,8 @@ _PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
 _ROUNDS = ((40.0, 5.0), (25.0, 3.0), (15.0, 2.0), (8.0, 1.0), (5.0, 0.5), (3.0, STRAIGHT_PX), (3.0, STRAIGHT_PX))
 """Distances within which an outline is looked for, and its scatter (px), in turn: a start is known to a few tenths of a
 motion of 100 px."""
+_FINER = ((True, 1.0), (True, 0.5), (False, 0.3), (False, LEAST_SCATTER_PX))
+"""Whether images are searched widely (4 px), and the least scatter (px), in turn."""
 CONTRADICTS = 3.0
 """Scatters by which a piece contradicts the rest."""
 AGREEING = 0.8
@@ -105,7 +107,12 @@ def fit_motion(
         other = min((fit.solve(ON_ARCS), fit.solve(UNEQUAL)), key=lambda solved: solved.chi2)
         if best.chi2 - other.chi2 > MORE_CHI2:
             best = other
-    return fit.result(fit.checked(best), fit.turned(best))
+    turned = fit.turned(fit.checked(best))
+    return fit.result(fit.finer(best), turned)
+
+
+_Found = tuple[NDArray[np.intp], Array, Array]
+"""Stations (m,) that meet an outline, a point of its line (m, 2), and its normal (m, 2), ideal coordinates."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,7 @@ class _Solved:
     chi2: float
     agreeing: float
     common: Array
+    free: NDArray[np.bool_]
 
 
 class _Fit:
@@ -146,6 +154,7 @@ class _Fit:
         self.finger = np.repeat(np.arange(len(fingers)), np.diff(self.first))
         self._stations()
         self.each = 4 + len(fingers)
+        self.around, self.blur_px = tuple(around.values()), seen.blur_px
         self.others = [_lines(camera, other) for other in around.values()]
         self._start(camera, seen, around)
 
@@ -283,7 +292,22 @@ class _Fit:
         covariance[np.ix_(free, free)] = np.linalg.pinv(normal, hermitian=True)
         cost, agreeing = self._cost(unknowns, frame)
         chi2 = cost + float(np.square(np.concatenate(self._expected(unknowns))).sum())
-        return _Solved(unknowns, covariance, self._split(unknowns)[3][:, 4:], chi2, agreeing, common)
+        return _Solved(unknowns, covariance, self._split(unknowns)[3][:, 4:], chi2, agreeing, common, free)
+
+    def finer(self, best: _Solved) -> _Solved:
+        """The same by the images themselves, and weighted by how well they agree; its covariance stays that of before,
+        with what lines may miss their edges by.
+        """
+        self.common, unknowns, free = best.common, best.unknowns, best.free
+        for wide, least_px in _FINER:
+            frame = self._frame(unknowns)
+            moved = self._moved(unknowns, frame)[1]
+            met = self._match(moved, _ROUNDS[-1][0])
+            found = [self._in_images(*each, wide=wide) for each in zip(moved, self.around, met, strict=True)]
+            rms = self._rms(self._off_px(unknowns, frame, found), self._pieces(found))
+            self.scatter_px = max(float(np.median(rms[rms > 0.0])), least_px)
+            unknowns = self._least_squares(unknowns, free, frame, found)[0]
+        return replace(best, unknowns=unknowns)
 
     def turned(self, best: _Solved) -> str:
         """Why fingers turn while they move, if they do."""
@@ -322,7 +346,7 @@ class _Fit:
             raise Unfit(f"only {100.0 * best.agreeing:.0f} % of the outlines move as those of two rigid fingers would")
         return best
 
-    def _match(self, moved: Array, reach_px: float) -> list[tuple[NDArray[np.intp], Array, Array]]:
+    def _match(self, moved: Array, reach_px: float) -> list[_Found]:
         """For each opening: the stations that meet an outline, a point of its line (m, 2), and its normal (m, 2)."""
         out = []
         ways = self.rays[self.ends[:, 1]] - self.rays[self.ends[:, 0]]
@@ -346,9 +370,27 @@ class _Fit:
             out.append((met, start[best[met]], normal[best[met]]))
         return out
 
-    def _off_px(
-        self, unknowns: Array, frame: tuple[Array, Array], found: list[tuple[NDArray[np.intp], Array, Array]]
-    ) -> Array:
+    def _in_images(self, points: Array, other: OpeningSeen, matched: _Found, *, wide: bool) -> _Found:
+        """As :meth:`_match`, each station measured in an opening's images; ``matched``, where those don't show it."""
+        ways = self.camera.project(points + 1e-3 * np.gradient(points.reshape(-1, STATIONS, 3), axis=1).reshape(-1, 3))
+        uv = np.nan_to_num(self.camera.project(points), nan=-1e3)
+        way = ways - uv
+        way /= np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+        across = np.column_stack([-way[:, 1], way[:, 0]])
+        inside = in_image(uv, self.shape_px, BORDER_PX)
+        # A station's normal points away from the finger: going along its outline that is on the left in the image.
+        stations = Stations(uv, across, inside)
+        seen = other.matte.images, stations, other.matte.noise
+        got = measure_transitions(*seen, wide=wide, blur_px=self.blur_px)
+        met = np.flatnonzero(got.usable)
+        if len(met) < 0.5 * len(matched[0]):
+            return matched
+        at_px = uv[met] + across[met] * got.offset_px[met, None]
+        at, aside = (self.camera.undistort(at_px + k * across[met]) for k in (0.0, 0.5))
+        normal = (aside - at) / np.linalg.norm(aside - at, axis=1)[:, None]
+        return met, at, normal
+
+    def _off_px(self, unknowns: Array, frame: tuple[Array, Array], found: list[_Found]) -> Array:
         moved = self._moved(unknowns, frame)[1]
         out = []
         for points, (met, at, normal) in zip(moved, found, strict=True):
@@ -361,7 +403,7 @@ class _Fit:
         unknowns: Array,
         free: NDArray[np.bool_],
         frame: tuple[Array, Array],
-        found: list[tuple[NDArray[np.intp], Array, Array]],
+        found: list[_Found],
     ) -> tuple[Array, Array]:
         def at(part: Array) -> Array:
             full = unknowns.copy()
@@ -376,7 +418,7 @@ class _Fit:
         solved = least_squares(residuals, unknowns[free], max_nfev=_STEPS)
         return at(solved.x), np.asarray(solved.jac)
 
-    def _pieces(self, found: list[tuple[NDArray[np.intp], Array, Array]]) -> NDArray[np.intp]:
+    def _pieces(self, found: list[_Found]) -> NDArray[np.intp]:
         """Which piece, at which opening, each matched station is of."""
         return np.concatenate([self.piece[met] + k * len(self.length_px) for k, (met, _, _) in enumerate(found)])
 
