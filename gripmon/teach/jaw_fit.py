@@ -6,9 +6,9 @@ relative travel, its length at each opening, the motion that both fingers have i
 they open), and how far each finger turns.  What one camera can't tell from another place or size is assumed with a
 standard deviation, which reaches the result's covariance:
 
-* both fingers move equally far along u (:data:`UNEQUAL`), and neither to the side (:data:`SIDEWAYS`);
-* their tips, mirror images of each other, lie along u (:data:`BESIDE`);
-* a finger's outline lies near a plane (:data:`OFF_PLANE`).
+* both fingers move equally far along u, straight or on arcs (:data:`STRAIGHT`, :data:`ON_ARCS`);
+* their tips, mirror images of each other, lie along u (:data:`~gripmon.teach.jaw_unknowns.BESIDE`);
+* a finger's outline lies near a plane (:data:`~gripmon.teach.jaw_unknowns.OFF_PLANE`).
 
 Each piece of an outline counts as two measurements, an offset and a turn, since its points err together.  Edges that
 move along themselves show no depth; they are placed near the plane of the rest.
@@ -27,50 +27,17 @@ from scipy.optimize import least_squares
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import Outline, PlacedOutlines
-from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact, rough_shift_px
+from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit
 from gripmon.teach.image_outline import BORDER_PX, OpeningSeen
+from gripmon.teach.jaw_unknowns import STATIONS, Jaws
 from gripmon.teach.silhouette import Stations, in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, LONGEST_CUT_PX, STRAIGHT_PX
 
-LARGEST_COMMON_MOTION = 0.2
-"""Largest common motion along the jaws' travel, over the relative one: 0.5 if one jaw is fixed, a few hundredths for
-tips at different depths that move equally far."""
-STRAIGHT = np.array([0.02, 0.01, 0.01])
-"""Standard deviations of the common motion along the travel, square to travel and fingers, and along the fingers, over
-the relative one: jaws that a rack, gears or a linkage moves on guides: 0.2 and 0.1 mm in 10 mm."""
-ON_ARCS = np.array([0.02, 0.1, 1.0])
-"""The same where tips move on arcs: 1 at 45 degrees, along fingers whose direction is known to 6 degrees."""
-UNEQUAL = np.array([0.3, 0.01, 0.01])
-"""The same of jaws that move unequally far: 0.5 if one stands."""
-LOOSE = np.array([1.0, 1.0, 1.0])
-"""The same of fingers that move each on its own."""
-BESIDE = 0.1
-"""Standard deviation (rad) of the angle between the travel and the connection of two tips' vertices that correspond:
-4 mm of 40, where the front edge of one and the back edge of the other are seen."""
-SQUARE = 0.2
-"""Standard deviation (rad) of the travel's angle with the image plane: cameras face the middle of the jaws."""
-BESIDE_ROUGHLY = 0.4
-"""The same of the tips' innermost vertices where none correspond: 16 mm, the thickness of a finger, of 40."""
-CORRESPOND_RAD = math.radians(3.0)
-"""Largest angle in the image between the travel and the connection of vertices that correspond: 2 px of 40, the
-shortest gap at which a tip is told from its neighbour."""
-OFF_PLANE = 0.05
-"""Standard deviation of an outline's points from a plane, over their distance: half of a finger 10 mm thick, 100 mm
-away."""
-AS_PLACED = 0.03
-"""Standard deviation of an outline's points, over their distance, from where perspective places them: 2 degrees of the
-fingers' direction, seen 45 degrees from it."""
-LEAST_TRAVEL_PX = 4.0
-"""Least motion of the fingers against each other: twice what a rough shift resolves."""
 MORE_CHI2 = 9.0
 """Least decrease of the fit's chi-squared by which tips move on arcs, or fingers turn: three standard deviations."""
 LEAST_TURN_RAD = math.radians(0.5)
 """Least turn that matters: at the root of a finger as long as the distance is six times as large, it is a twentieth of
 a millimetre at its tip."""
-STATIONS = 12
-"""Number of stations on each piece."""
-_PARTS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75))
-"""Parts of a finger's length, from its tip, whose motions start the search."""
 _ROUNDS = ((40.0, 5.0), (25.0, 3.0), (15.0, 2.0), (8.0, 1.0), (5.0, 0.5), (3.0, STRAIGHT_PX), (3.0, STRAIGHT_PX))
 """Distances within which an outline is looked for, and its scatter (px), in turn: a start is known to a few tenths of a
 motion of 100 px."""
@@ -83,6 +50,17 @@ AGREEING = 0.8
 _SAME_WAY = math.cos(math.radians(30.0))
 _PER_PIECE = 2.0
 _STEPS = 5
+
+
+STRAIGHT = np.array([0.02, 0.01, 0.01])
+"""Standard deviations of the common motion along the travel, square to travel and fingers, and along the fingers, over
+the relative one: jaws that a rack, gears or a linkage moves on guides: 0.2 and 0.1 mm in 10 mm."""
+ON_ARCS = np.array([0.02, 0.1, 1.0])
+"""The same where tips move on arcs: 1 at 45 degrees, along fingers whose direction is known to 6 degrees."""
+UNEQUAL = np.array([0.3, 0.01, 0.01])
+"""The same of jaws that move unequally far: 0.5 if one stands."""
+LOOSE = np.array([1.0, 1.0, 1.0])
+"""The same of fingers that move each on its own."""
 
 
 def fit_motion(
@@ -126,153 +104,8 @@ class _Solved:
     free: NDArray[np.bool_]
 
 
-class _Fit:
-    """The unknowns, in turn: inverse depths; three of each finger's plane, or its factor on what perspective says; the
-    travel's direction, two; at each opening its logarithm, the common motion (3,) over it, and the fingers' turns.
-    """
-
-    def __init__(
-        self,
-        camera: Camera,
-        fingers: Sequence[Outline],
-        seen: OpeningSeen,
-        around: Mapping[float, OpeningSeen],
-        placed: PlacedOutlines | None,
-        travel: Mapping[float, tuple[float, float]] | None,
-        direction: Array | None,
-        *,
-        loose: bool,
-    ):
-        if len(fingers) > 2 or (len(fingers) < 2 and not loose):
-            raise Unfit("it takes two fingers")
-        self.loose, self.sides = loose, np.array([-0.5, 0.5] if len(fingers) == 2 else [1.0])
-        self.camera, self.focal, self.fingers, self.openings = camera, camera.fx_px, fingers, tuple(around)
-        self.shape_px = seen.fingers[0].mask.shape
-        self.placed, self.travel, self.direction = placed, travel, direction
-        self.first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
-        self.rays = np.vstack([np.column_stack([f.xy, np.ones(len(f.xy))]) for f in fingers])
-        self.finger = np.repeat(np.arange(len(fingers)), np.diff(self.first))
-        self._stations()
-        self.each = 4 + len(fingers)
-        self.around, self.blur_px = tuple(around.values()), seen.blur_px
-        self.others = [_lines(camera, other) for other in around.values()]
-        self._start(camera, seen, around)
-
-    def _stations(self) -> None:
-        ends, finger = [], []
-        for k, outline in enumerate(self.fingers):
-            kept = outline.pieces if self.placed is None else self.placed.kept[k]
-            ends += [(a + self.first[k], b + self.first[k]) for a, b in kept]
-            finger += [k] * len(kept)
-        lengths = np.linalg.norm(np.subtract(*self.rays[np.reshape(ends, (-1, 2)).T]), axis=1)
-        self.length_px = self.focal * lengths
-        self.ends = np.repeat(np.reshape(ends, (-1, 2)).astype(int), STATIONS, axis=0)
-        self.piece = np.repeat(np.arange(len(ends)), STATIONS)
-        self.of_finger = np.repeat(np.array(finger), STATIONS)
-        self.share = np.tile(np.linspace(0.05, 0.95, STATIONS), len(ends))[:, None]
-        self.ray = (1.0 - self.share) * self.rays[self.ends[:, 0]] + self.share * self.rays[self.ends[:, 1]]
-
-    def _start(self, camera: Camera, seen: OpeningSeen, around: Mapping[float, OpeningSeen]) -> None:
-        rough = np.array([
-            [[rough_shift_px(f.mask, f.outwards, other, part) for part in _PARTS] for f in seen.fingers]
-            for other in around.values()
-        ]) / camera.fx_px  # fmt: skip
-        tips = rough[:, :, 0]
-        apart = tips[:, 1] - tips[:, 0] if len(self.fingers) == 2 else tips[:, 0]
-        common = tips.mean(axis=1) if len(self.fingers) == 2 else 0.0 * apart
-        length = np.linalg.norm(apart, axis=1)
-        if not length.min() > LEAST_TRAVEL_PX / camera.fx_px:
-            raise Unfit("the fingers don't move against each other")
-        far = int(length.argmax())
-        way = apart[far] / length[far]
-        foremost = [f.xy[(f.xy @ f.outwards).argmax()] for f in self.fingers]
-        if len(foremost) == 2:
-            way = way * np.sign(float(way @ (foremost[1] - foremost[0])))
-        self.tips = [first + own for first, own in zip(self.first, contact(self.fingers, way)[0], strict=False)]
-        self.sign = np.sign(apart @ way)
-        along = common @ way / length
-        if np.abs(along).max() > LARGEST_COMMON_MOTION and not self.loose:
-            raise Unfit("one finger moves farther than the other")
-        if self.placed is None:
-            q = np.concatenate([
-                _roughly(f, s * 0.5 * apart[far], shifts)
-                for f, s, shifts in zip(self.fingers, (-1.0, 1.0), rough[far], strict=True)
-            ])  # fmt: skip
-        else:
-            depth = np.concatenate([p[:, 2] for p in self.placed.points])
-            q = np.where(np.isfinite(depth), 1.0 / depth, 1.0)
-        self.pairs = self._corresponding(way) if len(self.fingers) == 2 else np.zeros((0, 2), int)
-        self.shape = q
-        self.extra = 6 if self.placed is None else 2
-        tail = np.zeros((len(self.openings), self.each))
-        tail[:, 0] = np.log(length)
-        tail[:, 1] = self.sign * along
-        outwards = np.sum([f.outwards for f in self.fingers], axis=0)
-        outwards -= way * float(way @ outwards)
-        tail[:, 3] = self.sign * (common @ outwards) / float(np.linalg.norm(outwards)) / length
-        self.start = np.concatenate([q, self._planes(q), [math.atan2(way[1], way[0]), 0.0], tail.ravel()])
-
-    def _corresponding(self, way: Array) -> NDArray[np.intp]:
-        """Pairs (p, 2) of the tips' vertices that lie beside each other along the travel, a direction (2,)."""
-        off = self.rays[self.tips[1], :2][None] - self.rays[self.tips[0], :2][:, None]
-        angle = np.abs(np.arctan2(off[..., 0] * way[1] - off[..., 1] * way[0], off @ way))
-        nearest = [(i, int(j)) for i, j in enumerate(angle.argmin(axis=1)) if angle[i, j] < CORRESPOND_RAD]
-        pairs = [(i, j) for i, j in nearest if angle[:, j].argmin() == i]
-        return np.array([(self.tips[0][i], self.tips[1][j]) for i, j in pairs], int).reshape(-1, 2)
-
-    def _planes(self, q: Array) -> Array:
-        if self.placed is not None:
-            return np.ones(len(self.fingers))
-        return np.concatenate([np.linalg.lstsq(self._plane(k), q[self.finger == k], rcond=None)[0] for k in range(2)])
-
-    def _plane(self, k: int) -> Array:
-        xy = self.fingers[k].xy
-        return np.column_stack([np.ones(len(xy)), xy - xy.mean(axis=0)])
-
-    def _split(self, unknowns: Array) -> tuple[Array, Array, Array, Array]:
-        """Inverse depths, what they are expected to be, the travel's direction (3,), and a row of each opening."""
-        count = len(self.rays)
-        q, extra = unknowns[:count], unknowns[count : count + self.extra]
-        angle, rise = unknowns[count + self.extra : count + self.extra + 2]
-        if self.placed is None:
-            expected = np.concatenate([self._plane(k) @ extra[3 * k : 3 * k + 3] for k in range(2)])
-        else:
-            expected = self.shape * extra[self.finger]
-        way = np.array([math.cos(angle), math.sin(angle), rise])
-        return (
-            q,
-            expected,
-            way / np.linalg.norm(way),
-            unknowns[count + self.extra + 2 :].reshape(len(self.openings), -1),
-        )
-
-    def _frame(self, unknowns: Array) -> tuple[Array, Array]:
-        """Directions (3,) along the fingers, and square to them and to the travel."""
-        q, _, way, _ = self._split(unknowns)
-        points = self.rays / q[:, None]
-        along = np.sum([along_finger(f, points[self.finger == k])[0] for k, f in enumerate(self.fingers)], axis=0)
-        along = along - way * float(along @ way)
-        along /= np.linalg.norm(along)
-        return along, np.cross(along, way)
-
-    def _moved(self, unknowns: Array, frame: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Motions (o, 2, 3) of the fingers' tips, and all stations (o, n, 3) where they have moved to."""
-        q, _, way, tail = self._split(unknowns)
-        along, square = frame
-        travel = self.sign * np.exp(tail[:, 0])
-        common = tail[:, 1:2] * way + tail[:, 2:3] * square + tail[:, 3:4] * along
-        motion = travel[:, None, None] * (self.sides[None, :, None] * way + common[:, None])
-        here = (1.0 - self.share) * q[self.ends[:, :1]] + self.share * q[self.ends[:, 1:]]
-        points = self.ray / here
-        pivot = np.array([(self.rays[tip] / q[tip, None]).mean(axis=0) for tip in self.tips])[self.of_finger]
-        arm = points - pivot
-        turn = tail[:, 4:][:, self.of_finger, None]
-        turned = (
-            arm * np.cos(turn)
-            + np.cross(square, arm) * np.sin(turn)
-            + square * (arm @ square)[:, None] * (1.0 - np.cos(turn))
-        )
-        return motion, pivot + turned + motion[:, self.of_finger]
+class _Fit(Jaws):
+    """Finds the unknowns."""
 
     def solve(self, common: Array, *, turning: bool = False, start: _Solved | None = None) -> _Solved:
         """``common`` (3,): standard deviations of the common motion."""
@@ -284,15 +117,15 @@ class _Fit:
             free[count - self.each * openings :].reshape(openings, -1)[:, 4:] = False
         for reach_px, scatter_px in _ROUNDS if start is None else _ROUNDS[3:]:
             self.scatter_px = scatter_px
-            frame = self._frame(unknowns)
-            found = self._match(self._moved(unknowns, frame)[1], reach_px)
+            frame = self.frame(unknowns)
+            found = self._match(self.moved(unknowns, frame)[1], reach_px)
             unknowns, jacobian = self._least_squares(unknowns, free, frame, found)
         normal = jacobian.T @ jacobian
         covariance = np.zeros((count, count))
         covariance[np.ix_(free, free)] = np.linalg.pinv(normal, hermitian=True)
         cost, agreeing = self._cost(unknowns, frame)
-        chi2 = cost + float(np.square(np.concatenate(self._expected(unknowns))).sum())
-        return _Solved(unknowns, covariance, self._split(unknowns)[3][:, 4:], chi2, agreeing, common, free)
+        chi2 = cost + float(np.square(np.concatenate(self.expected(unknowns))).sum())
+        return _Solved(unknowns, covariance, self.split(unknowns)[3][:, 4:], chi2, agreeing, common, free)
 
     def finer(self, best: _Solved) -> _Solved:
         """The same by the images themselves, and weighted by how well they agree; its covariance stays that of before,
@@ -300,8 +133,8 @@ class _Fit:
         """
         self.common, unknowns, free = best.common, best.unknowns, best.free
         for wide, least_px in _FINER:
-            frame = self._frame(unknowns)
-            moved = self._moved(unknowns, frame)[1]
+            frame = self.frame(unknowns)
+            moved = self.moved(unknowns, frame)[1]
             met = self._match(moved, _ROUNDS[-1][0])
             found = [self._in_images(*each, wide=wide) for each in zip(moved, self.around, met, strict=True)]
             rms = self._rms(self._off_px(unknowns, frame, found), self._pieces(found))
@@ -315,7 +148,7 @@ class _Fit:
         turn = float(np.abs(turning.turns).max())
         if best.chi2 - turning.chi2 > MORE_CHI2 and turn > LEAST_TURN_RAD:
             return f"the fingers turn by {math.degrees(turn):.1f} degrees while they move"
-        along = self._frame(best.unknowns)[0]
+        along = self.frame(best.unknowns)[0]
         if self.placed is None and float(along @ self.rays[np.concatenate(self.tips)].mean(axis=0)) < 0.0:
             # As if they pointed at the camera, which looks along them: roots are nearer, and would move farther.
             return "the fingers' tips move farther than their roots, so that they turn"
@@ -325,7 +158,7 @@ class _Fit:
         """The outlines' part of chi-squared, to which a piece that contradicts or isn't found adds a limited one, and
         which part of them agrees.
         """
-        moved = self._moved(unknowns, frame)[1]
+        moved = self.moved(unknowns, frame)[1]
         found = self._match(moved, _ROUNDS[-1][0])
         off, piece = self._off_px(unknowns, frame, found), self._pieces(found)
         rms = self._rms(off, piece)[piece] / self.scatter_px
@@ -372,7 +205,8 @@ class _Fit:
 
     def _in_images(self, points: Array, other: OpeningSeen, matched: _Found, *, wide: bool) -> _Found:
         """As :meth:`_match`, each station measured in an opening's images; ``matched``, where those don't show it."""
-        ways = self.camera.project(points + 1e-3 * np.gradient(points.reshape(-1, STATIONS, 3), axis=1).reshape(-1, 3))
+        ahead = np.asarray(np.gradient(points.reshape(-1, STATIONS, 3), axis=1)).reshape(-1, 3)
+        ways = self.camera.project(points + 1e-3 * ahead)
         uv = np.nan_to_num(self.camera.project(points), nan=-1e3)
         way = ways - uv
         way /= np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
@@ -391,7 +225,7 @@ class _Fit:
         return met, at, normal
 
     def _off_px(self, unknowns: Array, frame: tuple[Array, Array], found: list[_Found]) -> Array:
-        moved = self._moved(unknowns, frame)[1]
+        moved = self.moved(unknowns, frame)[1]
         out = []
         for points, (met, at, normal) in zip(moved, found, strict=True):
             xy = points[met, :2] / points[met, 2:]
@@ -412,7 +246,7 @@ class _Fit:
 
         def residuals(part: Array) -> Array:
             full = at(part)
-            return np.concatenate([self._off_px(full, frame, found) * each, *self._expected(full)])
+            return np.concatenate([self._off_px(full, frame, found) * each, *self.expected(full)])
 
         each = self._worth(self._off_px(unknowns, frame, found), self._pieces(found))
         solved = least_squares(residuals, unknowns[free], max_nfev=_STEPS)
@@ -438,45 +272,10 @@ class _Fit:
         """Of each piece's stations."""
         return np.asarray(np.sqrt(np.bincount(piece, off**2) / np.maximum(np.bincount(piece), 1)))
 
-    def _expected(self, unknowns: Array) -> list[Array]:
-        """What is assumed, over its standard deviation."""
-        q, expected, way, tail = self._split(unknowns)
-        out = [
-            (q - expected) / (OFF_PLANE if self.placed is None else AS_PLACED),
-            self._off_beside(self.rays / q[:, None], way),
-            way[2:] / SQUARE,
-            (tail[:, 1:4] / self.common).ravel(),
-        ]
-        if self.travel is None:
-            mean = (
-                np.mean([1.0 / q[tip].mean() for tip in self.tips])
-                if self.placed is None
-                else np.mean(expected / self.shape)
-            )
-            out.append(np.array([1e3 * (mean - 1.0)]))
-        else:
-            known = np.array([self.travel[opening] for opening in self.openings])
-            out.append((np.exp(tail[:, 0]) - known[:, 0]) / known[:, 1])
-        if self.direction is not None:
-            out.append(np.cross(self.direction, way) / (0.2 * BESIDE))
-        return out
-
-    def _off_beside(self, points: Array, way: Array) -> Array:
-        """How far two tips aren't beside each other along the travel."""
-        if len(self.fingers) == 1:
-            return np.zeros(0)
-        if len(self.pairs):
-            between, sigma = points[self.pairs[:, 1]] - points[self.pairs[:, 0]], BESIDE
-        else:
-            first, last = (points[tip].mean(axis=0) for tip in self.tips)
-            between, sigma = (last - first)[None], BESIDE_ROUGHLY
-        between /= np.linalg.norm(between, axis=1)[:, None]
-        return np.asarray(np.cross(between, way).ravel() / sigma)
-
     def result(self, best: _Solved, turned: str) -> JawMotion:
-        q, _, way, tail = self._split(best.unknowns)
-        frame = self._frame(best.unknowns)
-        motions = self._moved(best.unknowns, frame)[0]
+        q, _, way, tail = self.split(best.unknowns)
+        frame = self.frame(best.unknowns)
+        motions = self.moved(best.unknowns, frame)[0]
         moved = {
             opening: tuple(FingerMoved(m, float(t)) for m, t in zip(motion, turns, strict=True))
             for opening, motion, turns in zip(self.openings, motions, best.turns, strict=True)
@@ -488,7 +287,7 @@ class _Fit:
         slopes = []
         for k in range(len(self.fingers)):
             own = np.flatnonzero(self.finger == k)
-            fit = np.linalg.pinv(self._plane(k))[1:]
+            fit = np.linalg.pinv(self.plane(k))[1:]
             slopes.append(np.diag(fit @ best.covariance[np.ix_(own, own)] @ fit.T))
         slope_sigma = np.sqrt(np.mean(slopes, axis=0))
         # The TCP is the mean over the tips of the mean of their vertices, each at its ray over q.
@@ -497,24 +296,3 @@ class _Fit:
             at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
         tcp = at_q @ best.covariance @ at_q.T
         return JawMotion(tuple(of_each), moved, travel, covariance, way, slope_sigma, tcp, turned)
-
-
-def _lines(camera: Camera, seen: OpeningSeen) -> tuple[Array, Array]:
-    """Both ends (n, 2) of all pieces of outlines, ideal coordinates."""
-    starts, ends = [], []
-    for finger in seen.fingers:
-        for chain in finger.chains:
-            xy = camera.undistort(chain.uv_px)
-            pieces = np.reshape(chain.pieces, (-1, 2)).astype(int)
-            starts.append(xy[pieces[:, 0]])
-            ends.append(xy[pieces[:, 1]])
-    return np.vstack(starts), np.vstack(ends)
-
-
-def _roughly(finger: Outline, shift: Array, of_parts: Array) -> Array:
-    """Inverse depths (v,), linear along the finger, from its parts' motions (p, 2) over the tip's ``shift`` (2,)."""
-    middles = [0.5 * (near + far) for near, far in _PARTS]
-    by_part = of_parts @ shift / float(shift @ shift)
-    slope, at_tip = np.polyfit(middles, by_part, 1)
-    ahead = finger.xy @ finger.outwards
-    return np.clip(at_tip + slope * (ahead.max() - ahead) / float(np.ptp(ahead)), 0.5, 2.0)
