@@ -160,7 +160,7 @@ def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tup
     assert found.gripper.model.scale_sigma == SIZE_UNKNOWN and found.cam_T_grip[2, 3] == NOMINAL_DISTANCE_M
     assert found.covariance[2, 2] >= NOMINAL_DISTANCE_M**2
     assert any("size is unknown" in note and "valid_by: reference" in note for note in found.notes)
-    creep = Creep(start_s=0.4, time_s=0.6, tcp_shift_m=(0.0008, 0.0004), translation_m=(0.0, 0.0, 0.0004))
+    creep = Creep(start_s=1.2, time_s=0.6, tcp_shift_m=(0.0008, 0.0004), translation_m=(0.0, 0.0, 0.0004))
     scenario = Scenario(name="x", duration_s=3.0, fps=10.0, mount=(creep,), background=Background(kind="printed"))
     simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
     settings = MonitorSettings(policy=PolicySettings(valid_by=ValidBy.REFERENCE))
@@ -184,7 +184,7 @@ def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tup
         assert record.cam_T_grip is not None and record.protection is not None
         error = perturbation_between(true_T(k) @ true_T_made, from_record(record.cam_T_grip))
         off_m = float(np.linalg.norm(error[:3]))
-        assert off_m < record.protection.position_m and off_m < 1.5e-4
+        assert off_m < record.protection.position_m and (k > 12 or off_m < 3e-5)
         assert record.absolute is not None and record.absolute.position_m > NOMINAL_DISTANCE_M
     assert valid >= 0.9 * (frames - 2)
 
