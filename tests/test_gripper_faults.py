@@ -172,16 +172,10 @@ JAW_FAULTS: list[tuple[str, Callable[[Model], None], str, str]] = [
         "rows sorted by opening_m",
     ),
     (
-        "table too short below",
-        _set("fingers", "right", "motion", "table", 0, 0, value=0.012),
-        "fingers.right.motion.table: covers 0.012 to 0.05 m; ",
-        "all of jaw.min_m to jaw.max_m",
-    ),
-    (
-        "table too short above",
-        _set("fingers", "right", "motion", "table", 2, 0, value=0.048),
-        "fingers.right.motion.table: covers 0.01 to 0.048 m; ",
-        "all of jaw.min_m to jaw.max_m",
+        "table without the nominal opening",
+        lambda m: m["fingers"]["right"]["motion"].update(table=[[0.04, 0.0, 0.0, 0.0], [0.05, 0.001, 0.0, 0.0]]),
+        "fingers.right.motion.table: covers 0.04 to 0.05 m; ",
+        "jaw.nominal_m within it",
     ),
     (
         "not at rest at nominal",

@@ -19,14 +19,15 @@ from gripmon.daemon.config import read_gripper
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
-from gripmon.model.gripper import Gripper
+from gripmon.model.gripper import SIZE_UNKNOWN, Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, ReferenceRecord, Verdict
+from gripmon.model.records import Array, Frame, ReferenceRecord, ValidBy, Verdict
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Creep, FingerLook, FingerMark, Light, Sensor
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
+from gripmon.teach.image_size import NOMINAL_DISTANCE_M
 
 DEPTH_M = 0.115
 DISTANCE = (DEPTH_M, 5e-5)
@@ -153,6 +154,41 @@ def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
         assert verdicts == {verdict}
 
 
+def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tuple) -> None:
+    images, _ = box
+    found = gripper_from_images(images, PAPER_LENS)
+    assert found.gripper.model.scale_sigma == SIZE_UNKNOWN and found.cam_T_grip[2, 3] == NOMINAL_DISTANCE_M
+    assert found.covariance[2, 2] >= NOMINAL_DISTANCE_M**2
+    assert any("size is unknown" in note and "valid_by: reference" in note for note in found.notes)
+    creep = Creep(start_s=1.2, time_s=0.6, tcp_shift_m=(0.0008, 0.0004), translation_m=(0.0, 0.0, 0.0004))
+    scenario = Scenario(name="x", duration_s=3.0, fps=10.0, mount=(creep,), background=Background(kind="printed"))
+    simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
+    settings = MonitorSettings(policy=PolicySettings(valid_by=ValidBy.REFERENCE))
+    monitor = Monitor(CAMERA, found.gripper, settings, reference_of(found.cam_T_grip, found.covariance))
+
+    def true_T(k: int) -> Array:
+        """In the file's unit."""
+        pose = np.array(simulator.truth(k).cam_T_grip)
+        pose[:3, 3] *= NOMINAL_DISTANCE_M / DEPTH_M
+        return pose
+
+    true_T_made = invert(true_T(0)) @ found.cam_T_grip
+    valid, frames = 0, 30
+    for k in range(frames):
+        shown = simulator.frame(k)
+        record = monitor.process(Frame(shown.seq, shown.stamp_ns, shown.image, None, shown.name))
+        monitor.run_pending()
+        if record.verdict is not Verdict.VALID:
+            continue
+        valid += 1
+        assert record.cam_T_grip is not None and record.protection is not None
+        error = perturbation_between(true_T(k) @ true_T_made, from_record(record.cam_T_grip))
+        off_m = float(np.linalg.norm(error[:3]))
+        assert off_m < record.protection.position_m and (k > 12 or off_m < 3e-5)
+        assert record.absolute is not None and record.absolute.position_m > NOMINAL_DISTANCE_M
+    assert valid >= 0.9 * (frames - 2)
+
+
 def _curve_ends(gripper: Gripper, true_T_grip: Array) -> Array:
     """Places (n, 3) where sides turn into curves, in the true gripper's frame, from left to right."""
     points = np.unique(gripper.edge_points[gripper.edge_curved])
@@ -205,8 +241,10 @@ def test_openings_in_metres_tell_distance_and_motion() -> None:
     found = gripper_from_images(images, PAPER_LENS, openings_m=openings)
     sigma_m = float(np.sqrt(found.covariance[2, 2]))
     assert abs(found.cam_T_grip[2, 3] - DEPTH_M) < max(4.0 * sigma_m, 0.01 * DEPTH_M)
-    assert found.gripper.jaw_min_m == 0.024
-    assert found.gripper.jaw_max_m == found.gripper.jaw_nominal_m == 0.034
+    assert found.gripper.jaw_nominal_m == 0.034
+    # As far again as the images show, to either side, and less certain there.
+    assert found.gripper.jaw_min_m == pytest.approx(0.014) and found.gripper.jaw_max_m == pytest.approx(0.044)
+    assert found.gripper.beyond_m(0.024) == 0.0 < found.gripper.beyond_m(0.02) < found.gripper.beyond_m(0.014) < 1e-3
     moved = found.gripper.points_grip_m(0.024) - found.gripper.points_grip_m(0.034)
     left = found.gripper.point_finger == 0
     # Each finger moves by half of the opening, the left one to the right.
@@ -265,7 +303,7 @@ def test_wrong_input_says_what_would_be_right(box: tuple) -> None:
     images, _ = box
     for wrong, values, word in (
         (images[:5], {"distance_m": DISTANCE}, "at least 10"),
-        (images, {}, "--distance"),
+        (images, {"openings_m": [0.03] * 30, "jaw_range_m": (0.0, 0.02)}, "jaw_range: is 0 to 0.02 m, but"),
         (images, {"distance_m": DISTANCE, "finger_width_m": (0.01, 1e-4)}, "one of"),
         ([*images[:12], images[3]], {"distance_m": DISTANCE}, "same image"),
         ([*images[:12], images[13][:-2]], {"distance_m": DISTANCE}, "one size"),

@@ -74,7 +74,7 @@ def test_tapered_fingers_are_placed_by_how_they_move() -> None:
     away = beside_truth_px(chains_of(found), MeshCamera(CAMERA, meshes).coverage(POSE))
     assert len(away) > 300 and np.quantile(away, 0.95) <= 0.2
     assert found.seen.matte.images.shape[0] == 20
-    # Given was the distance of what reaches farthest out; here that of the tips' middle, 3 mm of which are thickness.
+    # Given was the distance of the tips' middle, which lies between the corners that face each other.
     scale = DISTANCE[0] / found.cam_T_grip[2, 3]
     points = found.gripper.points_grip_m() @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3]
     for finger, mesh in enumerate(meshes):
@@ -83,8 +83,9 @@ def test_tapered_fingers_are_placed_by_how_they_move() -> None:
         depth = depth_of_outline(true, own)
         assert np.abs(own[:, 2] / depth - 1.0).max() < 0.03
     assert abs(found.gripper.jaw_nominal_m / GAP_M - 1.0) < 0.03
+    # The images show 12 mm of travel, and as much to either side isn't excluded.
     moved_m = found.gripper.jaw_max_m - found.gripper.jaw_min_m
-    assert abs(moved_m / 0.012 - 1.0) < 0.03
+    assert abs(moved_m / 0.036 - 1.0) < 0.03
     assert any("move equally far" in note for note in found.notes) and not any("flat" in note for note in found.notes)
 
 
@@ -161,7 +162,9 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart_by_motion() -> N
     found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     assert found.gripper.finger_ids == ("left", "right")
     assert any("join the fingers" in note for note in found.notes)
-    assert abs(found.gripper.jaw_max_m - 0.034) < 2e-4 and abs(found.gripper.jaw_min_m - 0.024) < 2e-4
+    assert abs(found.gripper.jaw_nominal_m - 0.034) < 2e-4
+    shown_m = [m for m in np.arange(0.014, 0.044, 1e-4).tolist() if found.gripper.beyond_m(m) == 0.0]
+    assert abs(min(shown_m) - 0.024) < 3e-4 and abs(max(shown_m) - 0.034) < 3e-4
     apart = perturbation_between(POSE, found.cam_T_grip)
     assert np.abs(apart[:3]).max() < 4e-4 and np.abs(apart[3:]).max() < np.radians(0.3)
 

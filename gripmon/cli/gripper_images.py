@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, length, progress_bar
+from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, jaw_range, length, progress_bar
 
 _OPTIONS = f"""
 IMAGE...                image file, or folder with images
@@ -14,7 +14,9 @@ IMAGE...                image file, or folder with images
 | --finger-width M:SIGMA
                         width of a fingertip across the jaws, with its standard deviation (m)
 | --reference FILE.yaml
-                        hand/eye calibration, of gripmon calibrate plane or another one: its frame is kept
+                        hand/eye calibration: its frame is kept.  Of gripmon calibrate plane, or cam_T_grip with
+                        position_sigma_m and rotation_sigma_rad
+--jaw-range MIN:MAX     range of the jaw opening (m); otherwise as far again as the images show to either side
 --fingers {1,2}         how many fingers the images show; with 1, another one isn't expected (default: 2)
 --within LEFT,TOP,RIGHT,BOTTOM
                         where in the image the fingers are (px), if something else stays in it, too
@@ -32,7 +34,7 @@ _EXAMPLES = """\
   gripmon gripper from-images free/ --camera camera.yaml --distance 0.12:0.003 \\
       --out gripper.yaml --reference-out reference.yaml --picture gripper.png
   gripmon gripper from-images openings/ --camera camera.yaml --out gripper.yaml \\
-      --reference-out reference.yaml
+      --reference-out reference.yaml --jaw-range 0:0.085
 
 exit codes: 0 written; 2 wrong usage or files; 3 no gripper found in the images, with the reason:
 nothing is written then"""
@@ -50,15 +52,16 @@ def _box(text: str) -> tuple[int, int, int, int]:
 
 @Command(
     "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
-    finger_width=length, fingers={"type": int, "choices": (1, 2)}, within=_box, name={"default": "gripper"},
-    out=REQUIRED, response=RESPONSE,
+    finger_width=length, fingers={"type": int, "choices": (1, 2)}, within=_box, jaw_range=jaw_range,
+    name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def from_images(arguments: Arguments) -> None:
     """Measure a gripper's outline, inner edges and pose in five to a hundred images of the wrist camera: the
     robot moves, so that the background changes and the gripper stays.  This needs no dimensions, straight
-    edges or plate, but one length: the distance of the fingertips from the camera, or the width of a
-    finger.  Images at several jaw openings show how the fingers move; with the openings in metres in a
-    timestamps.csv beside them, as for gripmon replay, they also give the length.
+    edges or plate.  One length gives the size: the distance of the fingertips from the camera, or the
+    width of a finger.  Images at several jaw openings show how the fingers move; with the openings in
+    metres in a timestamps.csv beside them, as for gripmon replay, they also give the size, unless the
+    fingers turn.  Without any, lengths are in units of the distance, which is enough to watch a mount.
 
     Use at least five images of each opening, in focus, each before another background, lit as in use.  If
     the fingers' long edges meet in one point (their vanishing point), it gives the fingers' pose in space,
@@ -84,9 +87,9 @@ def from_images(arguments: Arguments) -> None:
     try:
         found = gripper_from_images(
             images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
-            finger_width_m=arguments.finger_width, reference=given.reference, fingers=arguments.fingers,
-            within=arguments.within, name=arguments.name, provenance=provenance, response=arguments.response,
-            progress=progress_bar,
+            finger_width_m=arguments.finger_width, reference=given.reference, jaw_range_m=arguments.jaw_range,
+            fingers=arguments.fingers, within=arguments.within, name=arguments.name, provenance=provenance,
+            response=arguments.response, progress=progress_bar,
         )  # fmt: skip
     except UnclearPartsError as unclear:
         arguments.save("picture", unclear.picture(image_in(images[0])))

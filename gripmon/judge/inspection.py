@@ -67,5 +67,6 @@ def _jaw(frame: Frame, gripper: Gripper) -> tuple[Refusal, str] | None:
     if opening_m is None or not gripper.has_jaw:
         return None
     if not gripper.jaw_min_m - 1e-3 <= opening_m <= gripper.jaw_max_m + 1e-3:
-        return Refusal.JAW_OPENING, f"jaw opening {opening_m:g} m; {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        range_m = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        return Refusal.JAW_OPENING, f"jaw opening {opening_m:g} m; {range_m}, as the gripper file says (jaw)"
     return None

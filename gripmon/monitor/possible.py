@@ -85,7 +85,7 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     possible = Possible(tracker, gripper, settings, measurement.prediction.cam_T_grip)
     hypotheses = possible.hypotheses(measurement.normal.edge)
     nothing = Known(cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
-    fits = Refits(measurement, hypotheses, tracker.floor, possible.model, nothing)
+    fits = Refits(measurement, hypotheses, tracker.floor_of(measurement), possible.model, nothing)
     cases = fits.cases(cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
     doubts = TwoDoubts(possible.model.absolute(cases, cam_T_grip), doubts_since(cases, None))
     return bounds_of(doubts, settings.policy.integrity_risk)

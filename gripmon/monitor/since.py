@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, invert, log_rotation, skew
+from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
     Absolute,
@@ -122,6 +123,10 @@ class CommonError(NamedTuple):
         (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
         """
         rows = np.vstack([self.taught, self.offset])
+        if self.scale_sigma >= SIZE_UNKNOWN:
+            # Along the line of sight it is the size, of which the motion is a part.
+            sight = at_T[:3, 3] / np.linalg.norm(at_T[:3, 3])
+            rows[:, :3] -= np.outer(rows[:, :3] @ sight, sight)
         share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
         moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
         return np.diag(share * np.repeat([moved, turned], 3))
@@ -210,7 +215,8 @@ class AtReference(NamedTuple):
         if common is not None:
             more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
             off = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
-            longer = common.scale_sigma * (lever @ off)[None]
+            # Of unknown size, lengths are in units of the distance, of which the motion is exact.
+            longer = (common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0) * (lever @ off)[None]
         unmoved = perturbation_between(motion @ reference_T, reference_T)
         return Differences(self.fits, lever, turn, more, longer, unmoved)
 

@@ -126,7 +126,7 @@ class Tracker:
         self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
         self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         self.floor: Array = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
-        """(6, 6) covariance of the systematic error that no averaging removes."""
+        """(6, 6) covariance of the systematic error that no averaging removes, but for :meth:`floor_of`."""
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
         """Standard deviation of each finger's length in the model, m; 0 with taught edges, which include it."""
         self.taught_error: Array = np.zeros((0, 6)) if taught is None else taught.reference_error
@@ -231,11 +231,18 @@ class Tracker:
             jaw_innovation=max(measurement.jaw_innovation, fused.innovation, key=abs),
         )
 
+    def floor_of(self, measurement: Measurement) -> Array:
+        """(6, 6) covariance of a measurement's systematic error: larger where the jaws are beyond the openings at which
+        their motion is known.
+        """
+        beyond_m = self._gripper.beyond_m(measurement.jaw_opening_m)
+        return self.floor + np.diag([beyond_m**2] * 3 + [0.0] * 3) if beyond_m else self.floor
+
     def update(self, measurement: Measurement) -> tuple[Array, Array]:
         """The corrected transform and its covariance: from all inlier edgels, or from the corners and equation (17)."""
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         if self._settings.measurement == "edges":
-            return cam_T_grip, covariance + self.floor
+            return cam_T_grip, covariance + self.floor_of(measurement)
         taken = self.taken(measurement)
         if np.count_nonzero(taken) >= 3:
             covariance_xy = measurement.corners.joint_covariance_xy(taken)
@@ -251,7 +258,7 @@ class Tracker:
                     covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
             except DegenerateGeometry:
                 pass  # The remaining corners lie on a line: the edges still determine the motion.
-        return cam_T_grip, covariance + self.floor
+        return cam_T_grip, covariance + self.floor_of(measurement)
 
     @staticmethod
     def _corner_update(

@@ -315,7 +315,8 @@ class Weigher:
         if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
             return None
         hypotheses = self._possible.about(fits.edges).without_ends
-        return Refits(measurement, hypotheses, self._tracker.floor, fits.model, fits.known, together=False)
+        floor = self._tracker.floor_of(measurement)
+        return Refits(measurement, hypotheses, floor, fits.model, fits.known, together=False)
 
     def _knocked_cases(
         self,
@@ -386,7 +387,7 @@ class Weigher:
         reference.
         """
         if self._slid is None:
-            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor
+            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor_of(measurement)
             way = perturbation_between(self._reference_T, cam_T_grip)
             displaced = _contradicts(way, covariance)
         else:
@@ -456,7 +457,8 @@ class Weigher:
             known = Known(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
             model = self._possible.model._replace(first=self._since.published_by)
             hypotheses = self._possible.about(measurement.normal.edge).hypotheses
-            self._newest = measurement, now_s, Refits(measurement, hypotheses, self._tracker.floor, model, known)
+            floor = self._tracker.floor_of(measurement)
+            self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]
 
 

@@ -61,7 +61,8 @@ class PlacedOutlines:
     """Outlines in space, the TCP at unit depth.  ``points`` of each finger (v, 3) in the camera frame, NaN where
     unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
-    to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws.
+    to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws;
+    ``tcp_covariance`` (3, 3) then.
     """
 
     points: tuple[Array, ...]
@@ -72,6 +73,7 @@ class PlacedOutlines:
     sigma_rad: Array
     round_tips: bool = False
     by_motion: bool = False
+    tcp_covariance: Array | None = None
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> PlacedOutlines:

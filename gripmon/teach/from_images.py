@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
-from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.gripper import Gripper, GripperError
@@ -27,19 +27,19 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
 from gripmon.model.response import in_light, response_of
 from gripmon.teach.finger_depth import PlacedOutlines, place
+from gripmon.teach.fingers import UnclearPartsError
 from gripmon.teach.image_drawing import draw_outlines
-from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines, tip_width
-from gripmon.teach.image_motion import SAME_OPENING_M, FingerMoved, check_opened, motion_of
+from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines
+from gripmon.teach.image_motion import SAME_OPENING_M
 from gripmon.teach.image_outline import OpeningSeen, see_opening
+from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
 from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
-from gripmon.teach.motion_depth import place_by_motion
+from gripmon.teach.motion_depth import move
 from gripmon.track.edges.taught import gripper_digest
 
 MOST_IMAGES = 200
-Length = tuple[float, float]
-"""A length and its standard deviation, m."""
-Pose = tuple[Array, Array]
-"""``cam_T_grip`` (4, 4) and the covariance (6, 6) of its error."""
+WORST_OUTLINE_PX = 1.0
+"""Standard deviation of an outline from which it is refused: search lines at work reach 3 px to either side."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,7 @@ def gripper_from_images(
     distance_m: Length | None = None,
     finger_width_m: Length | None = None,
     reference: Pose | None = None,
+    jaw_range_m: tuple[float, float] | None = None,
     fingers: int | None = None,
     within: tuple[int, int, int, int] | None = None,
     name: str = "gripper",
@@ -150,6 +151,7 @@ def gripper_from_images(
     :class:`~gripmon.model.errors.NoResultError` where the images show no gripper.
     """
     _check(distance_m, finger_width_m, reference, openings_m, len(images))
+    _check_range(jaw_range_m, openings_m)
     made = make_camera(camera)
     taken = list(images_of_one_camera(images))
     for file, image in taken:
@@ -166,23 +168,25 @@ def gripper_from_images(
         outlines = finger_outlines(made, seen)
         pose = None if reference is None else reference[0]
         at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
+        travel = None if reference is None or openings_m is None else travel_of(reference, groups)
         placed = place(outlines, *(at or (None, None)))
-        if placed.flat:
-            placed = place_by_motion(made, outlines, seen, list(around.values()), at) or placed
-        moved = _motions(made, seen, placed, around, notes)
+        placed, motion = move(made, outlines, seen, around, placed, pose=at, travel=travel, notes=notes)
         step()
     if openings_m is None and around:
-        check_opened(moved, [len(own) for own in groups.values()])
+        motion.check_opened([len(own) for own in groups.values()])
     first = next(iter(groups))
     opening_m = first if openings_m is not None else None
-    scale = _scale(placed, distance_m, finger_width_m, reference, moved, opening_m)
+    by_openings, why = depth_by_openings(motion, opening_m)
+    size = size_of(placed, made.fx_px, distance_m, finger_width_m, reference, by_openings, notes)
+    scale, moved = (size.depth_m, size.sigma_m), motion.by_opening
     if openings_m is None and moved:
-        opening_m, moved = as_gaps(placed, moved, scale[0])
+        opening_m, moved = as_gaps(placed, moved, size.depth_m)
         notes.append(
             f"openings: the gap between the fingertips, as the images show it, {1e3 * min(opening_m, *moved):.2f} to "
             f"{1e3 * max(opening_m, *moved):.2f} mm; the jaws may report another number"
         )
-    described = MeasuredGripper(made, seen, outlines, placed, moved, *scale, opening_m)
+    parts = made, seen, outlines, placed, moved, size.depth_m, size.scale_sigma, opening_m, jaw_range_m
+    described = MeasuredGripper(*parts)
     try:
         gripper = Gripper(build_model(described, name, provenance, notes))
     except GripperError as error:
@@ -193,14 +197,23 @@ def gripper_from_images(
     else:
         assert reference is not None
         cam_T_grip, covariance = reference
-    notes += _assumptions(placed, scale, reference, left_out, len(taken))
+    notes += unit_notes(size, why) if reference is None else []
+    notes += _assumptions(placed, reference is not None, left_out, len(taken))
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
+    outline_px = float(np.hypot(np.median(sigmas), light.sigma_px))
+    if outline_px >= WORST_OUTLINE_PX:
+        raise UnclearPartsError(
+            f"the outline is known to {outline_px:.1f} px, less than {WORST_OUTLINE_PX:g} px is needed: more images, each "
+            "before another background that is brighter or darker than the fingers",
+            [finger.mask for finger in seen.fingers],
+            seen.matte.still,
+        )
     rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
     used = len(seen.matte.kept)
     shown = taken[groups[first][seen.matte.kept[0]]][1]
     names = tuple(outline.name for outline in outlines)
     return GripperFromImages(
-        gripper, cam_T_grip, covariance, opening_m, float(np.hypot(np.median(sigmas), light.sigma_px)), used, left_out,
+        gripper, cam_T_grip, covariance, opening_m, outline_px, used, left_out,
         tuple(notes), camera,
         seen,
         shown, names, float(np.sqrt(np.square(rms).mean())),
@@ -257,16 +270,16 @@ def _check(
             raise InputError(f"{len(openings_m)} for {count} images; one for each", "openings_m")
         if any(opening is None for opening in openings_m):
             raise InputError("some images have one and others don't; of all images or of none", "openings_m")
-    if not given and (openings_m is None or _spread(openings_m) <= SAME_OPENING_M):
+
+
+def _check_range(jaw_range_m: tuple[float, float] | None, openings_m: Sequence[float | None] | None) -> None:
+    shown = [opening for opening in openings_m or () if opening is not None]
+    if jaw_range_m is not None and shown and not (jaw_range_m[0] <= min(shown) and max(shown) <= jaw_range_m[1]):
         raise InputError(
-            "the scale is unknown: --distance M (fingertips from the camera), --finger-width M, --reference FILE, or "
-            "images at several jaw openings, in metres in their timestamps.csv"
+            f"is {jaw_range_m[0]:g} to {jaw_range_m[1]:g} m, but the images show openings of {min(shown):g} to "
+            f"{max(shown):g} m; a range that holds them",
+            "jaw_range",
         )
-
-
-def _spread(openings_m: Sequence[float | None]) -> float:
-    values = [opening for opening in openings_m if opening is not None]
-    return max(values) - min(values) if values else 0.0
 
 
 def _groups(
@@ -293,58 +306,6 @@ def _groups(
     return {round(float(np.mean([openings_m[k] or 0.0 for k in run])), 6): sorted(run) for run in runs}
 
 
-def _motions(
-    camera: Camera, seen: OpeningSeen, placed: PlacedOutlines, around: Mapping[float, OpeningSeen], notes: list[str]
-) -> dict[float, Sequence[FingerMoved]]:
-    """How each finger moved to each other opening; openings where a finger isn't found are left out, with a note."""
-    out: dict[float, Sequence[FingerMoved]] = {}
-    for opening, other in around.items():
-        moved = [
-            motion_of(camera, finger.mask, finger.outwards, points, kept, seen, other)
-            for finger, points, kept in zip(seen.fingers, placed.points, placed.kept, strict=True)
-        ]
-        found = [m for m in moved if m is not None]
-        if len(found) < len(moved):
-            notes.append(f"opening {opening:g} m isn't used: a finger of the first opening isn't found there")
-        else:
-            out[opening] = found
-    return out
-
-
-def _scale(
-    placed: PlacedOutlines,
-    distance_m: Length | None,
-    finger_width_m: Length | None,
-    reference: Pose | None,
-    moved: Mapping[float, Sequence[FingerMoved]],
-    opening_m: float | None,
-) -> Length:
-    """Depth of the TCP and its standard deviation, m."""
-    if distance_m is not None:
-        return distance_m
-    if finger_width_m is not None:
-        width = tip_width(placed)
-        return finger_width_m[0] / width, finger_width_m[1] / width
-    if reference is not None:
-        return float(reference[0][2, 3]), float(np.sqrt(reference[1][2, 2]))
-    if opening_m is None or not moved or len(placed.points) < 2:
-        raise NoResultError(
-            "the openings don't give the scale: two fingers that move with the jaws, at two openings at least; or "
-            "--distance M, --finger-width M"
-        )
-    values, weights = [], []
-    for opening, fingers in moved.items():
-        apart = fingers[-1].shift - fingers[0].shift
-        folds = np.linalg.norm(fingers[-1].folds - fingers[0].folds, axis=1)
-        length = float(np.linalg.norm(apart))
-        sigma = float(np.sqrt((len(folds) - 1) / len(folds) * np.square(folds - folds.mean()).sum())) / length
-        values.append(abs(opening - opening_m) / length)
-        weights.append(1.0 / max(sigma, 1e-4) ** 2)
-    depth = float(np.average(values, weights=weights))
-    scatter = float(np.ptp(values)) / depth if len(values) > 1 else 0.0
-    return depth, depth * max(float(np.sum(weights)) ** -0.5, 0.5 * scatter)
-
-
 def _covariance(fx_px: float, placed: PlacedOutlines, scale: Length, seen: OpeningSeen) -> Array:
     """Covariance (6, 6): from the distance along the line of sight, the outline's scatter across it, and the axes'
     directions.
@@ -355,29 +316,24 @@ def _covariance(fx_px: float, placed: PlacedOutlines, scale: Length, seen: Openi
     ray = placed.tcp / placed.tcp[2]
     out = np.zeros((6, 6))
     out[:3, :3] = sigma**2 * np.outer(ray, ray) + across**2 * np.eye(3)
+    if placed.tcp_covariance is not None:
+        # Of the depth itself the size has it already.
+        beside = np.eye(3) - np.outer(ray, [0.0, 0.0, 1.0])
+        out[:3, :3] += depth**2 * beside @ placed.tcp_covariance @ beside.T
     out[3:, 3:] = np.diag(placed.sigma_rad**2) + (across / depth) ** 2 * np.eye(3)
     return out
 
 
-def _assumptions(
-    placed: PlacedOutlines, scale: Length, reference: Pose | None, left_out: Mapping[str, str], count: int
-) -> list[str]:
+def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str, str], count: int) -> list[str]:
     """What is unknown or was assumed, as texts."""
     notes = []
-    if reference is None:
-        depth, sigma = scale
-        notes.append(
-            f"lengths are known to {100.0 * sigma / depth:.1f} %: the fingertips are {1e3 * depth:.1f} +- "
-            f"{1e3 * sigma:.2g} mm from the camera, which is in the reference's covariance and in every protection "
-            "level (scale_sigma)"
-        )
     if placed.flat:
         notes.append(
             "the outline is assumed flat, facing the camera: no three long edges of the fingers meet in one point. "
             "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
             "large by what the fingers stand out of that plane"
         )
-    elif reference is None and len(placed.points) == 1:
+    elif not calibrated and len(placed.points) == 1:
         notes.append("the finger's long edges are assumed parallel: a taper would look like another direction of it")
     if placed.by_motion:
         notes.append(

@@ -36,8 +36,8 @@ LONGEST_SHARE = 0.25
 
 @dataclass(frozen=True)
 class MeasuredGripper:
-    """What images show of a gripper.  ``depth_m`` of the TCP, with the standard deviation ``depth_sigma_m``; ``moved``:
-    by opening, each finger's motion.
+    """What images show of a gripper.  ``depth_m`` of the TCP and ``scale_sigma``, of the gripper file; ``moved``: by
+    opening, each finger's motion; ``jaw_range_m``: that of the jaws, if it is known.
     """
 
     camera: Camera
@@ -46,8 +46,9 @@ class MeasuredGripper:
     placed: PlacedOutlines
     moved: Mapping[float, Sequence[FingerMoved]]
     depth_m: float
-    depth_sigma_m: float
+    scale_sigma: float
     opening_m: float | None
+    jaw_range_m: tuple[float, float] | None = None
 
 
 def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
@@ -147,10 +148,10 @@ def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None,
             f"{inner_dropped} inner edges aren't used: they don't start from a corner, so their depth isn't known"
         )
     fingers, jaw = _jaw(seen)
-    scale_sigma = float(f"{seen.depth_sigma_m / seen.depth_m:.2g}")
     return GripperModel(
-        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=scale_sigma, provenance=provenance
-    )
+        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=seen.scale_sigma,
+        provenance=provenance,
+    )  # fmt: skip
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:
@@ -275,12 +276,15 @@ def _add_inner(
 
 
 def _jaw(seen: MeasuredGripper) -> tuple[dict[str, FingerModel], JawModel | None]:
-    """Motion of the fingers as a table over the openings."""
+    """Motion of the fingers as a table over the openings seen, and the range of the jaws."""
     names = [outline.name for outline in seen.outlines]
     if seen.opening_m is None or not seen.moved:
         return {name: FingerModel() for name in names}, None
     openings = sorted([seen.opening_m, *seen.moved])
-    jaw = JawModel(nominal_m=seen.opening_m, min_m=openings[0], max_m=openings[-1])
+    low, high = openings[0], openings[-1]
+    # Beyond what the images show the motion is less certain, but possible: as far again, unless the range is known.
+    least, most = seen.jaw_range_m or (max(2.0 * low - high, 0.0), 2.0 * high - low)
+    jaw = JawModel(nominal_m=seen.opening_m, min_m=min(least, low), max_m=max(most, high))
     fingers = {}
     for number, name in enumerate(names):
         rows = []

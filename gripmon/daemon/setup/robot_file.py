@@ -35,6 +35,19 @@ def reference_text(path: Path) -> tuple[bytes, str]:
     if "schema" in values:
         read_document(path, HandEyeCalibration)
         return path.read_bytes(), "a file of gripmon calibrate plane"
+    settings = robot_reference(path, values)
+    x, y, z = (1e3 * v for v in settings.cam_T_grip.translation_m)
+    text = f"# {path.name}, by gripmon setup (gripmon {__version__})\n{as_yaml(msgspec.to_builtins(settings))}"
+    return text.encode(), f"TCP at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"
+
+
+def is_robot_reference(values: dict[str, object]) -> bool:
+    """Whether a document is one for :func:`robot_reference`."""
+    return "schema" not in values and ("cam_T_grip" in values or all(name in values for name in _FLANGE))
+
+
+def robot_reference(path: Path, values: dict[str, object]) -> ReferenceSettings:
+    """The reference that a robot's file says, given what was read of it.  :class:`~gripmon.model.errors.InputError`."""
     if all(name in values for name in _FLANGE):
         flange_T_cam, flange_T_tcp = (_transform(path, values.pop(name), name) for name in _FLANGE)
         made = to_record(invert(flange_T_cam) @ flange_T_tcp)
@@ -46,9 +59,7 @@ def reference_text(path: Path) -> tuple[bytes, str]:
         reference_transform(settings)
     except SettingsError as error:
         raise InputError(f"{path}: {error.fault.key}: {error.fault.wrong}; {error.fault.right}") from None
-    x, y, z = (1e3 * v for v in settings.cam_T_grip.translation_m)
-    text = f"# {path.name}, by gripmon setup (gripmon {__version__})\n{as_yaml(msgspec.to_builtins(settings))}"
-    return text.encode(), f"TCP at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"
+    return settings
 
 
 def _transform(path: Path, value: object, key: str) -> Array:

@@ -20,7 +20,8 @@ from gripmon.io.sources import FolderSettings, SourceError
 from gripmon.io.sources.files import opening_beside
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
-from gripmon.model.records import ReferenceRecord
+from gripmon.model.gripper import SIZE_UNKNOWN
+from gripmon.model.records import ReferenceRecord, ValidBy
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.corner_pose import CornerPose
 from gripmon.teach.messages import SaveOrder
@@ -63,7 +64,7 @@ def config_text(
         parts.append(lines_of(source, 2))
     if inputs.setup.gripper.has_jaw:
         parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
-    parts += ["", _defaults(inputs.setup.settings)]
+    parts += ["", _defaults(inputs.setup.settings, inputs.setup.gripper.model.scale_sigma < SIZE_UNKNOWN)]
     return "\n".join(parts) + "\n"
 
 
@@ -146,8 +147,13 @@ def _in_table(inputs: Inputs) -> bool:
         return False
 
 
-def _defaults(monitor: MonitorSettings) -> str:
-    """The defaults, commented out but for the response of the camera as it was found."""
+def _defaults(monitor: MonitorSettings, size_known: bool) -> str:
+    """The defaults, commented out but for the response of the camera as it was found, and for what a transform of a
+    gripper of unknown size is valid by: its motion since the reference, in units of its distance.
+    """
+    if not size_known:
+        policy = msgspec.structs.replace(monitor.policy, valid_by=ValidBy.REFERENCE)
+        monitor = msgspec.structs.replace(monitor, policy=policy)
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
     ]
@@ -155,7 +161,10 @@ def _defaults(monitor: MonitorSettings) -> str:
         if field.name in _DEFAULT_SECTIONS:
             value = monitor if field.name == "monitor" else field.default
             section = [f"# {field.name}:", *lines_of(value, 2, off=True).splitlines()]
-            lines += _on(section, "corners", "edges", "response") if value is monitor else section
+            if value is monitor:
+                section = _on(section, "corners", "edges", "response")
+                section = section if size_known else _on(section, "policy", "valid_by")
+            lines += section
     return "\n".join(lines)
 
 
@@ -163,7 +172,7 @@ def _on(section: Sequence[str], *keys: str) -> list[str]:
     """A section that is commented out with the key at this path taken back in."""
     out, level = list(section), 0
     for number, line in enumerate(section):
-        if line.startswith(f"# {'  ' * level}{('monitor', *keys)[level]}:"):
+        if line.removeprefix("# ").startswith(f"{'  ' * level}{('monitor', *keys)[level]}:"):
             out[number], level = line.removeprefix("# "), level + 1
             if level > len(keys):
                 break

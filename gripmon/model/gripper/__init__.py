@@ -10,6 +10,7 @@ from __future__ import annotations
 from gripmon.model.gripper.core import LARGEST_EXTENT_M, EdgeView, Gripper, on_a_line
 from gripmon.model.gripper.faces import FaceLoop
 from gripmon.model.gripper.model import (
+    SIZE_UNKNOWN,
     UNTOLD_BEVEL_M,
     WIDEST_BEVEL_M,
     AxisMotion,
@@ -27,6 +28,7 @@ from gripmon.model.gripper.model import (
 
 __all__ = [
     "LARGEST_EXTENT_M",
+    "SIZE_UNKNOWN",
     "UNTOLD_BEVEL_M",
     "WIDEST_BEVEL_M",
     "AxisMotion",

@@ -20,7 +20,7 @@ from gripmon.model.gripper.faces import (
     triangles,
 )
 from gripmon.model.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
-from gripmon.model.gripper.motion import motion_table, offset_m
+from gripmon.model.gripper.motion import beyond_table_m, motion_table, offset_m
 from gripmon.model.gripper.rounds import Rounds
 from gripmon.model.records import Array
 
@@ -107,6 +107,12 @@ class Gripper:
             raise ValueError(f"jaw opening {jaw_opening_m:.4f} m is outside {self.jaw_min_m} to {self.jaw_max_m} m")
         offsets_m = self._finger_offsets_m(jaw_opening_m)[self.point_finger]
         return self._rounds.seen_from(eye_grip_m, self._nominal_points_m + offsets_m, offsets_m)
+
+    def beyond_m(self, jaw_opening_m: float) -> float:
+        """Standard deviation of the fingers' places at an opening beyond those that the file's motions are known for;
+        0 within them (see :func:`~gripmon.model.gripper.motion.beyond_table_m`).
+        """
+        return max(beyond_table_m(table, jaw_opening_m) for table in self._motion) if self.has_jaw else 0.0
 
     def point_motion(self, jaw_opening_m: float) -> Array:
         """Derivative (p, 3) of all points by the jaw opening, m/m; central difference over 0.1 mm, as motion is

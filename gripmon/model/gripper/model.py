@@ -11,6 +11,8 @@ from gripmon.model.errors import InputError
 from gripmon.model.provenance import Provenance
 
 Vector = tuple[float, float, float]
+SIZE_UNKNOWN = 1.0
+"""``scale_sigma`` of a gripper whose size isn't known: its lengths are in units of its distance from the camera."""
 Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]
 
 
@@ -19,6 +21,8 @@ class GripperError(InputError):
 
 
 class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``nominal_m``: where the file's coordinates hold; openings beyond ``min_m`` to ``max_m`` are impossible."""
+
     nominal_m: Opening
     min_m: Opening
     max_m: Opening
@@ -31,7 +35,9 @@ class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Rows ``opening_m, dx_m, dy_m, dz_m`` with ascending openings; linear between rows."""
+    """Rows ``opening_m, dx_m, dy_m, dz_m`` with ascending openings; linear between rows, and beyond them, where what
+    an arc would deviate is in every bound.
+    """
 
     table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
 
@@ -99,7 +105,8 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         Meta(
             ge=0.0,
             le=1.0,
-            description="standard deviation of a factor on all lengths, for the protection level; 0: the unit is exact",
+            description="standard deviation of a factor on all lengths, for the protection level; 0: the unit is "
+            "exact; 1: the size is unknown, and lengths are in units of the distance from the camera",
         ),
     ] = 0.0
     provenance: Provenance | None = None
