@@ -271,9 +271,12 @@ def test_images_that_contradict_are_left_out_and_named(box: tuple) -> None:
     spoilt[9] = cv2.GaussianBlur(images[9], (0, 0), 2.5)
     spoilt[17] = np.roll(images[17], 40, axis=0)
     again = gripper_from_images(spoilt, PAPER_LENS, distance_m=DISTANCE)
-    assert set(again.left_out) == {"image 5", "image 10", "image 18"}
-    assert "moved" in again.left_out["image 5"]
+    assert set(again.left_out) == {"image 10", "image 18"}
+    assert "moved" in again.left_out["image 18"]
     assert "blurred" in again.left_out["image 10"]
+    # A mount has play: an image that shows the gripper displaced by 3 px is moved back.
+    matte = again.seen.matte
+    assert abs(float(matte.moved_px[matte.kept.index(4), 0]) - 3.0) < 0.1 and np.abs(matte.moved_px).max() < 3.1
     assert rotation_angle(again.cam_T_grip[:3, :3] @ found.cam_T_grip[:3, :3].T) < np.radians(0.5)
 
 
@@ -289,8 +292,8 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
     for wrong, word in (
         (noise, "stays the same"),
         (blurred, "blurred"),
-        (moved, "gripper"),
-        (images[:12] + other, "gripper"),
+        (moved, "gripper|contradict|finger"),
+        (images[:12] + other, "gripper|finger"),
     ):
         with pytest.raises(NoResultError, match=word) as caught:
             gripper_from_images(wrong, PAPER_LENS, distance_m=DISTANCE)
@@ -302,7 +305,7 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
 def test_wrong_input_says_what_would_be_right(box: tuple) -> None:
     images, _ = box
     for wrong, values, word in (
-        (images[:5], {"distance_m": DISTANCE}, "at least 10"),
+        (images[:4], {"distance_m": DISTANCE}, "at least 5"),
         (images, {"openings_m": [0.03] * 30, "jaw_range_m": (0.0, 0.02)}, "jaw_range: is 0 to 0.02 m, but"),
         (images, {"distance_m": DISTANCE, "finger_width_m": (0.01, 1e-4)}, "one of"),
         ([*images[:12], images[3]], {"distance_m": DISTANCE}, "same image"),

@@ -19,6 +19,7 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.teach.fingers import UnclearPartsError
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
 from gripmon.teach.matte import grey_levels, image_sets
 
@@ -127,7 +128,9 @@ def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:
 
     pictures = MeshCamera(CAMERA, tapered()[:1], 5)
     images = [pictures.picture(POSE) for _ in range(20)]
-    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    with pytest.raises(UnclearPartsError, match="--fingers 1"):
+        gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE, fingers=1)
     assert found.gripper.finger_ids == ("finger",) and not found.gripper.has_jaw
     away = beside_truth_px(chains_of(found), pictures.coverage(POSE))
     assert len(away) > 150 and np.quantile(away, 0.95) <= 0.2
@@ -152,13 +155,13 @@ def housed() -> Gripper:
     return gripper_from_dict(model)
 
 
-def test_fingers_that_hang_together_in_the_image_are_told_apart_by_motion() -> None:
+def test_fingers_that_hang_together_in_the_image_are_told_apart() -> None:
     gripper = housed()
     images: list[Image] = []
     for seed, opening_m, count in ((501, 0.034, 14), (502, 0.024, 10)):
         images += images_of(moving_robot(seed, "printed", gripper=gripper, opening_m=opening_m), count)
     alone = gripper_from_images(images[:14], PAPER_LENS, distance_m=DISTANCE)
-    assert alone.gripper.finger_ids == ("finger",)
+    assert alone.gripper.finger_ids == ("left", "right")
     found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     assert found.gripper.finger_ids == ("left", "right")
     assert any("join the fingers" in note for note in found.notes)

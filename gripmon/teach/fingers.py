@@ -24,6 +24,9 @@ LEAST_VALLEY = 0.25
 """Least depth of the space between two fingers of one part, over the distance of their tips."""
 ALIKE_OUTLINES = 0.3
 """Least outline of a second finger over the first one's; what is shorter is taken for something else."""
+ALIKE_SHARES = 0.8
+"""Least mean share of the images that show an edge along a part's outline, over the largest of all parts: before the
+same backgrounds two fingers' outlines are seen about equally often, those of chance less."""
 _BOTTOM = 0.9
 _BORDER_PX = 2
 
@@ -75,7 +78,9 @@ def find_fingers(
         inner = still
     found = [own for part in _connected(inner) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
     strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
-    found = [own for own in found if _mean_along(own[0], still, strength) > edges.limit]
+    shares = [_mean_along(own[0], still, strength) for own in found]
+    least = max(edges.limit, ALIKE_SHARES * max(shares, default=0.0))
+    found = [own for own, share in zip(found, shares, strict=True) if share > least]
     if any(enters for *_, enters in found):  # what floats in the view is a mark on the lens, a stamp, a reflection
         found = [own for own in found if own[3]]
     found.sort(key=lambda own: -own[2])
@@ -130,10 +135,10 @@ def _divided(part: Bits) -> list[_Part]:
             body = cv2.dilate((part & ~ahead).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             roots = [np.argwhere(prong & body)[:, ::-1] for prong in prongs]
             return [
-                (prong, _outwards_from(prong, root.mean(axis=0) if len(root) else _root(prong)), outline, True)
+                (prong, outwards_from(prong, root.mean(axis=0) if len(root) else _root(prong)), outline, True)
                 for prong, root, outline in zip(prongs, roots, outlines, strict=True)
             ]
-    outwards, outline = _outwards_from(part, _root(part)), _outline_px(part, part)
+    outwards, outline = outwards_from(part, _root(part)), _outline_px(part, part)
     border = part & _at_border(part.shape)
     if not border.any():
         return [(part, outwards, outline, False)]
@@ -223,7 +228,7 @@ def _root(mask: Bits) -> Array:
     return centre
 
 
-def _outwards_from(mask: Bits, root: Array) -> Array:
+def outwards_from(mask: Bits, root: Array) -> Array:
     """Direction (2,) in the image from a part's root (2,) to its farthest points."""
     points = np.argwhere(mask)[:, ::-1].astype(float)
     # The farthest hundredth of the pixels: a single pixel is not a tip.

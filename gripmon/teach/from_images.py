@@ -203,8 +203,8 @@ def gripper_from_images(
     outline_px = float(np.hypot(np.median(sigmas), light.sigma_px))
     if outline_px >= WORST_OUTLINE_PX:
         raise UnclearPartsError(
-            f"the outline is known to {outline_px:.1f} px, less than {WORST_OUTLINE_PX:g} px is needed: more images, each "
-            "before another background that is brighter or darker than the fingers",
+            f"the outline is known to {outline_px:.1f} px, less than {WORST_OUTLINE_PX:g} px is needed: more images, "
+            "each before another background that is brighter or darker than the fingers",
             [finger.mask for finger in seen.fingers],
             seen.matte.still,
         )

@@ -46,9 +46,9 @@ CHANGING_PART = 0.3
 most half of what the tenth of the cells has that changes most: a background of few edges."""
 LEAST_CHANGING = 0.02
 """Least part of these cells where edges come and go; noise alone makes a thousandth."""
-CHANGE_WORTH = 0.5
+CHANGE_WORTH = 0.3
 """What a boundary between a cell where everything changes and one where nothing does counts over an edge that stays in
-all images: by itself, as where a wall begins, not enough."""
+all images: by itself, as where a wall begins, less than :data:`STAYING_PART` asks for."""
 CELL_PX = 14
 """Side of a cell: its boundary is twice the shortest edge of 8 px that is measured, so that one edge divides it."""
 SHORT_PENALTY = 0.3

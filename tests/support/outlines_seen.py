@@ -10,8 +10,11 @@ from scipy.spatial import ConvexHull
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.image_outline import BORDER_PX, FingerSeen, OpeningSeen, outwards_from
+from gripmon.teach.fingers import outwards_from
+from gripmon.teach.image_outline import FingerSeen, OpeningSeen
 from gripmon.teach.matte import Matte
+from gripmon.teach.silhouette import FROM_BORDER_PX
+from gripmon.teach.staying import Edges
 from gripmon.teach.straight_pieces import Chain
 
 
@@ -40,8 +43,9 @@ def seen_opening(
     shape = camera.height_px, camera.width_px
     found = tuple(_finger(camera, shape, f @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3], noise_px, rng) for f in fingers)
     nothing = np.zeros(shape, np.float32)
-    matte = Matte(nothing, nothing, nothing > 0, 1.0, nothing[None], (0,), {})
-    return OpeningSeen(matte, found, {}, 1.0)
+    edges = Edges(nothing, nothing, nothing > 0, nothing > 0, 0.1)
+    matte = Matte(nothing, nothing > 0, edges, 1.0, nothing[None], np.zeros((1, 2)), (0,), {})
+    return OpeningSeen(matte, found, {}, 1.0, nothing > 0)
 
 
 def _finger(
@@ -57,7 +61,7 @@ def _finger(
         normal = np.array([-way[1], way[0]])
         lines.append((a + normal * rng.normal(0.0, noise_px), b + normal * rng.normal(0.0, noise_px)))
     noisy = np.array([_meet(lines[k - 1], lines[k]) for k in range(len(lines))])
-    inside = np.array([BORDER_PX, BORDER_PX]), np.array([shape[1], shape[0]]) - 1.0 - BORDER_PX
+    inside = np.array([FROM_BORDER_PX, FROM_BORDER_PX]), np.array([shape[1], shape[0]]) - 1.0 - FROM_BORDER_PX
     pieces = [_clipped(a, b, *inside) for a, b in zip(noisy, np.roll(noisy, -1, axis=0), strict=True)]
     kept = [k for k, piece in enumerate(pieces) if piece is not None]
     # Begin after the stretch that the border hides.
