@@ -18,8 +18,9 @@ IMAGE...                image file, or folder with images
                         position_sigma_m and rotation_sigma_rad
 --jaw-range MIN:MAX     range of the jaw opening (m); otherwise as far again as the images show to either side
 --fingers {1,2}         how many fingers the images show; with 1, another one isn't expected (default: 2)
---within LEFT,TOP,RIGHT,BOTTOM
-                        where in the image the fingers are (px), if something else stays in it, too
+--within LEFT,TOP,RIGHT,BOTTOM...
+                        where in the image the fingers are (px), if something else stays in it, too; given twice, one
+                        finger in each
 {RESPONSE_OPTION.strip()}
 --name NAME             the gripper's name (default: gripper)
 --out FILE.yaml         gripper file to write
@@ -88,7 +89,7 @@ def from_images(arguments: Arguments) -> None:
         found = gripper_from_images(
             images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
             finger_width_m=arguments.finger_width, reference=given.reference, jaw_range_m=arguments.jaw_range,
-            fingers=arguments.fingers, within=arguments.within, name=arguments.name, provenance=provenance,
+            fingers=arguments.fingers, within=arguments.within or (), name=arguments.name, provenance=provenance,
             response=arguments.response, progress=progress_bar,
         )  # fmt: skip
     except UnclearPartsError as unclear:

@@ -5,6 +5,7 @@ in view.  A palm's border between two fingers is seen, and they are cut off alon
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,8 +26,8 @@ LEAST_VALLEY = 0.25
 ALIKE_OUTLINES = 0.3
 """Least outline of a second finger over the first one's; what is shorter is taken for something else."""
 ALIKE_SHARES = 0.8
-"""Least mean share of the images that show an edge along a part's outline, over the largest of all parts: before the
-same backgrounds two fingers' outlines are seen about equally often, those of chance less."""
+"""Least mean share of the images that show an edge along a part's outline, over that of the part with the longest one:
+before the same backgrounds two fingers' outlines are seen about equally often, those of chance less."""
 _BOTTOM = 0.9
 _BORDER_PX = 2
 
@@ -64,30 +65,45 @@ class UnclearPartsError(NoResultError):
         return out
 
 
-def find_fingers(
-    still: Bits, edges: Edges, count: int | None = None, within: tuple[int, int, int, int] | None = None
-) -> Parts:
+_Part = tuple[Bits, Array, float, bool]
+"""A part's mask, the direction to its tip, the length of its outline in view (px), and whether it enters the view."""
+Box = tuple[int, int, int, int]
+"""A part of an image, px: left, top, right, bottom."""
+
+
+def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Sequence[Box] = ()) -> Parts:
     """The fingers among what stays (h, w), from left to right (or from top to bottom): ``count`` of them if given,
-    else two; only ``within`` (left, top, right, bottom), px, if given.  Raises :class:`UnclearPartsError`.
+    else two.  ``within``: only there; with several boxes one finger in each.  Raises :class:`UnclearPartsError`.
     """
-    if within is not None:
-        left, top, right, bottom = within
-        inner = np.zeros_like(still)
-        inner[top : bottom + 1, left : right + 1] = still[top : bottom + 1, left : right + 1]
-    else:
-        inner = still
-    found = [own for part in _connected(inner) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
     strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
+    if len(within) > 1:
+        each = [_candidates(_inside_box(still, box), strength, edges.limit)[:1] for box in within]
+        return _chosen([own for found in each for own in found], still, len(within), len(within))
+    found = _candidates(_inside_box(still, within[0]) if within else still, strength, edges.limit)
+    return _chosen([own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]], still, count or 2, count)
+
+
+def _inside_box(still: Bits, box: Box) -> Bits:
+    left, top, right, bottom = box
+    out = np.zeros_like(still)
+    out[top : bottom + 1, left : right + 1] = still[top : bottom + 1, left : right + 1]
+    return out
+
+
+def _candidates(still: Bits, strength: Plane, limit: float) -> list[_Part]:
+    """Parts that may be fingers, those with the longest outline first."""
+    found = [own for part in _connected(still) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
     shares = [_mean_along(own[0], still, strength) for own in found]
-    least = max(edges.limit, ALIKE_SHARES * max(shares, default=0.0))
+    longest = int(np.argmax([own[2] * share for own, share in zip(found, shares, strict=True)])) if found else 0
+    least = max(limit, ALIKE_SHARES * shares[longest]) if found else limit
     found = [own for own, share in zip(found, shares, strict=True) if share > least]
     if any(enters for *_, enters in found):  # what floats in the view is a mark on the lens, a stamp, a reflection
         found = [own for own in found if own[3]]
-    found.sort(key=lambda own: -own[2])
-    if found:
-        found = [own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]]
+    return sorted(found, key=lambda own: -own[2])
+
+
+def _chosen(found: list[_Part], still: Bits, wanted: int, count: int | None) -> Parts:
     parts = [own[0] for own in found]
-    wanted = count or 2
     if not parts:
         raise UnclearPartsError(
             "what stays in the images has no finger's shape: it should enter from the image's border or from a palm "
@@ -100,7 +116,7 @@ def find_fingers(
     if len(parts) > wanted and count is None:
         raise UnclearPartsError(
             f"{len(parts)} parts that stay may be fingers (see --picture); --within LEFT,TOP,RIGHT,BOTTOM around the "
-            "two, in pixels",
+            "two, in pixels, or one around each",
             parts,
             still,
         )
@@ -110,10 +126,6 @@ def find_fingers(
     chosen = [chosen[k] for k in np.argsort(centres[:, axis]).tolist()]
     fingers = tuple(own[0] for own in chosen)
     return Parts(fingers, tuple(own[1] for own in chosen), still & ~np.any(fingers, axis=0))
-
-
-_Part = tuple[Bits, Array, float, bool]
-"""A part's mask, the direction to its tip, the length of its outline in view (px), and whether it enters the view."""
 
 
 def _connected(mask: Bits) -> list[Bits]:

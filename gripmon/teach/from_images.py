@@ -27,7 +27,7 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
 from gripmon.model.response import in_light, response_of
 from gripmon.teach.finger_depth import PlacedOutlines, place
-from gripmon.teach.fingers import UnclearPartsError
+from gripmon.teach.fingers import Box, UnclearPartsError
 from gripmon.teach.image_drawing import draw_outlines
 from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines
 from gripmon.teach.image_motion import SAME_OPENING_M
@@ -132,7 +132,7 @@ def gripper_from_images(
     reference: Pose | None = None,
     jaw_range_m: tuple[float, float] | None = None,
     fingers: int | None = None,
-    within: tuple[int, int, int, int] | None = None,
+    within: Sequence[Box] = (),
     name: str = "gripper",
     provenance: Provenance | None = None,
     response: str = "auto",
@@ -142,7 +142,8 @@ def gripper_from_images(
 
     ``openings_m``: the jaw's opening in each image (None: images of one opening are recognised by themselves); an
     opening with fewer than five images isn't used.  ``fingers``: how many are seen, 1 or 2 (default: 2, and anything
-    else is refused); ``within`` (left, top, right, bottom): where in the image they are, px.  The scale comes from
+    else is refused); ``within``: where in the
+    image they are, or a box (left, top, right, bottom), px, for each.  The scale comes from
     ``distance_m`` (of the fingertips from the camera, along the optical axis), ``finger_width_m`` (of a fingertip,
     across the jaws), a ``reference`` calibration, or from several openings.  ``response``: how grey levels follow the
     light, linear or srgb; auto: as the images show it.

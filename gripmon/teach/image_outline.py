@@ -13,7 +13,7 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
-from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Parts, find_fingers
+from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
@@ -29,6 +29,8 @@ MOST_BLUR_PX = 2.5
 """Largest blur of an outline's transition: beyond it the background's edges merge with the fingers' (see Limits)."""
 LEAST_SHARPNESS = 0.6
 """Least sharpness of an image's transitions over that of all: an image blurred to 1.7 times their width has less."""
+LEAST_SEEN = 0.7
+"""Least part of a finger's outline in view that is measured: with less, what is missing may be its tip."""
 _TURNS = 4
 
 
@@ -64,7 +66,7 @@ def see_opening(
     step: Callable[[], None] = lambda: None,
     *,
     fingers: int | None = None,
-    within: tuple[int, int, int, int] | None = None,
+    within: Sequence[Box] = (),
 ) -> OpeningSeen:
     """Measure the outlines in ``images`` (h, w), grey levels of 0 to 255; ``fingers`` and ``within`` as in
     :func:`~gripmon.teach.fingers.find_fingers`.  Raises :class:`NoResultError`.
@@ -191,6 +193,11 @@ def _without(matte: Matte, bad: Mapping[int, str]) -> Matte:
     )  # fmt: skip
 
 
+def _length_px(chain: Chain) -> float:
+    ends = chain.uv_px[np.array(chain.pieces)]
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
+
+
 def _fingers(
     camera: Camera,
     matte: Matte,
@@ -201,16 +208,26 @@ def _fingers(
 ) -> tuple[FingerSeen, ...]:
     """The fingers with the chains of their outlines."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
+    in_view = dict.fromkeys(chains, 0)
     for part, contour in contours:
         stations = _stations(contour, part, parts.rest)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
+        in_view[id(part)] += np.count_nonzero(stations.inside)
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chain = fit_chain(camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px)
             if chain is not None:
                 chains[id(part)].append(chain)
         step()
+    shares = [sum(map(_length_px, chains[id(part)])) / max(in_view[id(part)], 1) for part in parts.fingers]
+    if min(shares) < LEAST_SEEN:
+        raise UnclearPartsError(
+            f"only {100.0 * min(shares):.0f} % of a finger's outline shows against the backgrounds, at least "
+            f"{100.0 * LEAST_SEEN:.0f} %: more images, before brighter and darker backgrounds",
+            list(parts.fingers),
+            matte.still,
+        )
     if not all(chains.values()):
         raise NoResultError("a finger has no straight or curved edge of 8 px; fingertips in view and in focus")
     return tuple(
