@@ -164,7 +164,7 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart() -> None:
     assert alone.gripper.finger_ids == ("left", "right")
     found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     assert found.gripper.finger_ids == ("left", "right")
-    assert any("join the fingers" in note for note in found.notes)
+    assert any("joins the fingers" in note for note in found.notes)
     assert abs(found.gripper.jaw_nominal_m - 0.034) < 2e-4
     shown_m = [m for m in np.arange(0.014, 0.044, 1e-4).tolist() if found.gripper.beyond_m(m) == 0.0]
     assert abs(min(shown_m) - 0.024) < 3e-4 and abs(max(shown_m) - 0.034) < 3e-4

@@ -23,6 +23,8 @@ LEAST_DEPTH = 0.25
 the image that a lens hides, or a housing, is flatter; a finger cut off by a corner is deeper than a third of it."""
 LEAST_VALLEY = 0.25
 """Least depth of the space between two fingers of one part, over the distance of their tips."""
+PRONGS_SHARE = 0.5
+"""Least share of a part's outline in view that its two fingers have; a notch in one finger's tip leaves less."""
 ALIKE_OUTLINES = 0.3
 """Least outline of a second finger over the first one's; what is shorter is taken for something else."""
 ALIKE_SHARES = 0.8
@@ -143,7 +145,8 @@ def _divided(part: Bits) -> list[_Part]:
         ahead = np.indices(part.shape)[::-1].transpose(1, 2, 0) @ way > level
         prongs = sorted(_connected(part & ahead), key=lambda own: -np.count_nonzero(own))[:2]
         outlines = [_outline_px(prong, part) for prong in prongs]
-        if len(prongs) == 2 and min(outlines) >= max(SHORTEST_OUTLINE_PX, ALIKE_OUTLINES * max(outlines)):
+        most = sum(outlines) >= PRONGS_SHARE * _outline_px(part, part)
+        if len(prongs) == 2 and most and min(outlines) >= max(SHORTEST_OUTLINE_PX, ALIKE_OUTLINES * max(outlines)):
             body = cv2.dilate((part & ~ahead).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             roots = [np.argwhere(prong & body)[:, ::-1] for prong in prongs]
             return [

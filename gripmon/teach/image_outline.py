@@ -213,7 +213,7 @@ def _fingers(
         stations = _stations(contour, part, parts.rest)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
-        in_view[id(part)] += np.count_nonzero(stations.inside)
+        in_view[id(part)] += int(np.count_nonzero(stations.inside))
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chain = fit_chain(camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px)

@@ -20,7 +20,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.special import ndtr
 
 from gripmon.model.camera import Camera
@@ -31,6 +31,8 @@ MOST_FOLDS = 10
 BLURS_PX = tuple(np.arange(0.5, 4.01, 0.1).tolist())
 MOST_RELIGHT = 0.5
 """Largest change of a finger's grey level from image to image, relative: the lamp behind instead of above it."""
+ALIKE_STATIONS = 41
+"""Stations, a pixel apart, along which a finger's light is about the same: several times what a corner takes up."""
 FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
@@ -144,11 +146,11 @@ def measure_transitions(
     finger = _finger_levels(profiles, s, wide=wide)
     d = profiles - finger[None]
     off = d[:, :, within].mean(axis=2)
-    # Light changes on a finger, by some tenths; where its grey level is another altogether, or changes along the search
-    # line, something else is in front of it, and the image isn't used at this station.
-    lit = np.abs(off) < MOST_RELIGHT * np.maximum(finger[:, within].mean(axis=1), 10.0)
-    d -= np.where(lit, off, 0.0)[:, :, None]
-    sound = lit & (d[:, :, within].std(axis=2) < 4.0 * max(noise, 1.0) + finger[:, within].std(axis=1))
+    # Light changes on a finger, much alike along it; where its grey level is another than beside, or changes along the
+    # search line, something else is in front of it, or it has ended, and the image isn't used at this station.
+    light = median_filter(off, (1, ALIKE_STATIONS), mode="nearest")
+    d -= light[:, :, None]
+    sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * _usual(finger, within))
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
     weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
@@ -173,6 +175,11 @@ def measure_transitions(
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness)
+
+
+def _usual(finger: Array, within: NDArray[np.bool_]) -> Array:
+    """Grey level (stations,) inside of the finger; at least 10 of 255."""
+    return np.maximum(finger[:, within].mean(axis=1), 10.0)
 
 
 def _finger_levels(profiles: NDArray[np.float32], s: Array, *, wide: bool) -> Array:
