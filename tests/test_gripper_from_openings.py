@@ -169,7 +169,9 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart() -> None:
     shown_m = [m for m in np.arange(0.014, 0.044, 1e-4).tolist() if found.gripper.beyond_m(m) == 0.0]
     assert abs(min(shown_m) - 0.024) < 3e-4 and abs(max(shown_m) - 0.034) < 3e-4
     apart = perturbation_between(POSE, found.cam_T_grip)
-    assert np.abs(apart[:3]).max() < 4e-4 and np.abs(apart[3:]).max() < np.radians(0.3)
+    sigma_rad = np.sqrt(np.diag(found.covariance)[3:])
+    assert np.abs(apart[:3]).max() < 4e-4 and sigma_rad.max() < np.radians(0.5)
+    assert (np.abs(apart[3:]) < 3.0 * sigma_rad).all()
 
 
 def test_openings_are_told_apart_without_a_table() -> None:

@@ -122,11 +122,12 @@ def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) ->
 
 
 def _stations(contour: Array, part: Bits, rest: Bits) -> Stations:
-    """Stations along a part's contour; the cut between it and the rest of what stays isn't outline."""
+    """Stations along a part's contour; where it is cut off from the rest of what stays, or near it, isn't outline."""
     stations = stations_along(contour, part)
-    ahead = np.rint(contour + _BESIDE_PX * stations.normal).astype(int)
-    ahead = np.clip(ahead, 0, np.array(rest.shape[::-1]) - 1)
-    return replace(stations, inside=stations.inside & ~rest[ahead[:, 1], ahead[:, 0]])
+    size = 2 * int(_BESIDE_PX) + 1
+    near = cv2.dilate(rest.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+    column, row = np.clip(np.rint(contour).astype(int), 0, np.array(rest.shape[::-1]) - 1).T
+    return replace(stations, inside=stations.inside & ~near[row, column])
 
 
 def _blurred(found: Transitions) -> dict[int, str]:

@@ -18,8 +18,8 @@ from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import folds_of, from_ideal_px, to_ideal_px
 from gripmon.teach.straight_pieces import jackknife_sigma
 
-SHORTEST_PX = 10.0
-"""Least length of an edge: two more than the outline's, since nothing but its grey level tells it from texture."""
+SHORTEST_PX = 20.0
+"""Least length of an edge: texture has shorter lines, scratches and brush marks."""
 LEAST_CONTRAST = 6.0
 """Least step over a pixel's noise: a search line averaged over three rows then shows it at ten sigma."""
 SEEN_SHARE = 0.7

@@ -149,8 +149,9 @@ def measure_transitions(
     # Light changes on a finger, much alike along it; where its grey level is another than beside, or changes along the
     # search line, something else is in front of it, or it has ended, and the image isn't used at this station.
     light = median_filter(off, (1, ALIKE_STATIONS), mode="nearest")
-    d -= light[:, :, None]
-    sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * _usual(finger, within))
+    usual = _usual(finger, within)
+    d -= (light / usual)[:, :, None] * finger[None]
+    sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
     weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
