@@ -172,17 +172,19 @@ def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tup
         pose[:3, 3] *= NOMINAL_DISTANCE_M / DEPTH_M
         return pose
 
-    true_T_made = invert(true_T(0)) @ found.cam_T_grip
-    valid, frames = 0, 30
+    valid, frames, number = 0, 30, {}
     for k in range(frames):
         shown = simulator.frame(k)
+        number[shown.stamp_ns] = k
         record = monitor.process(Frame(shown.seq, shown.stamp_ns, shown.image, None, shown.name))
         monitor.run_pending()
         if record.verdict is not Verdict.VALID:
             continue
         valid += 1
         assert record.cam_T_grip is not None and record.protection is not None
-        error = perturbation_between(true_T(k) @ true_T_made, from_record(record.cam_T_grip))
+        assert record.since_reference is not None
+        true_d = true_T(k) @ invert(true_T(number[record.since_reference.since_ns]))
+        error = perturbation_between(true_d @ found.cam_T_grip, from_record(record.cam_T_grip))
         off_m = float(np.linalg.norm(error[:3]))
         assert off_m < record.protection.position_m and (k > 12 or off_m < 3e-5)
         assert record.absolute is not None and record.absolute.position_m > NOMINAL_DISTANCE_M

@@ -4,7 +4,8 @@ Long edges along a finger are parallel in space, so their images meet in one poi
 fingers' direction (Caprile and Torre 1990).  Fingertips end square to it: their outline lies in the contact plane, and
 the long edges run back from it.  The outline of a round tip lies in the plane of the finger's sides instead: it leaves
 them smoothly, whereas an outline in the contact plane would bend by 90 degrees, which is invisible from only a few
-places.  Where edges don't meet in a point, the outline is taken as flat, facing the camera.
+places.  Where edges don't meet in a point, the outline is taken as flat, tilted as fingers before a wrist camera
+usually are.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ CORNER_TURN_SHARE = 0.75
 """Least part of the turn, within the length of a cut corner, that a corner makes at its first vertex.  On the
 tightest curve that isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
 _ROUNDS = 4
+USUAL_TILT_RAD = math.radians(35.0)
+"""Angle between the fingers and the line of sight to their tips, where nothing tells: wrist cameras look along their
+fingers at 20 to 50 degrees."""
+USUAL_TILT_SIGMA_RAD = math.radians(15.0)
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
 
@@ -73,6 +78,7 @@ class PlacedOutlines:
     sigma_rad: Array
     round_tips: bool = False
     by_motion: bool = False
+    normal: Array | None = None
     tcp_covariance: Array | None = None
 
 
@@ -291,23 +297,34 @@ def nearest_on_ray(ray: Array, start: Array, direction: Array) -> Array:
 
 
 def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp: Array | None) -> PlacedOutlines:
-    """All fingers in one plane through the TCP that faces the camera."""
-    facing = _ray(centre if tcp is None else tcp[:2] / tcp[2])
-    facing = facing / np.linalg.norm(facing)
+    """All fingers in one plane through the TCP: that of a calibration's x and z axes if it is seen well, or one in
+    which the fingers point away from the camera as they usually do.
+    """
+    outwards = np.sum([f.outwards for f in fingers], axis=0)
     at = _ray(centre) if tcp is None else tcp
-    points = [np.array([_ray(xy) * float(facing @ at) / float(facing @ _ray(xy)) for xy in f.xy]) for f in fingers]
+    sight = at / np.linalg.norm(at)
+    aside = np.array([*outwards, 0.0]) - sight * float(sight[:2] @ outwards)
+    aside /= np.linalg.norm(aside)
+    direction = math.cos(USUAL_TILT_RAD) * sight + math.sin(USUAL_TILT_RAD) * aside
+    normal = np.cross(direction, np.cross(sight, aside))
+    if rotation is not None and abs(float(rotation[:, 1] @ sight)) > math.sin(math.radians(15.0)):
+        normal = rotation[:, 1]
+    points = [np.array([_ray(xy) * float(normal @ at) / float(normal @ _ray(xy)) for xy in f.xy]) for f in fingers]
+    for own in points:
+        own[own[:, 2] <= 0.0] = np.nan
     tips = [int((f.xy @ f.outwards).argmax()) for f in fingers]
     sigma = np.zeros(3)
     if rotation is None or tcp is None:
-        outwards = np.sum([f.outwards for f in fingers], axis=0)
-        direction = np.array([*outwards, 0.0]) - facing * float(facing[:2] @ outwards)
-        direction /= np.linalg.norm(direction)
         inner = innermost(points) if len(points) > 1 else [points[0][tips[0]]]
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
-        rotation = _axes(inner, direction, facing)
-        sigma = np.array([FLAT_SIGMA_RAD, FLAT_SIGMA_RAD, 0.0])
-    return PlacedOutlines(tuple(points), tuple(f.pieces for f in fingers), rotation, tcp, True, sigma)
+        rotation = _axes(inner, direction, normal)
+        sigma = np.array([USUAL_TILT_SIGMA_RAD, USUAL_TILT_SIGMA_RAD, 0.0])
+    kept = tuple(
+        tuple(piece for piece in f.pieces if np.isfinite(own[list(piece)]).all())
+        for f, own in zip(fingers, points, strict=True)
+    )
+    return PlacedOutlines(tuple(points), kept, rotation, tcp, True, sigma, normal=normal)
 
 
 def innermost(tips: Sequence[Array]) -> list[Array]:

@@ -330,9 +330,9 @@ def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str
     notes = []
     if placed.flat:
         notes.append(
-            "the outline is assumed flat, facing the camera: no three long edges of the fingers meet in one point. "
-            "Corrections of the camera's tilt, and of motions of some per cent of the distance, are too small or too "
-            "large by what the fingers stand out of that plane"
+            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: no three "
+            "long edges of the fingers meet in one point. Corrections of the camera's tilt, and of motions of some per "
+            "cent of the distance, are too small or too large by what the fingers stand out of that plane"
         )
     elif not calibrated and len(placed.points) == 1:
         notes.append("the finger's long edges are assumed parallel: a taper would look like another direction of it")

@@ -240,7 +240,7 @@ def _inner_in_space(
     xy = seen.camera.undistort(edge.uv_px)
     rays = np.column_stack([xy, np.ones(2)])
     if seen.placed.flat:
-        plane = seen.placed.tcp / np.linalg.norm(seen.placed.tcp)
+        plane = seen.placed.tcp if seen.placed.normal is None else seen.placed.normal
         return np.asarray(rays * (float(plane @ seen.placed.tcp) / (rays @ plane))[:, None])
     if start is None:
         return None
