@@ -243,12 +243,12 @@ STEPS = (
                   ("gripper", (FROM_CAD,))),
             Field("cad_view", "view (m:°)", "", "for round, hollow or open fingers: distance from the camera to the "
                   "fingertips, and the camera's tilt against them, e.g. 0.12:30", (), ("gripper", (FROM_CAD,))),
-            Field("free_images", "images in", "teaching", "a folder with ten to a hundred images, each before another "
-                  "background; teaching: take thirty in the step Gripper at work first", (),
-                  ("gripper", (FROM_IMAGES,))),
+            Field("free_images", "images in", "teaching", "a folder with five to two hundred images, each before "
+                  "another background, some brighter and some darker than the fingers; teaching: take fifteen in the "
+                  "step Gripper at work first", (), ("gripper", (FROM_IMAGES,))),
             Field("distance", "distance (m)", "", "of the fingertips from the camera, with its standard deviation, "
-                  "which is in every bound, e.g. 0.12:0.0001; empty: from images at several jaw openings", (),
-                  ("gripper", (FROM_IMAGES,))),
+                  "which is in every bound, e.g. 0.12:0.0001; empty: from images at several jaw openings, else unknown",
+                  (), ("gripper", (FROM_IMAGES,))),
             Field("jaw_range", "jaws move (m)", "", "MIN:MAX, e.g. 0:0.06; empty: they don't", (),
                   ("gripper", (INFERRED, FROM_CAD))),
             Field("options", "more options", "", "added to the command below, written as there", (),
@@ -287,7 +287,7 @@ STEPS = (
     ),
     Step(
         "teaching", "Gripper at work", "One to ten images as at work, each before another background, the fingers free "
-        "and lit as in use; thirty if the gripper's model is made from them.", "capture", "Start",
+        "and lit as in use; fifteen if the gripper's model is made from them.", "capture", "Start",
         ("camera.yaml", "gripper.yaml"), ("teaching",),
         _step_command("teaching"), (Field("teaching_source", "images from", "", _PLATE_SOURCE),),
     ),
