@@ -23,6 +23,9 @@ LEAST_DEPTH = 0.25
 the image that a lens hides, or a housing, is flatter; a finger cut off by a corner is deeper than a third of it."""
 LEAST_VALLEY = 0.25
 """Least depth of the space between two fingers of one part, over the distance of their tips."""
+LEAST_STEEPNESS = 1.2
+"""Least rise of both sides of that space over their way along the line between the tips: 50°.  In the corner
+between one finger and what carries it, of 90° or so, a side has 45° at most."""
 PRONGS_SHARE = 0.5
 """Least share of a part's outline in view that its two fingers have; a notch in one finger's tip leaves less."""
 ALIKE_OUTLINES = 0.3
@@ -31,6 +34,7 @@ ALIKE_SHARES = 0.8
 """Least mean share of the images that show an edge along a part's outline, over that of the part with the longest one:
 before the same backgrounds two fingers' outlines are seen about equally often, those of chance less."""
 _BOTTOM = 0.9
+_FLANK = (0.2, 0.7)  # parts of a valley's depth: above, a finger's end that is farther back than the other one's
 _BORDER_PX = 2
 
 
@@ -75,14 +79,23 @@ Box = tuple[int, int, int, int]
 
 def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Sequence[Box] = ()) -> Parts:
     """The fingers among what stays (h, w), from left to right (or from top to bottom): ``count`` of them if given,
-    else two.  ``within``: only there; with several boxes one finger in each.  Raises :class:`UnclearPartsError`.
+    else two.  ``within``: only there; with several boxes one finger in each.  Raises :class:`UnclearPartsError`, also
+    if there are more: a cable that hangs in the view has a finger's shape, and may be the longer one.
     """
     strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
     if len(within) > 1:
         each = [_candidates(_inside_box(still, box), strength, edges.limit)[:1] for box in within]
-        return _chosen([own for found in each for own in found], still, len(within), len(within))
+        return _chosen([own for found in each for own in found], still, len(within))
     found = _candidates(_inside_box(still, within[0]) if within else still, strength, edges.limit)
-    return _chosen([own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]], still, count or 2, count)
+    alike = [own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]]
+    if count != 1 and len(alike) == 1 and len(found) > 1:  # the largest may be a cable
+        raise UnclearPartsError(
+            f"{len(found)} parts that stay may be fingers, one much larger than the others (see --picture); --fingers "
+            "1 if that is the gripper's only one, else --within LEFT,TOP,RIGHT,BOTTOM around each finger, in pixels",
+            [own[0] for own in found],
+            still,
+        )
+    return _chosen(alike, still, count or 2)
 
 
 def _inside_box(still: Bits, box: Box) -> Bits:
@@ -104,7 +117,7 @@ def _candidates(still: Bits, strength: Plane, limit: float) -> list[_Part]:
     return sorted(found, key=lambda own: -own[2])
 
 
-def _chosen(found: list[_Part], still: Bits, wanted: int, count: int | None) -> Parts:
+def _chosen(found: list[_Part], still: Bits, wanted: int) -> Parts:
     parts = [own[0] for own in found]
     if not parts:
         raise UnclearPartsError(
@@ -115,10 +128,11 @@ def _chosen(found: list[_Part], still: Bits, wanted: int, count: int | None) -> 
         )
     if len(parts) < wanted:
         raise UnclearPartsError("one finger is seen; --fingers 1 if the gripper shows no more", parts, still)
-    if len(parts) > wanted and count is None:
+    if len(parts) > wanted:
+        around = "the two, in pixels, or one around each" if wanted > 1 else "the finger, in pixels"
         raise UnclearPartsError(
-            f"{len(parts)} parts that stay may be fingers (see --picture); --within LEFT,TOP,RIGHT,BOTTOM around the "
-            "two, in pixels, or one around each",
+            f"{len(parts)} parts that stay may be fingers (see --picture); --within LEFT,TOP,RIGHT,BOTTOM around "
+            f"{around}",
             parts,
             still,
         )
@@ -157,12 +171,28 @@ def _divided(part: Bits) -> list[_Part]:
     border = part & _at_border(part.shape)
     if not border.any():
         return [(part, outwards, outline, False)]
+    if not _ends_within(part, border):
+        return []
     points = np.argwhere(part)[:, ::-1] @ outwards
     depth = float(points.max() - (np.argwhere(border)[:, ::-1] @ outwards).min())
     inside = float(points.max() - np.median(np.argwhere(border)[:, ::-1] @ outwards))
     if min(depth, inside) < LEAST_DEPTH * np.count_nonzero(border) / _BORDER_PX:
         return []
     return [(part, outwards, outline, True)]
+
+
+def _ends_within(part: Bits, border: Bits) -> bool:
+    """Whether a part ends in view: what is farthest from where it enters (most of its ``border``) isn't where it leaves
+    again, as a cable that crosses the view; what enters along a whole side, as a housing, must stand out from it.
+    """
+    root = max(_connected(border), key=np.count_nonzero)
+    if (root[:, 0].any() and root[:, -1].any()) or (root[0].any() and root[-1].any()):
+        out = float(cv2.distanceTransform((~root).astype(np.uint8), cv2.DIST_L2, 5)[part].max())
+        return bool(out >= LEAST_DEPTH * np.count_nonzero(root) / _BORDER_PX)
+    points = np.argwhere(part)
+    away = np.linalg.norm(points - np.argwhere(root).mean(axis=0), axis=1)
+    tip = points[away >= np.quantile(away, 0.99)]
+    return not bool((border & ~root)[tip[:, 0], tip[:, 1]].any())
 
 
 def _cut(part: Bits) -> tuple[Array, float] | None:
@@ -189,6 +219,8 @@ def _cut(part: Bits) -> tuple[Array, float] | None:
         below = (valley - tips[0]) @ normal
         normal *= -1.0 if abs(below.max()) > abs(below.min()) else 1.0
         below = np.abs(below)
+        if not _steep(below, (valley - tips[0]) @ chord):
+            continue
         bottom = valley[below > _BOTTOM * below.max()]
         spread = bottom - bottom.mean(axis=0)
         way = np.linalg.svd(spread, full_matrices=False)[2][0] if len(bottom) > 2 else chord
@@ -200,6 +232,15 @@ def _cut(part: Bits) -> tuple[Array, float] | None:
         if best is None or depth > best[0]:
             best = depth, across, float((bottom @ across).max()) + 1.0
     return None if best is None else (best[1], best[2])
+
+
+def _steep(below: Array, along: Array) -> bool:
+    """Whether both sides of a valley are steep: its points, in order, lie ``below`` (n,) and ``along`` (n,) a
+    line from tip to tip.
+    """
+    high, low = (along[below >= part * below.max()] for part in _FLANK)
+    run = max(low[0] - high[0], high[-1] - low[-1])
+    return bool(run * LEAST_STEEPNESS < (_FLANK[1] - _FLANK[0]) * below.max())
 
 
 def _ends_in_view(tips: Array, shape: tuple[int, ...]) -> bool:

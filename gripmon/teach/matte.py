@@ -100,7 +100,7 @@ def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], N
                 )
         elif np.abs(change).max() < 0.25:
             break
-    still = _grown(_static(edges), images[0].shape)
+    still = _static(edges, images[0].shape)
     stack = np.stack([shifted(given[k], -moved[k]) for k in kept])
     inside = _inside(still)
     _level(stack, inside)
@@ -151,8 +151,8 @@ def _grown(mask: Bits, shape: tuple[int, ...]) -> Bits:
     return np.asarray(out > 0)
 
 
-def _static(edges: Edges) -> Bits:
-    """The pixels (h, w) that don't belong to the background.  Raises :class:`NoResultError`."""
+def _static(edges: Edges, shape: tuple[int, ...]) -> Bits:
+    """The pixels of images of a ``shape`` that don't belong to the background.  Raises :class:`NoResultError`."""
     still = enclosed(edges)
     share = 1.0 if still is None else float(still.mean())
     if still is None or share > MOST_STILL_SHARE:
@@ -160,6 +160,7 @@ def _static(edges: Edges) -> Bits:
             f"{100.0 * share:.0f} % of the image stays the same; images with changing backgrounds: move the robot "
             "between them"
         )
+    still = _grown(still, shape)
     if not still.any():
         raise NoResultError(
             "no edges that stay enclose anything; a camera that is fixed to the gripper, one gripper, jaws at rest, "
