@@ -509,7 +509,7 @@ def test_a_gripper_of_the_library_and_every_kind_of_reference(
         states = {state.name: state for state in project.states()}
         assert states["reference"].progress == "skipped" and "--reference" not in states["teach"].command
         _sent(site, "open", StepRequest(step="teach"))
-        assert _shown(site)["needed"] == 4
+        assert _shown(site)["needed"] == 3
         _started_and_stopped(site, tmp_path)
         with pytest.raises(BadRequest, match="no step nose"):
             _sent(site, "open", StepRequest(step="nose"))

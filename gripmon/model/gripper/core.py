@@ -95,6 +95,7 @@ class Gripper:
         if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
             raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
         self._motion = [motion_table(n, f.motion, model.jaw) for n, f in model.fingers.items()]
+        self._known_m = max(float(t[0, 0]) for t in self._motion), min(float(t[-1, 0]) for t in self._motion)
         self._check()
 
     def points_grip_m(self, jaw_opening_m: float | None = None, eye_grip_m: Array | None = None) -> Array:
@@ -112,7 +113,9 @@ class Gripper:
         """Standard deviation of the fingers' places at an opening beyond those that the file's motions are known for;
         0 within them (see :func:`~gripmon.model.gripper.motion.beyond_table_m`).
         """
-        return max(beyond_table_m(table, jaw_opening_m) for table in self._motion) if self.has_jaw else 0.0
+        if not self.has_jaw or self._known_m[0] <= jaw_opening_m <= self._known_m[1]:
+            return 0.0
+        return max(beyond_table_m(table, jaw_opening_m) for table in self._motion)
 
     def point_motion(self, jaw_opening_m: float) -> Array:
         """Derivative (p, 3) of all points by the jaw opening, m/m; central difference over 0.1 mm, as motion is
