@@ -74,10 +74,12 @@ def test_the_longest_run_inside_the_image_is_sampled():
 
 
 def test_a_finger_is_where_its_table_has_it():
-    """Against NumPy's own interpolation, at the table's rows, between them and beyond its ends."""
+    """Against NumPy's own interpolation, at the table's rows and between them; beyond its ends it goes on straight."""
     from gripmon.model.gripper.motion import offset_m
 
     table = np.array([[0.0, 0.0, 0.1, 0.2], [0.01, 1.0, 0.0, 0.3], [0.04, 4.0, -0.5, 0.1], [0.05, 3.0, 0.0, 0.0]])
-    for opening_m in (-0.01, 0.0, 0.003, 0.01, 0.0399, 0.04, 0.05, 0.07):
+    np.testing.assert_allclose(offset_m(table, -0.01), [-1.0, 0.2, 0.1], atol=1e-15)
+    np.testing.assert_allclose(offset_m(table, 0.07), [1.0, 1.0, -0.2], atol=1e-14)
+    for opening_m in (0.0, 0.003, 0.01, 0.0399, 0.04, 0.05):
         expected = [np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)]
         np.testing.assert_allclose(offset_m(table, opening_m), expected, atol=1e-15)

@@ -104,7 +104,7 @@ def test_an_opening_that_nobody_reports_may_be_far_from_the_nominal_one(rig: Rig
 def test_refusals_say_what_to_do(rig: Rig, setup: Setup):
     good = rig.rough(*INNER)
     few = setup.evaluate(rig.image, put({"L_in_near": good["L_in_near"]}), (), OPENING_M)
-    assert few.snapped.refused == "place 3 more corners on the fingertips" and few.reference is None
+    assert few.snapped.refused == "place 2 more corners on the fingertips" and few.reference is None
     swapped = {**good, "L_in_near": good["R_in_near"], "R_in_near": good["L_in_near"]}
     assert "where the others put it" in str(setup.evaluate(rig.image, put(swapped), (), OPENING_M).snapped.refused)
     other = {name: good[f"{'R' if name[0] == 'L' else 'L'}{name[1:]}"] for name in good}
@@ -367,11 +367,11 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
         ([image, "--page", "--config", camera, "--jaw-source", "zenoh"], "--jaw-source: --config gives the source"),
         ([image, *page, "--live-wait", "3"], "--live-wait: goes with --live"),
-        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, hidden ones too"),
+        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 3, hidden ones too"),
         ([image, *page, "--corners", rough], "--page and --corners"),
         ([image, *page, "--config", camera], "--config names camera, gripper and reference already"),
         ([image, *page, "--jaw-opening", "0.2"], "jaw opening 0.2 m; the gripper's 0 to 0.06 m"),
-        ([image, *page, "--picture", "a.png"], "--picture goes with --config"),
+        ([image, *page, "--picture", "a.png"], "--picture: the page shows it; leave it out"),
         ([image, *given, "--corners", bad], "corners.nose: the gripper has no such corner; one of L_in_near"),
         ([image, *given, "--corners", tmp_path / "flat.yaml"], "corners.L_in_near: has 1 values"),
         ([image, *given, "--corners", tmp_path / "none.yaml"], "there is no such file"),

@@ -95,8 +95,8 @@ class Gripper:
         if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
             raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
         self._motion = [motion_table(n, f.motion, model.jaw) for n, f in model.fingers.items()]
-        self._known_m = max(float(t[0, 0]) for t in self._motion), min(float(t[-1, 0]) for t in self._motion)
         self._check()
+        self._known_m = max(float(t[0, 0]) for t in self._motion), min(float(t[-1, 0]) for t in self._motion)
 
     def points_grip_m(self, jaw_opening_m: float | None = None, eye_grip_m: Array | None = None) -> Array:
         """All points (p, 3) in the gripper frame at an opening (nominal if None).  ValueError outside the jaw's range.
