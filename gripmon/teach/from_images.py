@@ -184,6 +184,8 @@ def gripper_from_images(
     by_openings, why = depth_by_openings(motion, opening_m)
     size = size_of(placed, made.fx_px, distance_m, finger_width_m, reference, by_openings, notes)
     scale, moved = (size.depth_m, size.sigma_m), motion.by_opening
+    if around and not moved:
+        notes.append(f"the file holds one opening, without a jaw: {motion.why or 'the others show too little'}")
     if openings_m is None and moved:
         opening_m, moved = as_gaps(placed, moved, size.depth_m)
         notes.append(
