@@ -182,9 +182,9 @@ def test_openings_are_told_apart_without_a_table() -> None:
     ]
     order = np.random.default_rng(1).permutation(len(images)).tolist()
     wanted = [set(range(16)), set(range(26, 38)), set(range(16, 26))]
-    sets = image_sets([images[k] for k in order], 0.3)
+    sets = image_sets([images[k] for k in order])
     assert [{order[k] for k in own} for own in sets] == wanted
-    assert image_sets(images[:16], 0.3) == [list(range(16))]
+    assert image_sets(images[:16]) == [list(range(16))]
 
 
 def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:

@@ -7,7 +7,7 @@ motion give their positions in space up to scale (:mod:`~gripmon.teach.finger_de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -164,7 +164,8 @@ def gripper_from_images(
     light = response_of([image for _, image in taken], response, openings_m)
     grey = [grey_levels(in_light(image, light.response)) for _, image in taken]
     # Which images are of one opening shows in grey levels as stored: in light, edges on dark fingers are faint.
-    groups = _groups(openings_m, [grey_levels(image) for _, image in taken], least)
+    stored = grey if light.response != "srgb" else (grey_levels(image) for _, image in taken)
+    groups = _groups(openings_m, stored)
     notes = [*light.notes]
     left_out: dict[str, str] = {}
     with progress(None, "step") as step:
@@ -290,12 +291,14 @@ def _check_range(jaw_range_m: tuple[float, float] | None, openings_m: Sequence[f
 
 
 def _groups(
-    openings_m: Sequence[float | None] | None, grey: Sequence[NDArray[np.float32]], least_noise: float
+    openings_m: Sequence[float | None] | None, grey: Iterable[NDArray[np.float32]]
 ) -> dict[float, list[int]]:
-    """Indices of the images of each opening, the one with most images first.  Unknown openings are numbered."""
+    """Indices of the images of each opening, the one with most images first.  Unknown openings are numbered; for them
+    alone the images are looked at.
+    """
     if openings_m is None:
-        return {float(k): own for k, own in enumerate(image_sets(grey, least_noise))}
-    order = sorted(range(len(grey)), key=lambda k: openings_m[k] or 0.0)
+        return {float(k): own for k, own in enumerate(image_sets(list(grey)))}
+    order = sorted(range(len(openings_m)), key=lambda k: openings_m[k] or 0.0)
     runs: list[list[int]] = [[order[0]]]
     for k in order[1:]:
         apart = (openings_m[k] or 0.0) - (openings_m[runs[-1][0]] or 0.0)

@@ -239,8 +239,8 @@ def _inner_in_space(
     """Both ends (2, 3) at unit depth; None where the depth can't be determined."""
     xy = seen.camera.undistort(edge.uv_px)
     rays = np.column_stack([xy, np.ones(2)])
-    if seen.placed.flat:
-        plane = seen.placed.tcp if seen.placed.normal is None else seen.placed.normal
+    plane = seen.placed.normal
+    if plane is not None:
         return np.asarray(rays * (float(plane @ seen.placed.tcp) / (rays @ plane))[:, None])
     if start is None:
         return None

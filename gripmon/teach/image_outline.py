@@ -22,7 +22,6 @@ from gripmon.teach.straight_pieces import Chain, fit_chain, runs, without_outlie
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""
-SHORTEST_CONTOUR_PX = 40
 LEAST_PLAY_PX = 0.03
 """Displacement of an image that isn't moved back: a seventh of the accuracy wanted of an outline."""
 MOST_BLUR_PX = 2.5
@@ -74,7 +73,7 @@ def see_opening(
     matte = find_matte(images, least_noise, step)
     left_out = dict(matte.left_out)
     parts = find_fingers(matte.still, matte.edges, fingers, within)
-    contours = [(part, contour) for part in parts.fingers for contour in trace(part, SHORTEST_CONTOUR_PX)]
+    contours = [(part, contour) for part in parts.fingers for contour in trace(part, int(SHORTEST_OUTLINE_PX))]
     for turn in range(_TURNS):
         stations, found = _around(matte, contours, parts.rest)
         if found.blur_px > MOST_BLUR_PX:

@@ -8,7 +8,7 @@ pixel or so: each is moved back, first by the direction of edges, and then adjus
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -85,7 +85,7 @@ def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], N
     for _ in range(3):
         edges = edges_that_stay([shifted(image, -moved[k] / shrink) for image, k in zip(small, kept, strict=True)])
         step()
-        more, likeness = _displacements([small[i] for i in range(len(kept))], edges, moved[kept] / shrink)
+        more, likeness = _displacements(small, edges, moved[kept] / shrink)
         change = more * shrink - moved[kept]
         moved[kept] = more * shrink
         bad = _unlike(moved[kept], likeness)
@@ -104,12 +104,13 @@ def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], N
     stack = np.stack([shifted(given[k], -moved[k]) for k in kept])
     inside = _inside(still)
     _level(stack, inside)
-    mean, noise = np.median(stack, axis=0), _noise(stack, inside, least_noise)
+    mean = np.asarray(np.median(stack, axis=0), np.float32)
+    noise = _noise((image - mean for image in stack), inside, least_noise)
     step()
-    sets = image_sets(list(stack), least_noise)
+    sets = image_sets(list(stack))
     if len(sets) > 1:
         raise sets_refused([len(own) for own in sets])
-    return Matte(np.asarray(mean, np.float32), still, edges, noise, stack, moved[kept], tuple(kept), left_out)
+    return Matte(mean, still, edges, noise, stack, moved[kept], tuple(kept), left_out)
 
 
 def shifted(image: Plane, by_px: Array) -> Plane:
@@ -272,16 +273,15 @@ def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
     return gain, offset
 
 
-def _noise(stack: Plane, inside: Bits, least_noise: float) -> float:
-    """Scatter of one pixel beside its neighbours: light that changes over a finger is none."""
-    values = []
-    for image, middle in zip(stack, itertools.repeat(np.median(stack, axis=0)), strict=False):
-        off = np.asarray(image - middle, np.float32)
-        values.append((off - cv2.blur(off, (5, 5)))[inside][::_STEP])
+def _noise(off: Iterable[Plane], inside: Bits, least_noise: float) -> float:
+    """Scatter of one pixel beside its neighbours, of images' deviations (h, w) from what is usual: light that changes
+    over a finger is none.
+    """
+    values = [(image - cv2.blur(image, (5, 5)))[inside][::_STEP] for image in off]
     return max(_MAD * float(np.median(np.abs(np.concatenate(values)))), least_noise)
 
 
-def image_sets(images: Sequence[Plane], least_noise: float) -> list[list[int]]:
+def image_sets(images: Sequence[Plane]) -> list[list[int]]:
     """Indices of images (h, w) in which the same edges stay, the largest set first; usually a set per jaw opening.  A
     set has at least :data:`FEWEST_IMAGES`; fewer images unlike all others stay with a set, whose matte rejects them.
     """

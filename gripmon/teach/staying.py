@@ -20,7 +20,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -90,7 +90,6 @@ class Edges:
         return np.asarray(cv2.dilate(on, np.ones((3, 3), np.uint8)))
 
 
-
 def edges_that_stay(images: Sequence[Plane]) -> Edges:
     """Of ``images`` (h, w), grey levels of 0 to 255, at one jaw opening."""
     usual, high = _quantiles(images)
@@ -101,9 +100,8 @@ def edges_that_stay(images: Sequence[Plane]) -> Edges:
     share, across_rad = _share(images, full)
     chance, _ = _share(_displaced(images), full)
     changing = (high > CHANGING_SLOPES * noise) & (high > CHANGING_FACTOR * usual)
-    chance_mean = float(chance.mean())
-    limit = chance_mean + STAYING_PART * (1.0 - chance_mean)
-    return Edges(share, across_rad, _ridge(usual, across_rad), changing & (share < max(limit, 0.6)), chance_mean)
+    edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()))
+    return replace(edges, changing=changing & (share < max(edges.limit, 0.6)))
 
 
 def gradient(image: Plane) -> tuple[Plane, Plane]:
@@ -193,9 +191,8 @@ def _cells(stays: Bits) -> NDArray[np.int64]:
             found, own = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
             labels[part] = own[part] + count
             count += found - 1
-    nearest = cv2.distanceTransformWithLabels((~free).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[
-        1
-    ]
+    taken = (~free).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(taken, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(nearest.max()) + 1, np.int64)
     table[nearest[free]] = labels[free]
     return np.asarray(table[nearest])
