@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from benchmarks.integrity_practice import GRASPED_M, PRACTICE
 from benchmarks.integrity_runs import Truth
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.real_images import answered, camera_file
+from benchmarks.shapes import Tracked
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
 from gripmon.daemon.calibrations import write_document
 from gripmon.model.geometry import from_record, perturb, to_record
@@ -32,23 +32,10 @@ PLATE = np.array([1e-4] * 3 + [1e-3] * 3)
 _SCENE = "pads at work"
 
 
-@dataclass(frozen=True)
-class Day:
-    """Of ``frames``: how many were valid, misleading (valid and off by more than the alert limit), beyond their own
-    bound; median error (m) of those with a measurement; the most frequent reason that frames weren't valid, or why
-    there is no file.
+def day(seed: int, number: int, folder: Path, frames: int = FRAMES, stills: int = STILLS) -> Tracked:
+    """Images, ``gripper from-images``, ``teach``, then the scene with lamp, grasp and a knock of 2 mm; or why there is
+    no file.
     """
-
-    frames: int
-    valid: int
-    misleading: int
-    beyond: int
-    error_m: float
-    why: str
-
-
-def day(seed: int, number: int, folder: Path, frames: int = FRAMES, stills: int = STILLS) -> Day:
-    """Images, ``gripper from-images``, ``teach``, then the scene with lamp, grasp and a knock of 2 mm."""
     (condition,) = (each for each in PRACTICE if each.name == _SCENE)
     scene = make_integrity_scene(condition, seed, number, frames)
     _take_images(scene, seed, stills, folder)
@@ -65,7 +52,7 @@ def day(seed: int, number: int, folder: Path, frames: int = FRAMES, stills: int 
         if answer.code != 0:
             # Without what was left out image by image.
             why = answer.words[-1].partition("; and left out before")[0] if answer.words else "without a word"
-            return Day(frames - 1, 0, 0, 0, float("nan"), f"{words[0]}: exit code {answer.code}: {why}")
+            return Tracked(frames - 1, 0, 0, 0, float("nan"), f"{words[0]}: exit code {answer.code}: {why}")
     return _watched(scene, gripmon.load_config(config, check_source=False))
 
 
@@ -130,7 +117,7 @@ def _configuration(folder: Path) -> Path:
     return path
 
 
-def _watched(scene: IntegrityScene, config: gripmon.Config) -> Day:
+def _watched(scene: IntegrityScene, config: gripmon.Config) -> Tracked:
     """Frame after frame, against where the gripper truly is; the first, which none confirms, doesn't count."""
     monitor, simulator = gripmon.Monitor(config), scene.simulator
     truth = Truth(from_record(config.reference.cam_T_grip), simulator.truth(scene.first).cam_T_grip)
@@ -152,4 +139,4 @@ def _watched(scene: IntegrityScene, config: gripmon.Config) -> Day:
         counts[1] += off_m > config.settings.monitor.policy.alert_limit_m
         counts[2] += off_m > record.protection.position_m
     commonest = why.most_common(1)[0][0] if why.total() else ""
-    return Day(scene.frames - 1, *counts, float(np.median(errors)) if errors else float("nan"), commonest)
+    return Tracked(scene.frames - 1, *counts, float(np.median(errors)) if errors else float("nan"), commonest)
