@@ -1,0 +1,270 @@
+"""The belief: hypotheses about where the gripper stands and what may be wrong, one frame after another.
+
+Multi-hypothesis tracking with fault modes as in ARAIM, merging by moments (GPB2).  Each frame: predict, branch by the
+rates, weigh by p(frame | hypothesis), keep.  Every hypothesis always learns from every row that it doesn't doubt; there
+is no other rule about learning.  Where the gripper is, how surely, and what is doubted are questions asked of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.belief import bound as bounds
+from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
+from gripmon.belief.keep import keep, remember
+from gripmon.belief.nodes import Nodes, prepare
+from gripmon.belief.rows import add_noise, fade, move
+from gripmon.belief.search import Asked, Candidates, put, put_all, put_pairs, search
+from gripmon.belief.state import (
+    LATELY_S,
+    LEAST_LIGHT_MEMORY,
+    LIGHT,
+    MOTION,
+    OPENING,
+    REFERENCE,
+    SIZE,
+    Array,
+    Bank,
+    Ints,
+    Priors,
+    Seen,
+)
+
+GUARD = 30.0
+"""Surprise (a logarithm) of the best hypothesis beyond which no hypothesis is believed: e^-30 is none of the risks."""
+NOT_KNOWN_WEIGHT = 0.1
+"""Of the hypothesis that the pose isn't known, while the guard stops: policy."""
+_MOST_CANDIDATES = 4096
+
+
+class Believed(NamedTuple):
+    """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place; bounds
+    ``position_m`` and ``rotation_rad`` of the former, and ``absolute_m`` and ``absolute_rad`` of both together, infinite
+    where there is none; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False
+    while nothing explains what is seen.
+    """
+
+    motion: Array
+    reference_error: Array
+    position_m: float
+    rotation_rad: float
+    absolute_m: float
+    absolute_rad: float
+    dropped: float
+    surprise: float
+    known: bool
+
+
+class Jumps(NamedTuple):
+    """What moves at once: log share and rate per second ``log_rate`` (j,), with ``factors`` (j, 6, 23) of its covariance,
+    of which ``ranks`` (j,) rows count; ``knock`` (j,): the rate is that of knocks, ``log_rate`` its share.
+    """
+
+    log_rate: Array
+    factors: Array
+    ranks: Ints
+    knock: Array
+
+    @classmethod
+    def of(cls, priors: Priors, along: Array) -> Jumps:
+        """``along`` (3,): the fingers' direction in camera axes."""
+        logs, factors, knock = [], [], []
+
+        def put(share: float, rows: Array, is_knock: bool) -> None:
+            logs.append(math.log(share))
+            factors.append(rows)
+            knock.append(is_knock)
+
+        put(priors.small_per_s, _diagonal([priors.small_m] * 3 + [priors.small_rad] * 3), False)
+        for size_m, share in priors.any_way:
+            put(share * (1.0 - priors.along_share), _diagonal([size_m] * 3 + [priors.knock_rad] * 3), True)
+        for size_m, share in priors.along:
+            row = np.zeros((1, SIZE))
+            row[0, :3] = size_m * along
+            put(share * priors.along_share, row, True)
+        row = np.zeros((1, SIZE))
+        row[0, OPENING] = priors.opening_jump_m
+        put(priors.opening_per_s, row, False)
+        padded = np.zeros((len(factors), 6, SIZE))
+        for j, rows in enumerate(factors):
+            padded[j, : len(rows)] = rows
+        return cls(np.array(logs), padded, np.array([len(f) for f in factors]), np.array(knock))
+
+
+class Belief:
+    """Of one gripper with e edges.  ``along`` (3,): the fingers' direction in camera axes; ``risk`` of each of position
+    and rotation together; at most ``most`` hypotheses are kept, and ``backgrounds`` remembered per edge.  ``everything``:
+    all sets of doubts are weighed and none is merged or dropped, for tests with few doubts.  ``searching`` False leaves
+    the search out, which a test shows to be wrong.
+    """
+
+    def __init__(
+        self, doubts: Sequence[Doubt], along: Array, priors: Priors | None = None, *, risk: float = 1e-5, most: int = 64,
+        backgrounds: int = 1, everything: bool = False, searching: bool = True,
+    ) -> None:  # fmt: skip
+        self.priors, self.risk, self.most = priors or Priors(), risk, most
+        self.least = risk * 1e-3
+        self._table = Table.of(doubts)
+        self._onsets = Onsets(self._table)
+        self._jumps = Jumps.of(self.priors, along)
+        self._edges, self._fingers = len(doubts[0].edges), len(doubts[0].ends)
+        self._sizes = np.square([self.priors.near_px, self.priors.far_px])
+        self._everything, self._searching = everything, searching
+        kept = _MOST_CANDIDATES if everything else most + 1
+        self._bank, self._other = (Bank.empty(kept, self._edges, backgrounds) for _ in range(2))
+        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.log_rate)), self._edges)
+        self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
+        self._bank.covariance[0] = self.priors.covariance()
+        self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
+        self._hypotheses, self._first, self._lost = 1, True, False
+
+    @property
+    def weights(self) -> dict[int, float]:
+        """Probability of each set of doubts (as bits)."""
+        out: dict[int, float] = {}
+        for h in range(self._hypotheses):
+            doubts = int(self._bank.doubts[h])
+            out[doubts] = out.get(doubts, 0.0) + math.exp(self._bank.log_weight[h])
+        return out
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (23,) and covariance (23, 23) of g over all hypotheses."""
+        n = self._hypotheses
+        weights, means = np.exp(self._bank.log_weight[:n]), self._bank.mean[:n]
+        mean = weights @ means
+        away = means - mean
+        return mean, np.einsum("h,hij->ij", weights, self._bank.covariance[:n]) + (weights[:, None] * away).T @ away
+
+    def update(
+        self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0, hidden_knock: float = 0.0
+    ) -> Believed:
+        """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else 0.
+        ``hidden_knock``: probability of a knock that is due in this frame because no end is seen (policy; once for each
+        such stretch), beside that of the rate; hypotheses that doubt all ends have it in any case.
+        """
+        first = self._first
+        if not first:
+            self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY))
+        for h in range(self._hypotheses):
+            fade(self._bank, h, seen)
+        told = told or nothing_told(self._fingers)
+        asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first)
+        n = self._branch(asked, dt_s, hidden_knock)
+        surprise = float(self._candidates.surprise[int(np.argmax(self._candidates.log_weight[:n]))])
+        dropped = self._keep(n, asked)
+        self._first, self._lost = False, surprise > GUARD
+        if self._lost:
+            self._not_known()
+        return self._believed(dropped, surprise)
+
+    def _predict(self, dt_s: float, light: float) -> None:
+        priors, root_dt = self.priors, math.sqrt(dt_s)
+        rows = np.zeros((7, SIZE))
+        rows[range(6), range(6)] = np.repeat([priors.creep_m_s * root_dt, priors.creep_rad_s * root_dt], 3)
+        rows[6, LIGHT] = priors.light_px * math.sqrt(1.0 - light * light)
+        factor = rows if light < 1.0 else rows[:6]
+        lag = 1.0 - math.exp(-dt_s / LATELY_S)
+        for h in range(self._hypotheses):
+            move(self._bank, h, lag, light)
+            if factor.any():
+                add_noise(self._bank, h, self._bank.mean[h], self._bank.covariance[h], factor)
+
+    def _branch(self, asked: Asked, dt_s: float, hidden_knock: float) -> int:
+        """Candidates of a frame; their number."""
+        bank, nodes, candidates, table = self._bank, self._nodes, self._candidates, self._table
+        nothing = np.zeros((0, SIZE))
+        n = 0
+        for h in range(self._hypotheses):
+            self._node(h, h, -1, float(bank.log_weight[h]), nothing, asked)
+            if self._everything:
+                n = put_all(candidates, n, nodes, h, bank, asked)
+            else:
+                n = put(candidates, n, nodes, h, int(bank.doubts[h]), bank, asked)
+                if asked.first or self._lost:
+                    n = put_pairs(candidates, n, nodes, h, bank, asked)
+        if self._everything:
+            return n
+        least = -math.log(self.least)
+        if not asked.first:
+            n = self._jump(n, asked, dt_s, hidden_knock, least)
+        reach = -math.log(0.3 * self.risk)
+        return int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
+
+    def _jump(self, n: int, asked: Asked, dt_s: float, hidden_knock: float, least: float) -> int:
+        """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light."""
+        bank, candidates, jumps = self._bank, self._candidates, self._jumps
+        stayed = candidates.log_weight[: self._hypotheses].copy()
+        best = float(candidates.log_weight[:n].max())
+        i = self._hypotheses
+        for h in range(self._hypotheses):
+            hope = max(float(candidates.surprise[h]), 0.0)
+            per_s = self.priors.knock_per_s
+            if int(bank.doubts[h]) & self._table.all_ends:
+                per_s += self.priors.unseen_knock_per_s
+            rate = per_s * dt_s + hidden_knock
+            for j, log_rate in enumerate(jumps.log_rate):
+                log = float(log_rate) + math.log(rate if jumps.knock[j] else dt_s)
+                if stayed[h] + hope + log < best - least:
+                    continue
+                factor = jumps.factors[j, : jumps.ranks[j]]
+                self._node(i, h, j, float(bank.log_weight[h]) + log, factor, asked)
+                n = put(candidates, n, self._nodes, i, int(bank.doubts[h]), bank, asked)
+                i += 1
+        return n
+
+    def _node(self, i: int, h: int, jump: int, before: float, factor: Array, asked: Asked) -> None:
+        nodes = self._nodes
+        nodes.parent[i], nodes.jump[i], nodes.before[i] = h, jump, before
+        doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
+        prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
+
+    def _keep(self, n: int, asked: Asked) -> float:
+        bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates
+        most, least = (min(n, len(bank.doubts)), 0.0) if self._everything else (self.most, self.least)
+        merging = not self._everything
+        chosen, dropped = keep(candidates, n, nodes, bank, other, asked.seen, self._table, most, least, merging)
+        parents = nodes.parent[candidates.node[chosen]]
+        for old, new in zip(bank[4:], other[4:], strict=True):
+            new[: len(chosen)] = old[parents]
+        jumps = self._jumps
+        remember(other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes)
+        self._bank, self._other, self._hypotheses = other, bank, len(chosen)
+        return float(dropped)
+
+    def _not_known(self) -> None:
+        """Beside what explains nothing: the pose is anywhere a knock may have brought it."""
+        bank, n = self._bank, self._hypotheses
+        h = int(np.argmax(bank.log_weight[:n]))
+        if n == len(bank.log_weight):
+            n -= 1
+        for of in bank:
+            of[n] = of[h]
+        widest = self._jumps.factors[len(self.priors.any_way)]  # behind the small motion: knocks any way, by size
+        add_noise(bank, n, bank.mean[n], bank.covariance[n], widest)
+        bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
+        bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
+        self._hypotheses = n + 1
+
+    def _believed(self, dropped: float, surprise: float) -> Believed:
+        bank, n, mean = self._bank, self._hypotheses, np.empty(SIZE)
+        bounds.place(bank, n, mean)
+        left = 0.0 if self._lost else 0.5 * self.risk - dropped
+        asked = np.zeros((4, 3, SIZE))
+        asked[0, :, MOTION][:, :3] = asked[1, :, MOTION][:, 3:] = np.eye(3)
+        asked[2], asked[3] = asked[0], asked[1]
+        asked[2, :, REFERENCE][:, :3] = asked[3, :, REFERENCE][:, 3:] = np.eye(3)
+        floors = (bounds.SPLIT_M, bounds.SPLIT_RAD) * 2
+        levels = [float(bounds.bound(bank, n, mean, a, f, left)) for a, f in zip(asked, floors, strict=True)]
+        return Believed(mean[MOTION], mean[REFERENCE], *levels, dropped, surprise, not self._lost)
+
+
+def _diagonal(sigmas: Sequence[float]) -> Array:
+    rows = np.zeros((len(sigmas), SIZE))
+    rows[range(len(sigmas)), range(len(sigmas))] = sigmas
+    return rows
+

@@ -1,0 +1,202 @@
+"""What may be wrong with the edges: doubts, how often they begin and end, and what the fingers' ends tell of them.
+
+Each doubt is a chain of two states by itself.  Rates are per second, or per background that is new; never per frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.belief.state import Array, Flags, Ints, Seen
+from gripmon.model.compiled import compiled
+
+MOST_DOUBTS = 62
+"""Bits of a set."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """A doubt's probability at ``first``, and how it begins and leaves: ``per_s``, and ``per_background`` that is new."""
+
+    first: float
+    per_s: float
+    per_background: float = 0.0
+    leaves_per_s: float = 0.0
+    leaves_per_background: float = 0.0
+
+
+# Policy, from design: one edge in a hundred is mistaken at first; something is held or lies beside the fingers every 50 s,
+# and for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days.
+EDGE = Rates(1e-2, 1e-3, 5e-3, 0.0, 0.7)
+GROUP = Rates(1e-2, 0.02, leaves_per_s=0.2)
+ALL_ENDS = Rates(1e-1, 0.02, leaves_per_s=0.2)
+FINGER = Rates(1e-3, 1e-6)
+FOOLED_SHARE = 3.0 / 178.0
+"""Share of wrong ends at which the witnesses answer as at right ones: 3/n of the 178 wrong fits that were looked at, none
+of which did."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """``edges`` (e,) that are something else's while it lasts; ``ends`` (f,) of fingers that are then not the ends;
+    ``fooled``: the witnesses of these answer all the same as for right ones.  What is ``held`` moves with the gripper.
+    """
+
+    edges: Flags
+    rates: Rates
+    ends: Flags
+    held: bool = True
+    fooled: bool = False
+
+
+def of_edges(edges: int, fingers: int) -> list[Doubt]:
+    """Each edge by itself: it isn't held, but belongs to what is behind."""
+    return [Doubt(np.arange(edges) == e, EDGE, np.zeros(fingers, bool), held=False) for e in range(edges)]
+
+
+def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
+    """The ends of each finger, ``ends_of`` (e,) edges a finger, and of all; each once found by witnesses and once not."""
+    out, fingers = [], len(ends_of)
+    for fooled, share in ((False, 1.0 - FOOLED_SHARE), (True, FOOLED_SHARE)):
+        each = [(ends_of[f], np.arange(fingers) == f, GROUP) for f in range(fingers)]
+        all_of = [(np.any(ends_of, axis=0), np.ones(fingers, bool), ALL_ENDS)]
+        for edges, ends, rates in each + (all_of if fingers > 1 else []):
+            shared = Rates(rates.first * share, rates.per_s * share, leaves_per_s=rates.leaves_per_s)
+            if edges.any():
+                out.append(Doubt(edges, shared, ends, fooled=fooled))
+    return out
+
+
+class Table(NamedTuple):
+    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled`` and
+    ``all_ends`` as bits of doubts.  ``rates`` (d, 5) in the order of :class:`Rates`.
+    """
+
+    edges: Ints
+    ends: Ints
+    held: int
+    fooled: int
+    all_ends: int
+    rates: Array
+
+    @classmethod
+    def of(cls, doubts: Sequence[Doubt]) -> Table:
+        """ValueError for more doubts, or edges, than a set has bits."""
+        if max(len(doubts), len(doubts[0].edges)) > MOST_DOUBTS:
+            raise ValueError(f"{len(doubts)} doubts about {len(doubts[0].edges)} edges; at most {MOST_DOUBTS} of each")
+        ends = np.array([_bits([d.ends[f] for d in doubts]) for f in range(len(doubts[0].ends))], np.int64)
+        every = [bool(d.ends.any() and d.ends.all()) for d in doubts]
+        rates = np.array(
+            [
+                (d.rates.first, d.rates.per_s, d.rates.per_background, d.rates.leaves_per_s, d.rates.leaves_per_background)
+                for d in doubts
+            ]
+        )
+        return cls(
+            np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
+            _bits([d.fooled for d in doubts]), _bits(every), rates,
+        )  # fmt: skip
+
+
+class Chances(NamedTuple):
+    """Of one frame: logarithms of a doubt's staying and changing (2, d), from off (0) and on (1); ``silent`` (d,): about
+    one edge that isn't shown, it waits.
+    """
+
+    stay: Array
+    change: Array
+    silent: Flags
+
+
+class Onsets:
+    """How probable it is now that each doubt begins or ends; what wasn't asked meanwhile is asked when it is shown."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        self._waits = np.zeros(len(table.edges))  # log probability of not having begun unseen
+        self._leaves = np.zeros(len(table.edges))
+        self._first = True
+
+    def of(self, seen: Seen, dt_s: float) -> Chances:
+        """Of a frame, ``dt_s`` after the last one."""
+        table, first = self._table, self._first
+        rates = table.rates.T
+        shown = _bits(seen.shown)
+        alone = np.array([not (table.held >> d) & 1 for d in range(len(table.edges))])
+        silent = alone & ((table.edges & shown) == 0)
+        new = np.zeros(len(table.edges))
+        for d in np.flatnonzero(alone & ~silent):
+            new[d] = 1.0 - seen.likeness[int(table.edges[d]).bit_length() - 1]
+        if first:
+            self._waits += np.log1p(-rates[0])
+        else:
+            self._waits += np.log1p(-rates[2] * new) - rates[1] * dt_s
+            self._leaves += np.log1p(-rates[4] * new) - rates[3] * dt_s
+        begins = np.where(silent, 0.0, -np.expm1(self._waits))
+        ends = np.where(silent, 0.0, -np.expm1(self._leaves))
+        self._waits[~silent], self._leaves[~silent], self._first = 0.0, 0.0, False
+        with np.errstate(divide="ignore"):
+            change = np.log(np.array([begins, ends]))
+        return Chances(np.log1p(-np.array([begins, ends])), np.maximum(change, -1e6), silent)
+
+
+class Told(NamedTuple):
+    """What the fingers' ends show: log likelihood of each finger's answer where its ends are ``right`` and ``wrong``
+    (f,); ``repeats`` (f,): whether it is the answer of the frame before; ``memory``: probability that an answer is only
+    repeated.
+    """
+
+    right: Array
+    wrong: Array
+    repeats: Flags
+    memory: float
+
+
+def nothing_told(fingers: int) -> Told:
+    """No witness."""
+    return Told(np.zeros(fingers), np.zeros(fingers), np.zeros(fingers, bool), 0.0)
+
+
+@compiled
+def edges_of(doubts: int, edges: Ints) -> int:
+    """Bits of all edges that a set of doubts is about."""
+    out, k = 0, 0
+    while doubts >> k:
+        if (doubts >> k) & 1:
+            out |= edges[k]
+        k += 1
+    return out
+
+
+@compiled
+def log_transition(before: int, after: int, chances: Chances) -> float:
+    """Log probability of a set of doubts after another."""
+    total = 0.0
+    for k in range(len(chances.silent)):
+        on = (before >> k) & 1
+        total += chances.change[on, k] if (after >> k) & 1 != on else chances.stay[on, k]
+    return total
+
+
+@compiled
+def log_told(before: int, after: int, table: Table, told: Told, first: bool) -> float:
+    """Log likelihood of the witnesses.  An answer that repeats is little news while nothing changed that it is about."""
+    total = 0.0
+    for f in range(len(table.ends)):
+        bad, was = after & table.ends[f], before & table.ends[f]
+        right, was_right = bad == 0 or bad & table.fooled != 0, was == 0 or was & table.fooled != 0
+        log = told.right[f] if right else told.wrong[f]
+        if not first and (bad != 0) == (was != 0) and right == was_right:
+            again = told.memory if told.repeats[f] else 0.0
+            log = math.log(again + (1.0 - told.memory) * math.exp(log))
+        total += log
+    return total
+
+
+def _bits(flags: Sequence[bool] | Flags) -> int:
+    return int(sum(1 << int(k) for k in np.flatnonzero(np.asarray(flags))))

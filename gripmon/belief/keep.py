@@ -1,0 +1,130 @@
+"""Which hypotheses are kept: what says the same is one, what is too light goes and is counted.  Compiled."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gripmon.belief.doubts import Table, edges_of
+from gripmon.belief.nodes import Nodes, weigh
+from gripmon.belief.rows import add_noise, foreign, forward, learn
+from gripmon.belief.search import Candidates
+from gripmon.belief.state import SIZE, Bank, Ints, Seen
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+
+
+@compiled
+def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: Array, covariance: Array) -> None:
+    """``mean`` (23,), which is that before the frame, and ``covariance`` (23, 23) of g after it."""
+    root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
+    weigh(nodes, i, seen, doubted, held, root, solution)
+    half = np.empty((SIZE, SIZE))  # row j: root of M^-1 L', so that the covariance is half' half
+    for j in range(SIZE):
+        for k in range(SIZE):
+            half[j, k] = nodes.root[i, j, k]
+            mean[j] += nodes.root[i, j, k] * solution[k]
+        forward(root, half[j])
+    for j in range(SIZE):
+        for k in range(j + 1):
+            total = 0.0
+            for l in range(SIZE):
+                total += half[j, l] * half[k, l]
+            covariance[j, k] = covariance[k, j] = total
+
+
+@compiled
+def same_place(mean: Array, covariance: Array, other: Array, other_covariance: Array) -> bool:
+    """Whether two hypotheses say the same of d and the opening: means within a sigma of the surer, variances within a
+    factor of two.  Never a wide one with a narrow one: its tail is the bound.
+    """
+    for j in (0, 1, 2, 3, 4, 5, 18):
+        a, b, away = covariance[j, j], other_covariance[j, j], mean[j] - other[j]
+        if away * away > min(a, b) or max(a, b) > 2.0 * min(a, b):
+            return False
+    return True
+
+
+@compiled
+def keep(
+    candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int, least: float,
+    merging: bool,
+) -> tuple[Ints, float]:  # fmt: skip
+    """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, at most ``most``, none lighter than
+    ``least``, by moments where two are the same (``merging``); which candidate gives each its rows (k,), and the probability that was
+    dropped.
+    """
+    order = np.argsort(-candidates.log_weight[:n])
+    top, total = candidates.log_weight[order[0]], 0.0
+    for c in order:
+        total += math.exp(candidates.log_weight[c] - top)
+    chosen, k, lost = np.empty(min(most, n), np.int64), 0, 0.0
+    mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
+    for c in order:
+        weight = math.exp(candidates.log_weight[c] - top) / total
+        if weight < 1e-3 * least:
+            lost += weight
+            continue
+        i, doubts = candidates.node[c], candidates.doubts[c]
+        for j in range(SIZE):
+            mean[j] = bank.mean[nodes.parent[i], j]
+        doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
+        posterior(nodes, i, seen, doubted, held, mean, covariance)
+        twin = -1
+        for q in range(k if merging else 0):
+            if into.doubts[q] == doubts and same_place(into.mean[q], into.covariance[q], mean, covariance):
+                twin = q
+                break
+        if twin >= 0:
+            merge(into, twin, weight, mean, covariance)
+        elif k < most and weight >= least:
+            chosen[k], into.doubts[k], into.log_weight[k] = c, doubts, weight
+            for j in range(SIZE):
+                into.mean[k, j] = mean[j]
+                for l in range(SIZE):
+                    into.covariance[k, j, l] = covariance[j, l]
+            k += 1
+        else:
+            lost += weight
+    for q in range(k):
+        into.log_weight[q] = math.log(into.log_weight[q] / (1.0 - lost))
+    return chosen[:k], lost
+
+
+@compiled
+def merge(into: Bank, q: int, weight: float, mean: Array, covariance: Array) -> None:
+    """By moments; ``log_weight`` holds the weight itself meanwhile."""
+    share = weight / (into.log_weight[q] + weight)
+    into.log_weight[q] += weight
+    away = np.empty(SIZE)
+    for j in range(SIZE):
+        away[j] = mean[j] - into.mean[q, j]
+    for j in range(SIZE):
+        for l in range(SIZE):
+            into.covariance[q, j, l] += share * (covariance[j, l] - into.covariance[q, j, l])
+            into.covariance[q, j, l] += share * (1.0 - share) * away[j] * away[l]
+        into.mean[q, j] += share * away[j]
+
+
+@compiled
+def remember(
+    into: Bank, chosen: Ints, candidates: Candidates, nodes: Nodes, bank: Bank, factors: Array, ranks: Ints, seen: Seen,
+    table: Table, sizes: Array,
+) -> None:  # fmt: skip
+    """What the rows of the hypotheses kept, which are those of their parents as yet, learn from the frame and from a
+    jump before it (``factors`` (j, r, 23), of which ``ranks`` (j,) rows count).
+    """
+    for q in range(len(chosen)):
+        c = chosen[q]
+        h, jump = nodes.parent[candidates.node[c]], nodes.jump[candidates.node[c]]
+        if jump >= 0:
+            add_noise(into, q, bank.mean[h], bank.covariance[h].copy(), factors[jump, : ranks[jump]])
+        doubts = candidates.doubts[c]
+        doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
+        before = edges_of(bank.doubts[h], table.edges)
+        for edge in range(len(seen.shown)):
+            if (doubted >> edge) & 1:
+                foreign(into, q, seen, edge, (before >> edge) & 1 == 0, (held >> edge) & 1 == 1, sizes, True)
+            elif seen.shown[edge]:
+                learn(into, q, seen, edge)

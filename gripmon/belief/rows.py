@@ -1,0 +1,242 @@
+"""What a hypothesis remembers of each row given g, compiled: how it fades, moves with g, and learns.
+
+h hypotheses, e edges with two rows each, k states of a row; everything else as in :class:`~gripmon.belief.state.Bank`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gripmon.belief.state import FOREIGN_KINDS, SIZE, STILL, Bank, Seen
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+
+
+@compiled
+def root_of(matrix: Array, root: Array) -> float:
+    """Cholesky's lower ``root`` (n, n) of a positive ``matrix``; half the logarithm of its determinant, NaN if it isn't
+    positive.
+    """
+    half = 0.0
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= root[i, k] * root[j, k]
+            if j < i:
+                root[i, j] = rest / root[j, j]
+            elif rest > 0.0:
+                root[i, i] = math.sqrt(rest)
+                half += math.log(root[i, i])
+            else:
+                return math.nan
+        for j in range(i + 1, len(matrix)):
+            root[i, j] = 0.0
+    return half
+
+
+@compiled
+def forward(root: Array, values: Array) -> None:
+    """``values`` (n,) become root^-1 values."""
+    for i in range(len(root)):
+        total = values[i]
+        for k in range(i):
+            total -= root[i, k] * values[k]
+        values[i] = total / root[i, i]
+
+
+@compiled
+def backward(root: Array, values: Array) -> None:
+    """``values`` (n,) become root^-T values."""
+    for i in range(len(root) - 1, -1, -1):
+        total = values[i]
+        for k in range(i + 1, len(root)):
+            total -= root[k, i] * values[k]
+        values[i] = total / root[i, i]
+
+
+@compiled
+def move(bank: Bank, h: int, lag: float, light: float) -> None:
+    """p goes ``lag`` of the way to d, and the light keeps a share: both ways can be undone, so each row keeps exactly what
+    it knew.
+    """
+    mean, covariance, slope = bank.mean[h], bank.covariance[h], bank.slope[h]
+    for i in range(6, 12):
+        mean[i] += lag * (mean[i - 6] - mean[i])
+    mean[21] *= light
+    for j in range(SIZE):
+        for i in range(6, 12):
+            covariance[i, j] += lag * (covariance[i - 6, j] - covariance[i, j])
+        covariance[21, j] *= light
+    for i in range(SIZE):
+        for j in range(6, 12):
+            covariance[i, j] += lag * (covariance[i, j - 6] - covariance[i, j])
+        covariance[i, 21] *= light
+    for q in range(slope.shape[0]):
+        for k in range(slope.shape[1]):
+            own = slope[q, k]  # A g = A F^-1 g'
+            for i in range(6, 12):
+                own[i] /= 1.0 - lag
+                own[i - 6] -= lag * own[i]
+            own[21] /= light
+
+
+@compiled
+def gains(covariance: Array, factor: Array, gain: Array, between: Array, root: Array) -> None:
+    """What adding noise B'B (``factor`` B (r, 23)) to g does: ``covariance`` becomes P' = P + B'B, ``gain`` (r, 23) is
+    B P'^-1, and ``between`` (r, r) is 1 - B P'^-1 B', the covariance of the noise once g' is known.
+    """
+    r = len(factor)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            for k in range(r):
+                covariance[i, j] += factor[k, i] * factor[k, j]
+    root_of(covariance, root)
+    for k in range(r):
+        for i in range(SIZE):
+            gain[k, i] = factor[k, i]
+        forward(root, gain[k])
+        backward(root, gain[k])
+    for k in range(r):
+        for l in range(r):
+            total = 1.0 if k == l else 0.0
+            for i in range(SIZE):
+                total -= gain[k, i] * factor[l, i]
+            between[k, l] = total
+
+
+@compiled
+def shift_row(mean: Array, factor: Array, gain: Array, slope: Array, along: Array) -> float:
+    """Change one state's ``slope`` (23,) to what it is given g' = g + w, and return how its offset changes; ``along`` (r,)
+    receives slope B', by which the noise is in it.
+    """
+    moved = 0.0
+    for k in range(len(factor)):
+        total = 0.0
+        for i in range(SIZE):
+            total += slope[i] * factor[k, i]
+        along[k] = total
+    for k in range(len(factor)):
+        at = 0.0
+        for i in range(SIZE):
+            at += gain[k, i] * mean[i]
+            slope[i] -= along[k] * gain[k, i]
+        moved += along[k] * at
+    return moved
+
+
+@compiled
+def add_noise(bank: Bank, h: int, mean: Array, covariance: Array, factor: Array) -> None:
+    """g gets noise with covariance B'B (``factor`` B (r, 23)): each row keeps its joint law with g', exactly.  What the
+    noise ties between rows is dropped (p takes most of it).  Of g that is before it, ``mean`` (23,) and ``covariance``
+    (23, 23), the latter becomes that after it.
+    """
+    r, states = len(factor), bank.offset.shape[2]
+    gain, between, root = np.empty((r, SIZE)), np.empty((r, r)), np.empty((SIZE, SIZE))
+    along = np.empty((states, r))
+    gains(covariance, factor, gain, between, root)
+    for q in range(bank.offset.shape[1]):
+        for k in range(states):
+            bank.offset[h, q, k] += shift_row(mean, factor, gain, bank.slope[h, q, k], along[k])
+        for k in range(states):
+            for l in range(states):
+                total = 0.0
+                for i in range(r):
+                    for j in range(r):
+                        total += along[k, i] * between[i, j] * along[l, j]
+                bank.spread[h, q, k, l] += total
+
+
+@compiled
+def fade(bank: Bank, h: int, seen: Seen) -> None:
+    """The errors before the backgrounds that are behind the edges now: as like them as the pictures are."""
+    for q in range(bank.offset.shape[1]):
+        edge = q // 2
+        if not seen.shown[edge]:
+            continue
+        s, rho = 1 + seen.background[edge], seen.likeness[edge]
+        bank.offset[h, q, s] *= rho
+        for i in range(SIZE):
+            bank.slope[h, q, s, i] *= rho
+        for k in range(bank.offset.shape[2]):
+            bank.spread[h, q, s, k] *= rho
+            bank.spread[h, q, k, s] *= rho
+        bank.spread[h, q, s, s] += (1.0 - rho * rho) * seen.strength[edge]
+
+
+@compiled
+def learn(bank: Bank, h: int, seen: Seen, edge: int) -> None:
+    """Both rows of an edge that is taken for the gripper's own."""
+    states, s = bank.offset.shape[2], 1 + seen.background[edge]
+    gain, line = np.empty(states), np.empty(SIZE)
+    for row in range(2):
+        q = 2 * edge + row
+        offset, slope, spread = bank.offset[h, q], bank.slope[h, q], bank.spread[h, q]
+        variance = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s] + seen.white[edge, row]
+        missing = seen.measured[edge, row] - offset[0] - offset[s]
+        for i in range(SIZE):
+            line[i] = seen.rows[edge, row, i] + slope[0, i] + slope[s, i]
+        for k in range(states):
+            gain[k] = spread[k, 0] + spread[k, s]
+        for k in range(states):
+            share = gain[k] / variance
+            offset[k] += share * missing
+            for i in range(SIZE):
+                slope[k, i] -= share * line[i]
+            for l in range(states):
+                spread[k, l] -= share * gain[l]
+
+
+@compiled
+def log_sum(a: float, b: float) -> float:
+    """log(exp(a) + exp(b))."""
+    return max(a, b) + math.log1p(math.exp(-abs(a - b)))
+
+
+@compiled
+def foreign(bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, keep: bool) -> float:
+    """Log likelihood of an edge that is another thing's, by ``sizes`` (2,), variances of near and far, px^2.
+
+    It lies anywhere around where it was searched, and stays there while the picture does; ``held`` moves with the gripper
+    and stays in any case.  ``fresh``: the doubt begins.  ``keep``: it is learnt, and what wasn't shown fades.
+    """
+    shown, strength = seen.shown[edge], seen.strength[edge]
+    like = seen.likeness[edge] if shown else 1.0
+    stays = 1.0 if held or like >= STILL else like
+    logs = np.empty(FOREIGN_KINDS)
+    for kind in range(FOREIGN_KINDS):
+        logs[kind] = -math.log(2.0) if fresh else bank.kind[h, edge, kind]
+        for row in range(2):
+            place, back = bank.place[h, edge, kind, row, 0], bank.place[h, edge, kind, row, 1]
+            pp, pb = bank.place_spread[h, edge, kind, row, 0], bank.place_spread[h, edge, kind, row, 1]
+            bb = bank.place_spread[h, edge, kind, row, 2]
+            at = bank.searched[h, edge, row]
+            if fresh:
+                place, back, pp, pb, bb, at = 0.0, 0.0, sizes[kind], 0.0, strength, seen.searched[edge, row]
+            else:
+                place, back = stays * place, like * back
+                pp = stays * stays * pp + (1.0 - stays * stays) * sizes[kind]
+                pb, bb = stays * like * pb, like * like * bb + (1.0 - like * like) * strength
+            if shown:
+                missing = seen.measured[edge, row] - at - place - back
+                variance = pp + 2.0 * pb + bb + seen.white[edge, row]
+                logs[kind] -= 0.5 * (missing * missing / variance + math.log(2.0 * math.pi * variance))
+                of_place, of_back = (pp + pb) / variance, (pb + bb) / variance
+                place, back = place + of_place * missing, back + of_back * missing
+                pp, pb, bb = (
+                    pp - of_place * of_place * variance,
+                    pb - of_place * of_back * variance,
+                    bb - of_back * of_back * variance,
+                )
+            if keep:
+                bank.searched[h, edge, row] = at
+                bank.place[h, edge, kind, row, 0], bank.place[h, edge, kind, row, 1] = place, back
+                bank.place_spread[h, edge, kind, row, 0], bank.place_spread[h, edge, kind, row, 1] = pp, pb
+                bank.place_spread[h, edge, kind, row, 2] = bb
+    total = log_sum(logs[0], logs[1])
+    if keep:
+        for kind in range(FOREIGN_KINDS):
+            bank.kind[h, edge, kind] = logs[kind] - total
+    return total

@@ -1,0 +1,161 @@
+"""Which sets of doubts explain a frame: the search that decides whether a bound can be trusted.
+
+From every hypothesis, and from what it finds, it goes on to the sets with one doubt more or less, each weighed exactly;
+without it one frame in five is beyond its bound, at any risk (``docs/integrity.md``).  Compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.belief.doubts import Chances, Table, Told, edges_of, log_told, log_transition
+from gripmon.belief.nodes import Nodes, weigh, without
+from gripmon.belief.state import SIZE, Bank, Flags, Ints, Seen
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+
+MOST_ROUNDS = 8
+AT_ONCE = 8
+"""Sets from which a round goes on, and rounds: four rounds of eight found all that more did (sampled)."""
+
+
+IMPOSSIBLE = -1e5
+"""A logarithm of no probability."""
+
+
+class Candidates(NamedTuple):
+    """c sets: ``node`` (c,), ``doubts`` (c,) as bits, ``log_weight`` (c,) after the frame, not normalised, ``surprise``
+    (c,); ``expanded`` (c,): its neighbours were weighed.
+    """
+
+    node: Ints
+    doubts: Ints
+    log_weight: Array
+    surprise: Array
+    expanded: Flags
+
+    @classmethod
+    def empty(cls, sets: int) -> Candidates:
+        """Zeros."""
+        return cls(
+            np.zeros(sets, np.int64), np.zeros(sets, np.int64), np.zeros(sets), np.zeros(sets), np.zeros(sets, bool)
+        )
+
+
+class Asked(NamedTuple):
+    """A frame: its edges, the doubts and their chances, what witnesses told, and whether it is the first."""
+
+    seen: Seen
+    table: Table
+    chances: Chances
+    told: Told
+    first: bool
+
+
+@compiled
+def known(candidates: Candidates, n: int, node: int, doubts: int) -> bool:
+    """Whether a set of a node is among the first ``n``."""
+    for c in range(n):
+        if candidates.doubts[c] == doubts and candidates.node[c] == node:
+            return True
+    return False
+
+
+@compiled
+def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank: Bank, asked: Asked) -> int:
+    """One more candidate, weighed; the number of them."""
+    if n >= len(candidates.node) or known(candidates, n, i, doubts):
+        return n
+    root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
+    table, before = asked.table, bank.doubts[nodes.parent[i]]
+    log, surprise = weigh(
+        nodes, i, asked.seen, edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges), root, solution
+    )
+    log += nodes.before[i] + log_transition(before, doubts, asked.chances)
+    candidates.node[n], candidates.doubts[n] = i, doubts
+    candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first)
+    candidates.surprise[n], candidates.expanded[n] = surprise, False
+    return n + 1
+
+
+@compiled
+def put_all(candidates: Candidates, n: int, nodes: Nodes, i: int, bank: Bank, asked: Asked) -> int:
+    """Every set of doubts that is possible."""
+    for doubts in range(1 << len(asked.table.edges)):
+        if log_transition(bank.doubts[nodes.parent[i]], doubts, asked.chances) < IMPOSSIBLE:
+            continue
+        n = put(candidates, n, nodes, i, doubts, bank, asked)
+    return n
+
+
+@compiled
+def put_pairs(candidates: Candidates, n: int, nodes: Nodes, i: int, bank: Bank, asked: Asked) -> int:
+    """Every set of one and two doubts: before anything is known, their likelihoods are no guide."""
+    for j in range(len(asked.table.edges)):
+        for k in range(j + 1):
+            n = put(candidates, n, nodes, i, (1 << j) | (1 << k), bank, asked)
+    return n
+
+
+@compiled
+def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank, asked: Asked, floor: float) -> int:
+    """Candidates with one doubt more or less than ``c``, heavier than ``floor``; the number of all.  A doubt about an
+    edge that another one covers changes nothing that can be seen: it is left as it is.
+    """
+    i, doubts, table, seen = candidates.node[c], candidates.doubts[c], asked.table, asked.seen
+    before = bank.doubts[nodes.parent[i]]
+    root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
+    covered, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
+    log, _ = weigh(nodes, i, seen, covered, held, root, solution)
+    candidates.expanded[c] = True
+    for k in range(len(table.edges)):
+        changed = doubts ^ (1 << k)
+        if asked.chances.silent[k]:
+            continue
+        if (table.held >> k) & 1 == 0:
+            edge = 0
+            while (table.edges[k] >> edge) & 1 == 0:
+                edge += 1
+            if (held >> edge) & 1:
+                continue
+            own = (covered >> edge) & 1 == 0
+            gain = without(nodes, i, edge, root, solution, own) - nodes.free[i, edge]
+            weight = log - gain if own else log + gain
+            weight += nodes.before[i] + log_transition(before, changed, asked.chances)
+            weight += log_told(before, changed, table, asked.told, asked.first)
+            if weight < floor:
+                continue
+        m = put(candidates, n, nodes, i, changed, bank, asked)
+        if m > n and candidates.log_weight[n] < floor:
+            continue
+        n = m
+    return n
+
+
+@compiled
+def search(candidates: Candidates, n: int, nodes: Nodes, bank: Bank, asked: Asked, reach: float, least: float) -> int:
+    """Go on from all candidates within ``reach`` (a logarithm) of the best until none is left; those lighter than
+    ``least`` (another) are left out.  The number of candidates.
+    """
+    best = -math.inf
+    for c in range(n):
+        best = max(best, candidates.log_weight[c])
+    for r in range(MOST_ROUNDS):
+        at_once = n if r == 0 else AT_ONCE
+        order = np.argsort(-candidates.log_weight[:n])
+        done = 0
+        for c in order:
+            if candidates.log_weight[c] < best - reach or done >= at_once:
+                break
+            if candidates.expanded[c]:
+                continue
+            n = neighbours(candidates, n, c, nodes, bank, asked, best - least)
+            done += 1
+        for c in range(n):
+            best = max(best, candidates.log_weight[c])
+        if done == 0:
+            break
+    return n

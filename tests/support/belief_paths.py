@@ -1,0 +1,149 @@
+"""The belief by definition: the sum over all paths of sets of doubts, with dense Gaussians over all rows of all frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.belief.doubts import Doubt
+from gripmon.belief.state import Array, Priors, Seen
+
+STILL = 0.99
+
+
+class Told(NamedTuple):
+    """A frame with the probability of each finger's answer where its ends are right and wrong."""
+
+    seen: Seen
+    right: Array
+    wrong: Array
+    repeats: Array
+    memory: float
+
+
+class Sum(NamedTuple):
+    """Probability of each set at the end, mean and covariance of g."""
+
+    weights: dict[int, float]
+    mean: Array
+    covariance: Array
+
+
+def sum_of_paths(doubts: Sequence[Doubt], priors: Priors, frames: Sequence[Told], dt_s: float, paths: Iterable) -> Sum:
+    cache: dict[bytes, tuple[float, Array, Array]] = {}
+    logs, means, covariances, ends = [], [], [], []
+    for path in paths:
+        log = _chains(doubts, frames, dt_s, path) + _witnesses(doubts, frames, path)
+        if log == -math.inf:
+            continue
+        on = [[d for i, d in enumerate(doubts) if s >> i & 1] for s in path]
+        bad = np.array([np.any([d.edges for d in o], axis=0) if o else np.zeros(len(doubts[0].edges), bool) for o in on])
+        held = np.array([np.any([d.edges & d.held for d in o] or [0 * doubts[0].edges], axis=0) for o in on]).astype(bool)
+        key = bad.tobytes() + held.tobytes()
+        if key not in cache:
+            cache[key] = _gaussian(priors, frames, bad, held)
+        rows, mean, covariance = cache[key]
+        logs.append(log + rows)
+        means.append(mean)
+        covariances.append(covariance)
+        ends.append(path[-1])
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    mean = weights @ np.array(means)
+    spread = sum(w * (c + np.outer(m - mean, m - mean)) for w, m, c in zip(weights, means, covariances, strict=True))
+    by_set = {s: float(weights[np.array(ends) == s].sum()) for s in set(ends)}
+    return Sum(by_set, mean, spread)
+
+
+def _chains(doubts: Sequence[Doubt], frames: Sequence[Told], dt_s: float, path: Sequence[int]) -> float:
+    log = 0.0
+    for i, d in enumerate(doubts):
+        for t, frame in enumerate(frames):
+            new = 0.0 if d.held else 1.0 - float(frame.seen.likeness[d.edges][0])
+            r = d.rates
+            begins = r.first if t == 0 else 1.0 - (1.0 - r.per_background * new) * math.exp(-r.per_s * dt_s)
+            leaves = 1.0 - (1.0 - r.leaves_per_background * new) * math.exp(-r.leaves_per_s * dt_s)
+            was, now = (path[t - 1] >> i & 1 if t else 0), path[t] >> i & 1
+            p = (1.0 - leaves if now else leaves) if was else (begins if now else 1.0 - begins)
+            log += math.log(p) if p > 0.0 else -math.inf
+    return log
+
+
+def _witnesses(doubts: Sequence[Doubt], frames: Sequence[Told], path: Sequence[int]) -> float:
+    log = 0.0
+    for f in range(len(doubts[0].ends)):
+        states = []
+        for s in path:
+            about = [d for i, d in enumerate(doubts) if s >> i & 1 and d.ends[f]]
+            states.append((bool(about), not about or any(d.fooled for d in about)))
+        for t, frame in enumerate(frames):
+            p = float((frame.right if states[t][1] else frame.wrong)[f])
+            if t and states[t] == states[t - 1]:
+                p = frame.memory * bool(frame.repeats[f]) + (1.0 - frame.memory) * p
+            log += math.log(p)
+    return log
+
+
+def _normal(values: Array, covariance: Array) -> float:
+    _, half = np.linalg.slogdet(covariance)
+    return float(-0.5 * (values @ np.linalg.solve(covariance, values) + half + len(values) * math.log(2.0 * math.pi)))
+
+
+def _faded(frames: Sequence[Told], edge: int, i: int, j: int, stays: Array | None = None) -> float:
+    """Correlation between frames i and j of what fades by the likeness, or of what stays."""
+    out = 1.0
+    for q in range(min(i, j) + 1, max(i, j) + 1):
+        if frames[q].seen.shown[edge]:
+            like = float(frames[q].seen.likeness[edge])
+            out *= like if stays is None else (1.0 if stays[q] or like >= STILL else like)
+    return out
+
+
+def _gaussian(priors: Priors, frames: Sequence[Told], bad: Array, held: Array) -> tuple[float, Array, Array]:
+    edges, log = bad.shape[1], 0.0
+    for e in range(edges):
+        log += sum(_stretch(priors, frames, e, a, b, held[:, e]) for a, b in _stretches(bad[:, e]))
+    at = [(t, e, r) for t in range(len(frames)) for e in range(edges) for r in (0, 1) if frames[t].seen.shown[e] and not bad[t, e]]
+    prior = priors.covariance()
+    if not at:
+        return log, np.zeros(len(prior)), prior
+    rows = np.array([frames[t].seen.rows[e, r] for t, e, r in at])
+    values = np.array([frames[t].seen.measured[e, r] for t, e, r in at])
+    noise = np.zeros((len(at), len(at)))
+    for a, (i, e, r) in enumerate(at):
+        for b, (j, other, row) in enumerate(at):
+            if (e, r) == (other, row):
+                strength = float(frames[i].seen.strength[e])
+                noise[a, b] = priors.lasting_px**2 + strength * _faded(frames, e, i, j)
+                noise[a, b] += float(frames[i].seen.white[e, r]) if i == j else 0.0
+    covariance = rows @ prior @ rows.T + noise
+    gain = prior @ rows.T @ np.linalg.inv(covariance)
+    left = np.eye(len(prior)) - gain @ rows
+    return log + _normal(values, covariance), gain @ values, left @ prior @ left.T + gain @ noise @ gain.T
+
+
+def _stretches(bad: Array) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _stretch(priors: Priors, frames: Sequence[Told], edge: int, start: int, end: int, held: Array) -> float:
+    shown = [t for t in range(start, end) if frames[t].seen.shown[edge]]
+    if not shown:
+        return 0.0
+    parts = []
+    for size in (priors.near_px, priors.far_px):
+        part = math.log(0.5)
+        for r in (0, 1):
+            values = [float(frames[t].seen.measured[edge, r] - frames[start].seen.searched[edge, r]) for t in shown]
+            covariance = np.array([[
+                size**2 * _faded(frames, edge, i, j, held)
+                + float(frames[i].seen.strength[edge]) * _faded(frames, edge, i, j)
+                + (float(frames[i].seen.white[edge, r]) if i == j else 0.0)
+                for j in shown] for i in shown])  # fmt: skip
+            part += _normal(np.array(values), covariance)
+        parts.append(part)
+    return float(np.logaddexp(*parts))
