@@ -41,19 +41,26 @@ NOT_KNOWN_WEIGHT = 0.1
 _MOST_CANDIDATES = 4096
 
 
-class Believed(NamedTuple):
-    """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place; bounds
-    ``position_m`` and ``rotation_rad`` of the former, and ``absolute_m`` and ``absolute_rad`` of both together, infinite
-    where there is none; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False
-    while nothing explains what is seen.
+class Bound(NamedTuple):
+    """``position_m`` and ``rotation_rad`` of the motion since the reference, ``absolute_m`` and ``absolute_rad`` of it and
+    the reference's error together; infinite where there is none.
     """
 
-    motion: Array
-    reference_error: Array
     position_m: float
     rotation_rad: float
     absolute_m: float
     absolute_rad: float
+
+
+class Believed(NamedTuple):
+    """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place, and their
+    ``bound``; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False while nothing
+    explains what is seen.
+    """
+
+    motion: Array
+    reference_error: Array
+    bound: Bound
     dropped: float
     surprise: float
     known: bool
@@ -121,6 +128,7 @@ class Belief:
         self._bank.covariance[0] = self.priors.covariance()
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses, self._first, self._lost = 1, True, False
+        self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
     @property
     def weights(self) -> dict[int, float]:
@@ -253,14 +261,19 @@ class Belief:
     def _believed(self, dropped: float, surprise: float) -> Believed:
         bank, n, mean = self._bank, self._hypotheses, np.empty(SIZE)
         bounds.place(bank, n, mean)
-        left = 0.0 if self._lost else 0.5 * self.risk - dropped
+        self._dropped, self._mean = dropped, mean
+        return Believed(mean[MOTION], mean[REFERENCE], self.bound(self.risk), dropped, surprise, not self._lost)
+
+    def bound(self, risk: float) -> Bound:
+        """Of the last frame, at another risk; that of the filter is the smallest for which enough is kept."""
+        left = 0.0 if self._lost else 0.5 * risk - self._dropped
         asked = np.zeros((4, 3, SIZE))
         asked[0, :, MOTION][:, :3] = asked[1, :, MOTION][:, 3:] = np.eye(3)
         asked[2], asked[3] = asked[0], asked[1]
         asked[2, :, REFERENCE][:, :3] = asked[3, :, REFERENCE][:, 3:] = np.eye(3)
         floors = (bounds.SPLIT_M, bounds.SPLIT_RAD) * 2
-        levels = [float(bounds.bound(bank, n, mean, a, f, left)) for a, f in zip(asked, floors, strict=True)]
-        return Believed(mean[MOTION], mean[REFERENCE], *levels, dropped, surprise, not self._lost)
+        of = (self._bank, self._hypotheses, self._mean)
+        return Bound(*(float(bounds.bound(*of, a, f, left)) for a, f in zip(asked, floors, strict=True)))
 
 
 def _diagonal(sigmas: Sequence[float]) -> Array:

@@ -137,25 +137,26 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
 
 @compiled
 def search(candidates: Candidates, n: int, nodes: Nodes, bank: Bank, asked: Asked, reach: float, least: float) -> int:
-    """Go on from all candidates within ``reach`` (a logarithm) of the best until none is left; those lighter than
-    ``least`` (another) are left out.  The number of candidates.
+    """Go on from every hypothesis that was within ``reach`` (a logarithm) of certain before the frame, then from what is
+    within it of the best now, until nothing is left; what is lighter than ``least`` (another) is left out.  The number of
+    candidates.
     """
     best = -math.inf
     for c in range(n):
         best = max(best, candidates.log_weight[c])
-    for r in range(MOST_ROUNDS):
-        at_once = n if r == 0 else AT_ONCE
-        order = np.argsort(-candidates.log_weight[:n])
-        done = 0
-        for c in order:
-            if candidates.log_weight[c] < best - reach or done >= at_once:
-                break
-            if candidates.expanded[c]:
-                continue
+    for c in range(n):
+        if nodes.before[candidates.node[c]] > -reach:
             n = neighbours(candidates, n, c, nodes, bank, asked, best - least)
-            done += 1
+    for _ in range(MOST_ROUNDS):
         for c in range(n):
             best = max(best, candidates.log_weight[c])
+        done = 0
+        for c in np.argsort(-candidates.log_weight[:n]):
+            if candidates.log_weight[c] < best - reach or done >= AT_ONCE:
+                break
+            if not candidates.expanded[c]:
+                n = neighbours(candidates, n, c, nodes, bank, asked, best - least)
+                done += 1
         if done == 0:
             break
     return n

@@ -8,6 +8,7 @@ import sys
 
 from benchmarks import (
     accuracy,
+    belief,
     causes,
     correction,
     drift,
@@ -28,6 +29,7 @@ from benchmarks import (
 
 _BENCHMARKS = (
     accuracy,
+    belief,
     causes,
     correction,
     drift,
