@@ -12,14 +12,15 @@ from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
 SPLIT_M, SPLIT_RAD = 1e-5, 1e-4
-"""Added to each sigma in squares, for what dropping the ties between rows makes too certain (measured with 17 states)."""
+"""Added to each sigma in squares, for what dropping the ties between rows makes too certain (measured with 17 states).
+"""
 _HALVINGS = 40
 
 
 @compiled
 def place(bank: Bank, n: int, mean: Array) -> int:
-    """The heaviest hypothesis of ``n``; ``mean`` (23,) becomes that of all that say the same as it, whatever they doubt:
-    it doesn't jump between doubts.
+    """The heaviest hypothesis of ``n``; ``mean`` (23,) becomes that of all that say the same as it, whatever they
+    doubt: it doesn't jump between doubts.
     """
     best = 0
     for h in range(n):
@@ -83,12 +84,12 @@ def bound(bank: Bank, n: int, mean: Array, asked: Array, floor: float, risk: flo
                 total = floor * floor if i == k else 0.0
                 for j in range(SIZE):
                     if asked[i, j] != 0.0:
-                        for l in range(SIZE):
-                            total += asked[i, j] * bank.covariance[h, j, l] * asked[k, l]
+                        for m in range(SIZE):
+                            total += asked[i, j] * bank.covariance[h, j, m] * asked[k, m]
                 covariance[i, k] = total
         values = np.linalg.eigvalsh(covariance)
         away[h], sigma[h] = math.sqrt(square), math.sqrt(values[2])
-        # P(|e| > L) <= erfc times this, for L beyond a sigma: the two other axes integrated out (Gaussian, independent).
+        # P(|e| > L) <= erfc times this, for L beyond a sigma: the two other axes, independent, integrated out.
         narrow = (1.0 - values[1] / values[2]) * (1.0 - values[0] / values[2])
         spread[h] = 1.0 / math.sqrt(max(narrow, 1e-6))
     return level(weights, away, sigma, spread, risk)

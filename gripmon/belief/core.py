@@ -27,12 +27,12 @@ from gripmon.belief.state import (
     OPENING,
     REFERENCE,
     SIZE,
-    Array,
     Bank,
     Ints,
     Priors,
     Seen,
 )
+from gripmon.model.records import Array
 
 GUARD = 30.0
 """Surprise (a logarithm) of the best hypothesis beyond which no hypothesis is believed: e^-30 is none of the risks."""
@@ -42,8 +42,8 @@ _MOST_CANDIDATES = 4096
 
 
 class Bound(NamedTuple):
-    """``position_m`` and ``rotation_rad`` of the motion since the reference, ``absolute_m`` and ``absolute_rad`` of it and
-    the reference's error together; infinite where there is none.
+    """``position_m`` and ``rotation_rad`` of the motion since the reference, ``absolute_m`` and ``absolute_rad`` of it
+    and the reference's error together; infinite where there is none.
     """
 
     position_m: float
@@ -54,8 +54,8 @@ class Bound(NamedTuple):
 
 class Believed(NamedTuple):
     """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place, and their
-    ``bound``; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False while nothing
-    explains what is seen.
+    ``bound``; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False while
+    nothing explains what is seen.
     """
 
     motion: Array
@@ -67,8 +67,8 @@ class Believed(NamedTuple):
 
 
 class Jumps(NamedTuple):
-    """What moves at once: log share and rate per second ``log_rate`` (j,), with ``factors`` (j, 6, 23) of its covariance,
-    of which ``ranks`` (j,) rows count; ``knock`` (j,): the rate is that of knocks, ``log_rate`` its share.
+    """What moves at once: log share and rate per second ``log_rate`` (j,), with ``factors`` (j, 6, 23) of its
+    covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): the rate is that of knocks, ``log_rate`` its share.
     """
 
     log_rate: Array
@@ -104,14 +104,14 @@ class Jumps(NamedTuple):
 
 class Belief:
     """Of one gripper with e edges.  ``along`` (3,): the fingers' direction in camera axes; ``risk`` of each of position
-    and rotation together; at most ``most`` hypotheses are kept, and ``backgrounds`` remembered per edge.  ``everything``:
-    all sets of doubts are weighed and none is merged or dropped, for tests with few doubts.  ``searching`` False leaves
-    the search out, which a test shows to be wrong.
+    and rotation together; at most ``most`` hypotheses are kept, and ``backgrounds`` remembered per edge.
+    ``everything``: all sets of doubts are weighed and none is merged or dropped, for tests with few doubts.
+    ``searching`` False leaves the search out, which a test shows to be wrong.
     """
 
     def __init__(
-        self, doubts: Sequence[Doubt], along: Array, priors: Priors | None = None, *, risk: float = 1e-5, most: int = 64,
-        backgrounds: int = 1, everything: bool = False, searching: bool = True,
+        self, doubts: Sequence[Doubt], along: Array, priors: Priors | None = None, *, risk: float = 1e-5,
+        most: int = 64, backgrounds: int = 1, everything: bool = False, searching: bool = True,
     ) -> None:  # fmt: skip
         self.priors, self.risk, self.most = priors or Priors(), risk, most
         self.least = risk * 1e-3
@@ -151,9 +151,9 @@ class Belief:
     def update(
         self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0, hidden_knock: float = 0.0
     ) -> Believed:
-        """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else 0.
-        ``hidden_knock``: probability of a knock that is due in this frame because no end is seen (policy; once for each
-        such stretch), beside that of the rate; hypotheses that doubt all ends have it in any case.
+        """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
+        0. ``hidden_knock``: probability of a knock that is due in this frame because no end is seen (policy; once for
+        each such stretch), beside that of the rate; hypotheses that doubt all ends have it in any case.
         """
         first = self._first
         if not first:
@@ -184,7 +184,7 @@ class Belief:
 
     def _branch(self, asked: Asked, dt_s: float, hidden_knock: float) -> int:
         """Candidates of a frame; their number."""
-        bank, nodes, candidates, table = self._bank, self._nodes, self._candidates, self._table
+        bank, nodes, candidates = self._bank, self._nodes, self._candidates
         nothing = np.zeros((0, SIZE))
         n = 0
         for h in range(self._hypotheses):
@@ -240,7 +240,9 @@ class Belief:
         for old, new in zip(bank[4:], other[4:], strict=True):
             new[: len(chosen)] = old[parents]
         jumps = self._jumps
-        remember(other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes)
+        remember(
+            other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
+        )
         self._bank, self._other, self._hypotheses = other, bank, len(chosen)
         return float(dropped)
 
@@ -280,4 +282,3 @@ def _diagonal(sigmas: Sequence[float]) -> Array:
     rows = np.zeros((len(sigmas), SIZE))
     rows[range(len(sigmas)), range(len(sigmas))] = sigmas
     return rows
-

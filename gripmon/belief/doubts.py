@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.belief.state import Array, Flags, Ints, Seen
+from gripmon.belief.state import Flags, Ints, Seen
 from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
 
 MOST_DOUBTS = 62
 """Bits of a set."""
@@ -30,15 +31,16 @@ class Rates:
     leaves_per_background: float = 0.0
 
 
-# Policy, from design: one edge in a hundred is mistaken at first; something is held or lies beside the fingers every 50 s,
-# and for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days.
+# Policy, from design: one edge in a hundred is mistaken at first; something is held or lies beside the fingers every
+# 50 s, for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days.
 EDGE = Rates(1e-2, 1e-3, 5e-3, 0.0, 0.7)
 GROUP = Rates(1e-2, 0.02, leaves_per_s=0.2)
 ALL_ENDS = Rates(1e-1, 0.02, leaves_per_s=0.2)
 FINGER = Rates(1e-3, 1e-6)
 FOOLED_SHARE = 3.0 / 178.0
-"""Share of wrong ends at which the witnesses answer as at right ones: 3/n of the 178 wrong fits that were looked at, none
-of which did."""
+"""Share of wrong ends at which the witnesses answer as at right ones: 3/n of the 178 wrong fits that were looked at,
+none of which did.
+"""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
 
 
 class Table(NamedTuple):
-    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled`` and
-    ``all_ends`` as bits of doubts.  ``rates`` (d, 5) in the order of :class:`Rates`.
+    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled``
+    and ``all_ends`` as bits of doubts.  ``rates`` (d, 5) in the order of :class:`Rates`.
     """
 
     edges: Ints
@@ -93,7 +95,13 @@ class Table(NamedTuple):
         every = [bool(d.ends.any() and d.ends.all()) for d in doubts]
         rates = np.array(
             [
-                (d.rates.first, d.rates.per_s, d.rates.per_background, d.rates.leaves_per_s, d.rates.leaves_per_background)
+                (
+                    d.rates.first,
+                    d.rates.per_s,
+                    d.rates.per_background,
+                    d.rates.leaves_per_s,
+                    d.rates.leaves_per_background,
+                )
                 for d in doubts
             ]
         )
@@ -104,8 +112,8 @@ class Table(NamedTuple):
 
 
 class Chances(NamedTuple):
-    """Of one frame: logarithms of a doubt's staying and changing (2, d), from off (0) and on (1); ``silent`` (d,): about
-    one edge that isn't shown, it waits.
+    """Of one frame: logarithms of a doubt's staying and changing (2, d), from off (0) and on (1); ``silent`` (d,):
+    about one edge that isn't shown, it waits.
     """
 
     stay: Array

@@ -29,8 +29,8 @@ def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: A
     for j in range(SIZE):
         for k in range(j + 1):
             total = 0.0
-            for l in range(SIZE):
-                total += half[j, l] * half[k, l]
+            for m in range(SIZE):
+                total += half[j, m] * half[k, m]
             covariance[j, k] = covariance[k, j] = total
 
 
@@ -48,12 +48,12 @@ def same_place(mean: Array, covariance: Array, other: Array, other_covariance: A
 
 @compiled
 def keep(
-    candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int, least: float,
-    merging: bool,
+    candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int,
+    least: float, merging: bool,
 ) -> tuple[Ints, float]:  # fmt: skip
     """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, at most ``most``, none lighter than
-    ``least``, by moments where two are the same (``merging``); which candidate gives each its rows (k,), and the probability that was
-    dropped.
+    ``least``, by moments where two are the same (``merging``); which candidate gives each its rows (k,), and the
+    probability that was dropped.
     """
     order = np.argsort(-candidates.log_weight[:n])
     top, total = candidates.log_weight[order[0]], 0.0
@@ -82,8 +82,8 @@ def keep(
             chosen[k], into.doubts[k], into.log_weight[k] = c, doubts, weight
             for j in range(SIZE):
                 into.mean[k, j] = mean[j]
-                for l in range(SIZE):
-                    into.covariance[k, j, l] = covariance[j, l]
+                for m in range(SIZE):
+                    into.covariance[k, j, m] = covariance[j, m]
             k += 1
         else:
             lost += weight
@@ -101,9 +101,9 @@ def merge(into: Bank, q: int, weight: float, mean: Array, covariance: Array) -> 
     for j in range(SIZE):
         away[j] = mean[j] - into.mean[q, j]
     for j in range(SIZE):
-        for l in range(SIZE):
-            into.covariance[q, j, l] += share * (covariance[j, l] - into.covariance[q, j, l])
-            into.covariance[q, j, l] += share * (1.0 - share) * away[j] * away[l]
+        for m in range(SIZE):
+            into.covariance[q, j, m] += share * (covariance[j, m] - into.covariance[q, j, m])
+            into.covariance[q, j, m] += share * (1.0 - share) * away[j] * away[m]
         into.mean[q, j] += share * away[j]
 
 

@@ -22,10 +22,10 @@ from gripmon.model.records import Array
 
 
 class Nodes(NamedTuple):
-    """n nodes: a hypothesis (``parent`` (n,)) that jumped (``jump`` (n,), -1 for none) before the frame, with log weight
-    ``before`` (n,).  ``root`` L (n, 23, 23); whitened ``rows`` w (n, e, 2, 23) and ``missing`` zeta (n, e, 2); ``base``
-    (n, e), what of an edge's log likelihood depends on no set; ``free`` and ``held`` (n, e), its log likelihood as
-    another thing's; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown.
+    """n nodes: a hypothesis (``parent`` (n,)) that jumped (``jump`` (n,), -1 for none) before the frame, with log
+    weight ``before`` (n,).  ``root`` L (n, 23, 23); whitened ``rows`` w (n, e, 2, 23) and ``missing`` zeta (n, e, 2);
+    ``base`` (n, e), what of an edge's log likelihood depends on no set; ``free`` and ``held`` (n, e), its log
+    likelihood as another thing's; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown.
     """
 
     parent: Ints
@@ -53,7 +53,9 @@ class Nodes(NamedTuple):
 
 @compiled
 def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen, sizes: Array, doubted: int) -> None:
-    """Node ``i``: hypothesis ``h``, whose edges ``doubted`` (bits) it doubted before, after noise ``factor`` (r, 23) on g."""
+    """Node ``i``: hypothesis ``h``, whose edges ``doubted`` (bits) it doubted before, after noise ``factor`` (r, 23) on
+    g.
+    """
     mean, r = bank.mean[h], len(factor)
     covariance, gain, between = bank.covariance[h].copy(), np.empty((r, SIZE)), np.empty((r, r))
     root, along, line = nodes.root[i], np.empty(r), np.empty(SIZE)
@@ -115,10 +117,12 @@ def add_row(information: Array, pull: Array, white: Array, zeta: float, sign: fl
 
 
 @compiled
-def weigh(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, root: Array, solution: Array) -> tuple[float, float]:
-    """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper; and the surprise:
-    by how much the squares of its own rows exceed what is expected, halved.  ``root`` (23, 23) of M and ``solution`` (23,)
-    M^-1 b are left behind.
+def weigh(
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, root: Array, solution: Array
+) -> tuple[float, float]:
+    """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper; and the
+    surprise: by how much the squares of its own rows exceed what is expected, halved.  ``root`` (23, 23) of M and
+    ``solution`` (23,) M^-1 b are left behind.
     """
     information, pull = np.empty((SIZE, SIZE)), np.empty(SIZE)
     for j in range(SIZE):

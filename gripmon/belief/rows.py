@@ -13,6 +13,9 @@ from gripmon.belief.state import FOREIGN_KINDS, SIZE, STILL, Bank, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
+LEAST_APART = 1e-8
+"""Standard deviation, m and rad, of what p gains in a frame beside d: of rows it changes 1e-10 px^2."""
+
 
 @compiled
 def root_of(matrix: Array, root: Array) -> float:
@@ -59,8 +62,8 @@ def backward(root: Array, values: Array) -> None:
 
 @compiled
 def move(bank: Bank, h: int, lag: float, light: float) -> None:
-    """p goes ``lag`` of the way to d, and the light keeps a share: both ways can be undone, so each row keeps exactly what
-    it knew.
+    """p goes ``lag`` of the way to d, and the light keeps a share: both ways can be undone, so each row keeps exactly
+    what it knew.
     """
     mean, covariance, slope = bank.mean[h], bank.covariance[h], bank.slope[h]
     for i in range(6, 12):
@@ -74,6 +77,8 @@ def move(bank: Bank, h: int, lag: float, light: float) -> None:
         for j in range(6, 12):
             covariance[i, j] += lag * (covariance[i, j - 6] - covariance[i, j])
         covariance[i, 21] *= light
+    for i in range(6):  # without creep p comes so near d that the covariance would have no root
+        covariance[6 + i, 6 + i] += LEAST_APART**2
     for q in range(slope.shape[0]):
         for k in range(slope.shape[1]):
             own = slope[q, k]  # A g = A F^-1 g'
@@ -100,17 +105,17 @@ def gains(covariance: Array, factor: Array, gain: Array, between: Array, root: A
         forward(root, gain[k])
         backward(root, gain[k])
     for k in range(r):
-        for l in range(r):
-            total = 1.0 if k == l else 0.0
+        for m in range(r):
+            total = 1.0 if k == m else 0.0
             for i in range(SIZE):
-                total -= gain[k, i] * factor[l, i]
-            between[k, l] = total
+                total -= gain[k, i] * factor[m, i]
+            between[k, m] = total
 
 
 @compiled
 def shift_row(mean: Array, factor: Array, gain: Array, slope: Array, along: Array) -> float:
-    """Change one state's ``slope`` (23,) to what it is given g' = g + w, and return how its offset changes; ``along`` (r,)
-    receives slope B', by which the noise is in it.
+    """Change one state's ``slope`` (23,) to what it is given g' = g + w, and return how its offset changes; ``along``
+    (r,) receives slope B', by which the noise is in it.
     """
     moved = 0.0
     for k in range(len(factor)):
@@ -141,12 +146,12 @@ def add_noise(bank: Bank, h: int, mean: Array, covariance: Array, factor: Array)
         for k in range(states):
             bank.offset[h, q, k] += shift_row(mean, factor, gain, bank.slope[h, q, k], along[k])
         for k in range(states):
-            for l in range(states):
+            for m in range(states):
                 total = 0.0
                 for i in range(r):
                     for j in range(r):
-                        total += along[k, i] * between[i, j] * along[l, j]
-                bank.spread[h, q, k, l] += total
+                        total += along[k, i] * between[i, j] * along[m, j]
+                bank.spread[h, q, k, m] += total
 
 
 @compiled
@@ -185,8 +190,8 @@ def learn(bank: Bank, h: int, seen: Seen, edge: int) -> None:
             offset[k] += share * missing
             for i in range(SIZE):
                 slope[k, i] -= share * line[i]
-            for l in range(states):
-                spread[k, l] -= share * gain[l]
+            for m in range(states):
+                spread[k, m] -= share * gain[m]
 
 
 @compiled
@@ -199,8 +204,8 @@ def log_sum(a: float, b: float) -> float:
 def foreign(bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, keep: bool) -> float:
     """Log likelihood of an edge that is another thing's, by ``sizes`` (2,), variances of near and far, px^2.
 
-    It lies anywhere around where it was searched, and stays there while the picture does; ``held`` moves with the gripper
-    and stays in any case.  ``fresh``: the doubt begins.  ``keep``: it is learnt, and what wasn't shown fades.
+    It lies anywhere around where it was searched, and stays there while the picture does; ``held`` moves with the
+    gripper and stays in any case.  ``fresh``: the doubt begins.  ``keep``: it is learnt, and what wasn't shown fades.
     """
     shown, strength = seen.shown[edge], seen.strength[edge]
     like = seen.likeness[edge] if shown else 1.0

@@ -58,10 +58,7 @@ class Asked(NamedTuple):
 @compiled
 def known(candidates: Candidates, n: int, node: int, doubts: int) -> bool:
     """Whether a set of a node is among the first ``n``."""
-    for c in range(n):
-        if candidates.doubts[c] == doubts and candidates.node[c] == node:
-            return True
-    return False
+    return bool(np.any((candidates.doubts[:n] == doubts) & (candidates.node[:n] == node)))
 
 
 @compiled
@@ -137,9 +134,9 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
 
 @compiled
 def search(candidates: Candidates, n: int, nodes: Nodes, bank: Bank, asked: Asked, reach: float, least: float) -> int:
-    """Go on from every hypothesis that was within ``reach`` (a logarithm) of certain before the frame, then from what is
-    within it of the best now, until nothing is left; what is lighter than ``least`` (another) is left out.  The number of
-    candidates.
+    """Go on from every hypothesis that was within ``reach`` (a logarithm) of certain before the frame, then from what
+    is within it of the best now, until nothing is left; what is lighter than ``least`` (another) is left out.  The
+    number of candidates.
     """
     best = -math.inf
     for c in range(n):

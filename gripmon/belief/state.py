@@ -1,9 +1,9 @@
 """What a hypothesis holds, and the numbers that it begins with.
 
-A hypothesis is a set of doubts, one Gaussian over g (23 quantities that all edges share) and a log weight.  What only one
-edge has, how far off it is for good and before the present background, is kept for each of its two rows *given g*:
+A hypothesis is a set of doubts, one Gaussian over g (23 quantities that all edges share) and a log weight.  What only
+one edge has, how far off it is for good and before the present background, is kept for each of its two rows *given g*:
 
-    u | g  ~  N(a + A g, C),     u = (lasting error, error before each remembered background)
+u | g  ~  N(a + A g, C),     u = (lasting error, error before each remembered background)
 
 so that nothing of the size of g and all edges together is ever formed, and an edge that is measured again before the
 same background tells nothing twice.  A doubted edge says nothing of g: it lies near or far from where it was searched.
@@ -52,13 +52,13 @@ class Priors:
     """Standard deviations, and rates per second, fixed before any benchmark; see ``docs/integrity.md``.
 
     Of the reference's error b (6,), m and rad; of the jaw opening and the finger lengths, m; of the light, px; of the
-    focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is for
-    good.  ``near_px`` and ``far_px``: where another thing's edge is found, by the width of an edge and by the reach of
-    the search.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.  ``small_per_s``: how
-    often it moves by ``small_m``, ``small_rad`` an axis.  ``knock_per_s``: one knock a month, of log-normal size, median
-    3 mm, 1 to 10 mm, as three Gaussians (``any_way``: standard deviation and share) in 2 of 3, else along the fingers;
-    ``unseen_knock_per_s``: more where all ends are doubted, 1e-3 in 5 s (policy: what hides them is what knocks).
-    ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``.
+    focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is
+    for good.  ``near_px`` and ``far_px``: where another thing's edge is found, by the width of an edge and by the reach
+    of the search.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.  ``small_per_s``:
+    how often it moves by ``small_m``, ``small_rad`` an axis.  ``knock_per_s``: one knock a month, of log-normal size,
+    median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``: standard deviation and share) in 2 of 3, else along the
+    fingers; ``unseen_knock_per_s``: more where all ends are doubted, 1e-3 in 5 s (policy: what hides them is what
+    knocks). ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``.
     """
 
     reference: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2)
@@ -93,9 +93,9 @@ class Priors:
 class Bank(NamedTuple):
     """h hypotheses of e edges (2 e rows), k - 1 remembered backgrounds: ``log_weight`` (h,), ``doubts`` (h,) as bits;
     ``mean`` (h, 23) and ``covariance`` (h, 23, 23) of g; each row's u given g: ``offset`` a (h, 2 e, k), ``slope`` A
-    (h, 2 e, k, 23), ``spread`` C (h, 2 e, k, k), px.  Of doubted edges ``searched`` (h, e, 2), px, where they were looked
-    for when the doubt began; by kind (near, far) its log share ``kind`` (h, e, 2), and of each row (place, background)
-    the ``place`` (h, e, 2, 2, 2) and its variances and covariance ``place_spread`` (h, e, 2, 2, 3).
+    (h, 2 e, k, 23), ``spread`` C (h, 2 e, k, k), px.  Of doubted edges ``searched`` (h, e, 2), px, where they were
+    looked for when the doubt began; by kind (near, far) its log share ``kind`` (h, e, 2), and of each row (place,
+    background) the ``place`` (h, e, 2, 2, 2) and its variances and covariance ``place_spread`` (h, e, 2, 2, 3).
     """
 
     log_weight: Array
@@ -122,11 +122,11 @@ class Bank(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """A frame's edges.  ``rows`` (e, 2, 23): how offset at the middle and slope times half the length, px, change with g
-    (zero for p), ``measured`` (e, 2) and ``white`` (e, 2), the variance of what is new in every frame, px^2; ``shown``
-    (e,); ``background`` (e,), the remembered one that is behind the edge now; ``likeness`` (e,) of it to when it was last
-    seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2; ``searched`` (e, 2), where the
-    edges were looked for, px.
+    """A frame's edges.  ``rows`` (e, 2, 23): how offset at the middle and slope times half the length, px, change with
+    g (zero for p), ``measured`` (e, 2) and ``white`` (e, 2), the variance of what is new in every frame, px^2;
+    ``shown`` (e,); ``background`` (e,), the remembered one that is behind the edge now; ``likeness`` (e,) of it to when
+    it was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2; ``searched`` (e,
+    2), where the edges were looked for, px.
     """
 
     rows: Array

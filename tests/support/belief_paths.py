@@ -40,8 +40,12 @@ def sum_of_paths(doubts: Sequence[Doubt], priors: Priors, frames: Sequence[Told]
         if log == -math.inf:
             continue
         on = [[d for i, d in enumerate(doubts) if s >> i & 1] for s in path]
-        bad = np.array([np.any([d.edges for d in o], axis=0) if o else np.zeros(len(doubts[0].edges), bool) for o in on])
-        held = np.array([np.any([d.edges & d.held for d in o] or [0 * doubts[0].edges], axis=0) for o in on]).astype(bool)
+        bad = np.array(
+            [np.any([d.edges for d in o], axis=0) if o else np.zeros(len(doubts[0].edges), bool) for o in on]
+        )
+        held = np.array([np.any([d.edges & d.held for d in o] or [0 * doubts[0].edges], axis=0) for o in on]).astype(
+            bool
+        )
         key = bad.tobytes() + held.tobytes()
         if key not in cache:
             cache[key] = _gaussian(priors, frames, bad, held)
@@ -106,7 +110,13 @@ def _gaussian(priors: Priors, frames: Sequence[Told], bad: Array, held: Array) -
     edges, log = bad.shape[1], 0.0
     for e in range(edges):
         log += sum(_stretch(priors, frames, e, a, b, held[:, e]) for a, b in _stretches(bad[:, e]))
-    at = [(t, e, r) for t in range(len(frames)) for e in range(edges) for r in (0, 1) if frames[t].seen.shown[e] and not bad[t, e]]
+    at = [
+        (t, e, r)
+        for t in range(len(frames))
+        for e in range(edges)
+        for r in (0, 1)
+        if frames[t].seen.shown[e] and not bad[t, e]
+    ]
     prior = priors.covariance()
     if not at:
         return log, np.zeros(len(prior)), prior

@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -25,7 +25,17 @@ from gripmon.belief.state import Priors
 FRAMES = 120
 RISKS = (1e-2, 1e-3, 1e-4)
 ALERT_M, ALERT_RAD = 1e-3, math.radians(1.0)
-SEARCHED = ("knock_per_s", "small_per_s", "small_m", "lasting_px", "near_px", "far_px", "creep_m_s", "length_m", "light_px")
+SEARCHED = (
+    "knock_per_s",
+    "small_per_s",
+    "small_m",
+    "lasting_px",
+    "near_px",
+    "far_px",
+    "creep_m_s",
+    "length_m",
+    "light_px",
+)
 """Priors that ``--sensitivity`` changes by three, in the belief alone."""
 
 
@@ -35,7 +45,7 @@ class Setup:
 
     fault: str | None = None
     differs: tuple[str, ...] = ()
-    priors: Priors = Priors()
+    priors: Priors = field(default_factory=Priors)
     searching: bool = True
     most: int = 64
 
@@ -139,9 +149,14 @@ def sampled(seed: int, runs: int, jobs: int, differs: tuple[str, ...], setup: Se
         print(row(fault, forced), flush=True)
         weight = probability(fault, Priors()) * (10.0 if "rates" in differs else 1.0)
         risk += weight * np.array([np.mean([r.beyond[k] / r.frames for r in forced]) for k in range(len(RISKS))])
-    print("\nsampled risk over stated risk: " + ", ".join(f"{s / r:.2g} at {r:.0e}" for s, r in zip(risk, RISKS, strict=True)))
+    print(
+        "\nsampled risk over stated risk: "
+        + ", ".join(f"{s / r:.2g} at {r:.0e}" for s, r in zip(risk, RISKS, strict=True))
+    )
     cpu = 1e3 * np.concatenate([r.cpu_s[1:] for r in usual])
-    print(f"a frame: median {np.median(cpu):.2f} ms, 99 % {np.quantile(cpu, 0.99):.2f} ms of processor time\n", flush=True)
+    print(
+        f"a frame: median {np.median(cpu):.2f} ms, 99 % {np.quantile(cpu, 0.99):.2f} ms of processor time\n", flush=True
+    )
 
 
 def handle(arguments: argparse.Namespace) -> int:
@@ -153,7 +168,11 @@ def handle(arguments: argparse.Namespace) -> int:
         for name in SEARCHED:
             for factor in (1.0 / 3.0, 3.0):
                 priors = replace(Priors(), **{name: factor * asdict(Priors())[name]})
-                runs = many(range(arguments.seed, arguments.seed + arguments.runs), replace(setup, priors=priors), arguments.jobs)
+                runs = many(
+                    range(arguments.seed, arguments.seed + arguments.runs),
+                    replace(setup, priors=priors),
+                    arguments.jobs,
+                )
                 print(row(f"{name} x {factor:.2g}", runs), flush=True)
         return 0
     print(f"{arguments.world} world\n")
@@ -164,7 +183,9 @@ def handle(arguments: argparse.Namespace) -> int:
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("belief", description=__doc__, help="sampled risk of the belief's bound")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--runs", type=int, default=60, help="without a rare fault; a sixth of them with each (default 60)")
+    parser.add_argument(
+        "--runs", type=int, default=60, help="without a rare fault; a sixth of them with each (default 60)"
+    )
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--most", type=int, default=64, help="hypotheses kept (default 64)")
     parser.add_argument("--world", choices=("own", "second", *SECOND), default="own")

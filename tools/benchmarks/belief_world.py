@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.belief.doubts import ALL_ENDS, FINGER, GROUP, Doubt, Told, of_edges, of_ends
-from gripmon.belief.state import FOCAL, LIGHT, MOTION, OPENING, REFERENCE, SIZE, STILL, Priors, Seen
+from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
+from gripmon.belief.state import FOCAL, LIGHT, MOTION, OPENING, SIZE, STILL, Priors, Seen
 from gripmon.model.records import Array
 
 Flags = NDArray[np.bool_]
@@ -41,7 +41,9 @@ class View:
 
 
 class Edge(NamedTuple):
-    """Of a finger (0, 1): ``ends`` (2, 3), m, in the gripper; it may be an ``inner`` one, of the ``side`` 0, 1 (2: across)."""
+    """Of a finger (0, 1): ``ends`` (2, 3), m, in the gripper; it may be an ``inner`` one, of the ``side`` 0, 1 (2:
+    across).
+    """
 
     finger: int
     along: bool
@@ -53,9 +55,7 @@ class Edge(NamedTuple):
 def view(rng: np.random.Generator) -> View:
     """Fingers along -y of the gripper, the jaw along x, seen from 30 degrees above."""
     gap, tilt = rng.uniform(0.02, 0.06), math.radians(30.0 + rng.uniform(-8.0, 8.0))
-    rotation = np.array(
-        [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
-    )
+    rotation = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
     at = np.array([rng.uniform(-0.008, 0.008), rng.uniform(-0.006, 0.006), _DISTANCE_M])
     edges = _edges(gap)
     count = int(rng.integers(8, 17))
@@ -74,7 +74,12 @@ def _edges(gap: float) -> list[Edge]:
     out = []
     for finger, sign in ((0, -1.0), (1, 1.0)):
         near, far, half = sign * gap / 2.0, sign * (gap / 2.0 + 0.01), 0.005
-        for x, z, inner, side in ((near, -half, True, 0), (far, -half, False, 0), (far, half, False, 1), (near, half, True, 1)):
+        for x, z, inner, side in (
+            (near, -half, True, 0),
+            (far, -half, False, 0),
+            (far, half, False, 1),
+            (near, half, True, 1),
+        ):
             out.append(Edge(finger, True, inner, side, np.array([[x, 0.04, z], [x, 0.0, z]])))
         for a, b, inner, side in (
             ((near, -half), (far, -half), False, 0),
@@ -147,12 +152,13 @@ SECOND = ("tails", "rates", "likeness")
 
 
 class World:
-    """One run.  ``fault`` (of FAULTS, or None) is forced once; what of SECOND ``differs`` from the belief's model: errors
-    with heavy tails, more frequent faults and motions, a likeness of moving pictures that is told wrong by 0.3.
+    """One run.  ``fault`` (of FAULTS, or None) is forced once; what of SECOND ``differs`` from the belief's model:
+    errors with heavy tails, more frequent faults and motions, a likeness of moving pictures that is told wrong by 0.3.
     """
 
     def __init__(
-        self, rng: np.random.Generator, priors: Priors, frames: int, fault: str | None = None, differs: Collection[str] = ()
+        self, rng: np.random.Generator, priors: Priors, frames: int, fault: str | None = None,
+        differs: Collection[str] = (),
     ) -> None:  # fmt: skip
         self.view, self._rng, self._priors, self._fault, self._differs = view(rng), rng, priors, fault, differs
         edges = len(self.view.along)
