@@ -249,7 +249,7 @@ def test_without_the_search_the_bound_is_false() -> None:
 
 @pytest.mark.parametrize(("fault", "within"), [(None, 0.9), ("knock", 0.7), ("opening", 0.8)])
 def test_sampled_runs_stay_within_their_bound(fault: str | None, within: float) -> None:
-    """Three runs each: at 1e-3 a bound that holds is passed in 1,080 frames by chance at most, and is worth something."""
+    """Three runs each: a bound at 1e-3 that holds is hardly ever passed in 360 frames, and is worth something."""
     from benchmarks import belief as belief_bench
 
     runs = [belief_bench.run(seed, belief_bench.Setup(fault=fault)) for seed in range(40, 43)]

@@ -22,7 +22,7 @@ MOST_DOUBTS = 62
 
 @dataclass(frozen=True)
 class Rates:
-    """A doubt's probability at ``first``, and how it begins and leaves: ``per_s``, and ``per_background`` that is new."""
+    """A doubt's probability at ``first``, and how it begins and leaves: ``per_s``, and per background that is new."""
 
     first: float
     per_s: float
@@ -62,7 +62,7 @@ def of_edges(edges: int, fingers: int) -> list[Doubt]:
 
 
 def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
-    """The ends of each finger, ``ends_of`` (e,) edges a finger, and of all; each once found by witnesses and once not."""
+    """The ends of each finger, ``ends_of`` (e,) edges a finger, and of all; each found by witnesses and not."""
     out, fingers = [], len(ends_of)
     for fooled, share in ((False, 1.0 - FOOLED_SHARE), (True, FOOLED_SHARE)):
         each = [(ends_of[f], np.arange(fingers) == f, GROUP) for f in range(fingers)]
@@ -193,7 +193,7 @@ def log_transition(before: int, after: int, chances: Chances) -> float:
 
 @compiled
 def log_told(before: int, after: int, table: Table, told: Told, first: bool) -> float:
-    """Log likelihood of the witnesses.  An answer that repeats is little news while nothing changed that it is about."""
+    """Log likelihood of the witnesses.  An answer that repeats is little news while what it is about stays."""
     total = 0.0
     for f in range(len(table.ends)):
         bad, was = after & table.ends[f], before & table.ends[f]

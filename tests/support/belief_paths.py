@@ -1,4 +1,4 @@
-"""The belief by definition: the sum over all paths of sets of doubts, with dense Gaussians over all rows of all frames."""
+"""The belief by definition: the sum over all paths of sets of doubts, dense Gaussians over all rows of all frames."""
 
 from __future__ import annotations
 
