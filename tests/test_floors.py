@@ -16,7 +16,7 @@ PACKAGE = ROOT / "gripmon"
 
 FLOORS = {
     "model": 0,
-    "track": 1,
+    "track": 1, "belief": 1,
     "judge": 2,
     "monitor": 3, "simulate": 3, "calibrate": 3,
     "laser": 4,

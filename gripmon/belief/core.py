@@ -128,6 +128,7 @@ class Belief:
         self._bank.covariance[0] = self.priors.covariance()
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses, self._first, self._lost = 1, True, False
+        self._began = np.zeros(1, bool)  # of each hypothesis: all ends are doubted since the last frame
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
     @property
@@ -152,7 +153,7 @@ class Belief:
         self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0, hidden_knock: float = 0.0
     ) -> Believed:
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
-        0. ``hidden_knock``: probability of a knock that is due in this frame because no end is seen (policy; once for
+        0. ``hidden_knock``: probability of a knock that is due in this frame because no end is shown (policy; once for
         each such stretch), beside that of the rate; hypotheses that doubt all ends have it in any case.
         """
         first = self._first
@@ -211,10 +212,9 @@ class Belief:
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0)
-            per_s = self.priors.knock_per_s
-            if int(bank.doubts[h]) & self._table.all_ends:
-                per_s += self.priors.unseen_knock_per_s
-            rate = per_s * dt_s + hidden_knock
+            rate = self.priors.knock_per_s * dt_s + hidden_knock
+            if self._began[h]:
+                rate += self.priors.unseen_knock
             for j, log_rate in enumerate(jumps.log_rate):
                 log = float(log_rate) + math.log(rate if jumps.knock[j] else dt_s)
                 if stayed[h] + hope + log < best - least:
@@ -243,6 +243,8 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
+        unseen, before = (of & self._table.all_ends != 0 for of in (other.doubts[: len(chosen)], bank.doubts[parents]))
+        self._began = unseen & ~before
         self._bank, self._other, self._hypotheses = other, bank, len(chosen)
         return float(dropped)
 
@@ -259,6 +261,7 @@ class Belief:
         bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
         bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
         self._hypotheses = n + 1
+        self._began = np.append(self._began[:n], False)
 
     def _believed(self, dropped: float, surprise: float) -> Believed:
         bank, n, mean = self._bank, self._hypotheses, np.empty(SIZE)

@@ -57,8 +57,8 @@ class Priors:
     of the search.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.  ``small_per_s``:
     how often it moves by ``small_m``, ``small_rad`` an axis.  ``knock_per_s``: one knock a month, of log-normal size,
     median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``: standard deviation and share) in 2 of 3, else along the
-    fingers; ``unseen_knock_per_s``: more where all ends are doubted, 1e-3 in 5 s (policy: what hides them is what
-    knocks). ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``.
+    fingers.  ``unseen_knock``: its probability each time that all ends begin to be doubted (policy: what hides them is
+    what knocks).  ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``.
     """
 
     reference: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2)
@@ -75,7 +75,7 @@ class Priors:
     small_m: float = 0.3e-3
     small_rad: float = 3e-3
     knock_per_s: float = 4e-7
-    unseen_knock_per_s: float = 2e-4
+    unseen_knock: float = 1e-3
     any_way: tuple[tuple[float, float], ...] = ((1.3e-3, 0.40), (2.6e-3, 0.45), (5.5e-3, 0.15))
     knock_rad: float = 20e-3
     along_share: float = 1.0 / 3.0

@@ -72,10 +72,15 @@ def run(seed: int, setup: Setup) -> Run:
     )
     beyond, available, frames = np.zeros(len(RISKS), int), np.zeros(len(RISKS), int), 0
     errors, bounds, dropped, cpu = [], [], [], []
+    hidden = False
     for t in range(FRAMES):
         sample = world.frame()
         start = time.thread_time()
-        believed = belief.update(sample.seen, DT_S, sample.told, light_memory=sample.light_memory)
+        was_hidden, hidden = hidden, not sample.seen.shown[~world.view.along].any()
+        believed = belief.update(
+            sample.seen, DT_S, sample.told, light_memory=sample.light_memory,
+            hidden_knock=setup.priors.unseen_knock if hidden and not was_hidden else 0.0,
+        )  # fmt: skip
         cpu.append(time.thread_time() - start)
         if t < world.at:
             continue
@@ -101,7 +106,7 @@ def probability(fault: str, priors: Priors) -> float:
     unseen = min(ALL_ENDS.first + ALL_ENDS.per_s * seconds, 1.0)
     return {
         "knock": priors.knock_per_s * seconds,
-        "knock unseen": priors.unseen_knock_per_s * unseen * min(seconds, 1.0 / ALL_ENDS.leaves_per_s),
+        "knock unseen": priors.unseen_knock * unseen,
         "finger": 2.0 * (FINGER.first + FINGER.per_s * seconds),
         "opening": priors.opening_per_s * seconds,
         "fooled": FOOLED_SHARE * unseen,
@@ -190,5 +195,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--most", type=int, default=64, help="hypotheses kept (default 64)")
     parser.add_argument("--world", choices=("own", "second", *SECOND), default="own")
     parser.add_argument("--search-off", action="store_true", help="without the search: has to fail")
-    parser.add_argument("--sensitivity", action="store_true", help="each prior times 3 and by 3, in the belief alone")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--sample", action="store_true", help="the risk of a world, by strata")
+    what.add_argument("--sensitivity", action="store_true", help="each prior times 3 and by 3, in the belief alone")
     parser.set_defaults(handler=handle)
