@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 from support.belief_paths import Told as Frame
 from support.belief_paths import sum_of_paths
 
+from gripmon.belief import bound
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import Doubt, Rates, Told
 from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
@@ -219,6 +221,20 @@ def test_an_edge_that_lies_still_beside_its_place_speaks_once() -> None:
         odds.append(np.log(belief.weights[1] / belief.weights[0]))
     assert odds[0] > 0.0
     assert max(odds) - min(odds) < 3.0
+
+
+@pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.5, 0.0), (0.8, 0.8), (0.95, 0.95), (0.95, 0.3), (1.0, 1.0)])
+def test_the_tail_of_an_error_in_three_dimensions_is_no_less_than_it_is(sigmas: tuple[float, float]) -> None:
+    """Against quadrature over the two shorter axes, a sigma of the longest being 1."""
+    at = np.linspace(-8.5, 8.5, 681)
+    weights = np.exp(-0.5 * at * at)
+    weights /= weights.sum()
+    short = (sigmas[0] * at[:, None]) ** 2 + (sigmas[1] * at[None, :]) ** 2
+    spread = 1.0 / np.sqrt(max((1.0 - sigmas[0] ** 2) * (1.0 - sigmas[1] ** 2), 1e-6))
+    for z in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
+        exact = weights @ special.erfc(np.sqrt(0.5 * np.maximum(z * z - short, 0.0))) @ weights
+        assert exact <= bound.tail(z, spread) * (1.0 + 1e-4)  # of the quadrature
+        assert bound.tail(z, spread) <= 1.7 * exact
 
 
 def test_what_nothing_explains_gives_no_bound() -> None:
