@@ -233,7 +233,7 @@ def test_the_tail_of_an_error_in_three_dimensions_is_no_less_than_it_is(sigmas: 
     spread = 1.0 / np.sqrt(max((1.0 - sigmas[0] ** 2) * (1.0 - sigmas[1] ** 2), 1e-6))
     for z in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
         exact = weights @ special.erfc(np.sqrt(0.5 * np.maximum(z * z - short, 0.0))) @ weights
-        assert exact <= bound.tail(z, spread) * (1.0 + 1e-4)  # of the quadrature
+        assert exact <= bound.tail(z, spread) * (1.0 + 3e-4)  # of the quadrature
         assert bound.tail(z, spread) <= 1.7 * exact
 
 
