@@ -63,10 +63,13 @@ def keep(
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
     for c in order:
         weight = math.exp(candidates.log_weight[c] - top) / total
-        if weight < 1e-3 * least:
+        i, doubts = candidates.node[c], candidates.doubts[c]
+        new, alike = k < most and weight >= least, False
+        for q in range(k if merging else 0):
+            alike = alike or into.doubts[q] == doubts
+        if not new and not alike:
             lost += weight
             continue
-        i, doubts = candidates.node[c], candidates.doubts[c]
         for j in range(SIZE):
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
@@ -78,7 +81,7 @@ def keep(
                 break
         if twin >= 0:
             merge(into, twin, weight, mean, covariance)
-        elif k < most and weight >= least:
+        elif new:
             chosen[k], into.doubts[k], into.log_weight[k] = c, doubts, weight
             for j in range(SIZE):
                 into.mean[k, j] = mean[j]

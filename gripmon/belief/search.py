@@ -58,7 +58,10 @@ class Asked(NamedTuple):
 @compiled
 def known(candidates: Candidates, n: int, node: int, doubts: int) -> bool:
     """Whether a set of a node is among the first ``n``."""
-    return bool(np.any((candidates.doubts[:n] == doubts) & (candidates.node[:n] == node)))
+    c = n - 1
+    while c >= 0 and (candidates.doubts[c] != doubts or candidates.node[c] != node):
+        c -= 1
+    return c >= 0
 
 
 @compiled
