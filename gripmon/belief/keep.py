@@ -47,6 +47,24 @@ def same_place(mean: Array, covariance: Array, other: Array, other_covariance: A
 
 
 @compiled
+def same_doubts(one: int, other: int, table: Table) -> bool:
+    """Whether two sets doubt the same edges, held alike, and the same ends, which witnesses are fooled about alike.
+
+    The ends of all fingers, or of each: they differ in nothing that is seen before one of them leaves.
+    """
+    if one == other:
+        return True
+    held = edges_of(one & table.held, table.edges) == edges_of(other & table.held, table.edges)
+    if not held or edges_of(one, table.edges) != edges_of(other, table.edges):
+        return False
+    for f in range(len(table.ends)):
+        a, b = one & table.ends[f], other & table.ends[f]
+        if (a != 0) != (b != 0) or (a & table.fooled != 0) != (b & table.fooled != 0):
+            return False
+    return True
+
+
+@compiled
 def keep(
     candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int,
     least: float, merging: bool,
@@ -66,7 +84,7 @@ def keep(
         i, doubts = candidates.node[c], candidates.doubts[c]
         new, alike = k < most and weight >= least, False
         for q in range(k if merging else 0):
-            alike = alike or into.doubts[q] == doubts
+            alike = alike or same_doubts(into.doubts[q], doubts, table)
         if not new and not alike:
             lost += weight
             continue
@@ -76,7 +94,9 @@ def keep(
         posterior(nodes, i, seen, doubted, held, mean, covariance)
         twin = -1
         for q in range(k if merging else 0):
-            if into.doubts[q] == doubts and same_place(into.mean[q], into.covariance[q], mean, covariance):
+            if same_doubts(into.doubts[q], doubts, table) and same_place(
+                into.mean[q], into.covariance[q], mean, covariance
+            ):
                 twin = q
                 break
         if twin >= 0:
