@@ -94,9 +94,9 @@ def keep(
         posterior(nodes, i, seen, doubted, held, mean, covariance)
         twin = -1
         for q in range(k if merging else 0):
-            if same_doubts(into.doubts[q], doubts, table) and same_place(
-                into.mean[q], into.covariance[q], mean, covariance
-            ):
+            if not same_doubts(into.doubts[q], doubts, table):
+                continue
+            if same_place(into.mean[q], into.covariance[q], mean, covariance):
                 twin = q
                 break
         if twin >= 0:
