@@ -32,7 +32,8 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, trust
-from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, CommonError, Opened
+from gripmon.monitor.common import CommonError
+from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, Opened
 from gripmon.monitor.tracker import Tracker
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.since import AtReference, Bounds, CommonError, Differences, Opened
+from gripmon.monitor.common import CommonError
+from gripmon.monitor.since import AtReference, Bounds, Differences, Opened
 from gripmon.track.integrity import Doubts, Separation
 
 SIGMA_INFLATION = 1.2

@@ -19,9 +19,10 @@ from gripmon.monitor.bounds import (
     doubts_since,
     unbounded,
 )
+from gripmon.monitor.common import CommonError, Tilt
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import Bounds, CommonError
+from gripmon.monitor.since import Bounds
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import Measurement, inner_edges, sides
 from gripmon.track.edges.words import in_words
@@ -53,8 +54,9 @@ class Possible:
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         self._kept: dict[bytes, About] = {}
         self.lasting = Lasting.of(self.hypotheses(np.arange(len(gripper.edge_ids))))
-        scale_sigma, taught, offset = gripper.model.scale_sigma, tracker.taught_error, tracker.taught_offset
-        common = CommonError(scale_sigma, taught, offset) if scale_sigma or len(taught) or offset.any() else None
+        file, taught, offset = gripper.model, tracker.taught_error, tracker.taught_offset
+        wrong = file.scale_sigma or file.tilt_sigma_rad or len(taught) or offset.any()
+        common = CommonError(file.scale_sigma, taught, offset, Tilt.of(gripper, cam_T_grip)) if wrong else None
         of_each = gripper.edge_finger, len(gripper.finger_ids)
         self.model = ModelError(tracker.model_sigma_m, tracker.finger_axis, *of_each, common)
 

@@ -9,21 +9,21 @@ both poses: ``x E (x_b E)^-1 = x x_b^-1``, whatever the motion (``docs/integrity
 What doesn't cancel: a gripper larger by a factor 1 + s is seen farther away by it, so that the translation of d is
 larger, too; as the jaws move, the reported travel contradicts the image by s times the travel, which the fit turns into
 a motion; edges taught at a reference that is wrong by an angle, or by a part of its distance, are off by that part of
-the motion; a longer finger moves a fit by its visible edges, which may be others than then.
+the motion, and so are those of a file whose plane is tilted (:mod:`~gripmon.monitor.common`); a longer finger moves a
+fit by its visible edges, which may be others than then.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, invert, log_rotation, skew
+from gripmon.model.geometry import from_record, invert, skew
 from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
@@ -36,8 +36,9 @@ from gripmon.model.records import (
     SinceReference,
     ValidBy,
 )
+from gripmon.monitor.common import CommonError
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Doubts, Separation, of_motion, with_known
+from gripmon.track.integrity import Separation, of_motion, with_known
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -93,43 +94,6 @@ class Opened(NamedTuple):
             return cls(0.0, np.zeros(6))
         known = max(measurement.jaw_known_sigma_m**2, covariance[6, 6])  # exact: as certain as the fit
         return cls(measurement.jaw_opening_m, covariance[:6, 6] / known if known > 0.0 else np.zeros(6))
-
-
-class CommonError(NamedTuple):
-    """What no frame tells, since all are off by it alike: ``scale_sigma``, the standard deviation of a factor on all
-    lengths of the gripper file (a larger gripper farther away gives the same image); ``taught`` (k, 6), the error of
-    the reference at which edges were taught, by one standard deviation along each of k directions; ``offset`` (6,), how
-    far off that reference the teaching images showed the gripper.
-    """
-
-    scale_sigma: float
-    taught: Array
-    offset: Array
-
-    def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
-        """The fits near a pose (4, 4) with it."""
-        farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
-        parts = np.vstack([self.taught, farther])
-        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
-        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
-
-    def reaching(self, doubts: Doubts) -> Doubts:
-        """The doubts, each farther away by the offset: it is measured, so it counts once, not as a deviation."""
-        lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
-        return replace(doubts, away=doubts.away + lengths[:, None])
-
-    def of_motion(self, motion: Array, at_T: Array) -> Array:
-        """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T
-        (4, 4): the motion times the reference's error, which is an angle, or a length over the distance.
-        """
-        rows = np.vstack([self.taught, self.offset])
-        if self.scale_sigma >= SIZE_UNKNOWN:
-            # Along the line of sight it is the size, of which the motion is a part.
-            sight = at_T[:3, 3] / np.linalg.norm(at_T[:3, 3])
-            rows[:, :3] -= np.outer(rows[:, :3] @ sight, sight)
-        share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
-        moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
-        return np.diag(share * np.repeat([moved, turned], 3))
 
 
 class Average(Protocol):
@@ -216,7 +180,8 @@ class AtReference(NamedTuple):
             more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
             off = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
             # Of unknown size, lengths are in units of the distance, of which the motion is exact.
-            longer = (common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0) * (lever @ off)[None]
+            size = (common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0) * off
+            longer = np.vstack([size, common.tilted_by(motion)]) @ lever.T
         unmoved = perturbation_between(motion @ reference_T, reference_T)
         return Differences(self.fits, lever, turn, more, longer, unmoved)
 

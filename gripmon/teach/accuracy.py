@@ -166,6 +166,9 @@ def as_if_measured(rig: Rig) -> dict[str, Rig]:
     if model.scale_sigma:
         exact_size = Gripper(structs.replace(model, scale_sigma=0.0))
         known["its size known better (scale_sigma in the gripper file)"] = rig._replace(gripper=exact_size)
+    if model.tilt_sigma_rad:
+        exact_tilt = Gripper(structs.replace(model, tilt_sigma_rad=0.0))
+        known["its tilt known better (tilt_sigma_rad in the gripper file)"] = rig._replace(gripper=exact_tilt)
     return known
 
 

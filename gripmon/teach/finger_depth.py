@@ -40,6 +40,7 @@ USUAL_TILT_RAD = math.radians(35.0)
 """Angle between the fingers and the line of sight to their tips, where nothing tells: wrist cameras look along their
 fingers at 20 to 50 degrees."""
 USUAL_TILT_SIGMA_RAD = math.radians(15.0)
+"""Its standard deviation, and that of the plane's tilt to either side."""
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
 
@@ -67,7 +68,7 @@ class PlacedOutlines:
     unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
     to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws;
-    ``tcp_covariance`` (3, 3) then.
+    ``tcp_covariance`` (3, 3) then; ``assumed``: nothing tells the tilt of their plane.
     """
 
     points: tuple[Array, ...]
@@ -80,6 +81,12 @@ class PlacedOutlines:
     by_motion: bool = False
     normal: Array | None = None
     tcp_covariance: Array | None = None
+    assumed: bool = False
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """Standard deviation of the tilt of the points' plane, as a gripper file has it."""
+        return USUAL_TILT_SIGMA_RAD if self.assumed else float(self.sigma_rad.max())
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> PlacedOutlines:
@@ -307,7 +314,8 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
     aside /= np.linalg.norm(aside)
     direction = math.cos(USUAL_TILT_RAD) * sight + math.sin(USUAL_TILT_RAD) * aside
     normal = np.cross(direction, np.cross(sight, aside))
-    if rotation is not None and abs(float(rotation[:, 1] @ sight)) > math.sin(math.radians(15.0)):
+    assumed = rotation is None or abs(float(rotation[:, 1] @ sight)) <= math.sin(math.radians(15.0))
+    if rotation is not None and not assumed:
         normal = rotation[:, 1]
     points = [np.array([_ray(xy) * float(normal @ at) / float(normal @ _ray(xy)) for xy in f.xy]) for f in fingers]
     for own in points:
@@ -319,12 +327,12 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, normal)
-        sigma = np.array([USUAL_TILT_SIGMA_RAD, USUAL_TILT_SIGMA_RAD, 0.0])
+        sigma = USUAL_TILT_SIGMA_RAD * np.sqrt(1.0 - rotation[:, 1] ** 2)  # about x and z, not about y
     kept = tuple(
         tuple(piece for piece in f.pieces if np.isfinite(own[list(piece)]).all())
         for f, own in zip(fingers, points, strict=True)
     )
-    return PlacedOutlines(tuple(points), kept, rotation, tcp, True, sigma, normal=normal)
+    return PlacedOutlines(tuple(points), kept, rotation, tcp, True, sigma, normal=normal, assumed=assumed)
 
 
 def innermost(tips: Sequence[Array]) -> list[Array]:

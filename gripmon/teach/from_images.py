@@ -337,12 +337,14 @@ def _covariance(fx_px: float, placed: PlacedOutlines, scale: Length, seen: Openi
 def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str, str], count: int) -> list[str]:
     """What is unknown or was assumed, as texts."""
     notes = []
-    if placed.flat:
+    if placed.assumed:
         notes.append(
-            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: no three "
-            "long edges of the fingers meet in one point. Corrections of the camera's tilt, and of motions of some per "
-            "cent of the distance, are too small or too large by what the fingers stand out of that plane"
+            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight, within 15 "
+            "(standard deviation): no three long edges of the fingers meet in one point. It is in every bound of a "
+            "motion and of the absolute rotation (tilt_sigma_rad in the gripper file)"
         )
+    elif placed.flat:
+        notes.append("the outline is assumed to lie in the reference's plane of x and z: its own edges show no other")
     elif not calibrated and len(placed.points) == 1:
         notes.append("the finger's long edges are assumed parallel: a taper would look like another direction of it")
     if placed.by_motion:

@@ -356,7 +356,7 @@ def gripper_values(model: GripperModel) -> dict[str, Any]:
     }
     plain = {"kind": "contour", "brighter": "any", "bevel_m": 0.0}
     out["edges"] = {name: {k: v for k, v in edge.items() if v != plain.get(k)} for name, edge in out["edges"].items()}
-    return {key: value for key, value in out.items() if value not in (None, [], ())}
+    return {key: value for key, value in out.items() if value not in (None, [], (), 0.0)}
 
 
 def measure_tracked(

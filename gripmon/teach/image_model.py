@@ -150,7 +150,7 @@ def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None,
     fingers, jaw = _jaw(seen)
     return GripperModel(
         name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=seen.scale_sigma,
-        provenance=provenance,
+        tilt_sigma_rad=round(seen.placed.tilt_sigma_rad, 4), provenance=provenance,
     )  # fmt: skip
 
 

@@ -109,14 +109,24 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
             "exact; 1: the size is unknown, and lengths are in units of the distance from the camera",
         ),
     ] = 0.0
+    tilt_sigma_rad: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="standard deviation of the tilt of the plane that the fingers' points lie in, as far as the "
+            "images that the file was made of don't show it (rad); 0: exact",
+        ),
+    ] = 0.0
     provenance: Provenance | None = None
 
 
 def contents_of(model: GripperModel) -> dict[str, Any]:
     """The contents of a gripper file that describe the gripper, for digests: all but its provenance."""
     contents = {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
-    if not contents["scale_sigma"]:  # as digests from before it
-        del contents["scale_sigma"]
+    for key in ("scale_sigma", "tilt_sigma_rad"):
+        if not contents[key]:  # as digests from before it
+            del contents[key]
     for edge in contents["edges"].values():
         if not edge["via"]:  # digests of grippers without curves date from before curves
             del edge["via"]
