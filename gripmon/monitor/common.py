@@ -94,7 +94,3 @@ class CommonError(NamedTuple):
         share = np.square(rows[:, :3]).sum() / np.square(at_T[:3, 3]).sum() + np.square(rows[:, 3:]).sum()
         moved, turned = np.square(motion[:3, 3]).sum(), np.square(log_rotation(motion[:3, :3])).sum()
         return np.diag(share * np.repeat([moved, turned], 3))
-
-    def tilted_by(self, motion: Array) -> Array:
-        """(k, 6): what a fit is off by after a ``motion`` (4, 4), by one standard deviation of each tilt."""
-        return np.asarray(self.tilt.of_motion @ motion[:3, 3])

@@ -116,23 +116,30 @@ class Average(Protocol):
 
 class Differences(NamedTuple):
     """What makes fits of a pose fits of exp(d) reference, as differences from the published ones: the ``first`` fits
-    b, under g lasting hypotheses, the Jacobians and covariance of :func:`of_motion`, the errors by the model that all
-    have besides, ``longer`` (k, 6), and the pose of a mount that hasn't moved (6,).
+    b, under g lasting hypotheses, the Jacobians and covariance of :func:`of_motion`, and the pose of a mount that
+    hasn't moved (6,).  The errors by the model that all have besides: of the jaws' ``travel`` (6,), and ``by_motion``
+    (k, 6, 3) times the motion of the camera's origin, which is ``moved`` (3,) as published, of the TCP ``at`` (3,).
     """
 
     first: Separation
     lever: Array
     turn: Array
     more: Array
-    longer: Array
+    travel: Array
+    by_motion: Array
+    moved: Array
+    at: Array
     unmoved: Array
 
     def of(self, fits: Separation, lasting: NDArray[np.intp]) -> Separation:
         """Of h hypotheses; ``lasting`` (h,): under which of the lasting ones b is taken; 0: nothing was wrong then."""
         made = of_motion(fits, self.first, lasting, self.lever, self.turn, self.more)
-        if not len(self.longer):
+        if not len(self.by_motion):
             return made
-        rows = np.broadcast_to(self.longer, (len(lasting), *self.longer.shape))
+        # Each by the motion that it has: a file's error does nothing where the mount stayed.
+        moved = self.moved + made.shift[:, :3] - np.cross(made.shift[:, 3:], self.at)
+        rows = np.moveaxis(self.by_motion @ moved.T, 2, 0)
+        rows[:, 0] += self.travel
         return made._replace(of_model=np.concatenate([made.of_model, rows], axis=1))
 
     def staying(self, motion: Separation, covariance: Array) -> Separation:
@@ -174,16 +181,18 @@ class AtReference(NamedTuple):
         """How fits near a published pose (4, 4) differ from that of exp(d) reference."""
         lever, turn = self._jacobians(cam_T_grip, reference_T)
         motion = self.motion(cam_T_grip)
-        more: Array = np.zeros((6, 6))
-        longer: Array = np.zeros((0, 6))
+        more, travel, by_motion = np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6, 3))
         if common is not None:
             more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
-            off = np.concatenate([-motion[:3, 3], np.zeros(3)]) + travel_m * opened.pose_rate
             # Of unknown size, lengths are in units of the distance, of which the motion is exact.
-            size = (common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0) * off
-            longer = np.vstack([size, common.tilted_by(motion)]) @ lever.T
-        unmoved = perturbation_between(motion @ reference_T, reference_T)
-        return Differences(self.fits, lever, turn, more, longer, unmoved)
+            size = common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0
+            travel = size * travel_m * (lever @ opened.pose_rate)
+            by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
+        at_T = motion @ reference_T
+        unmoved = perturbation_between(at_T, reference_T)
+        return Differences(
+            self.fits, lever, turn, more, travel, by_motion, motion[:3, 3], at_T[:3, 3], unmoved
+        )
 
     def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
         """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is

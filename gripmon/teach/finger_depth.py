@@ -307,13 +307,10 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
     """All fingers in one plane through the TCP: that of a calibration's x and z axes if it is seen well, or one in
     which the fingers point away from the camera as they usually do.
     """
-    outwards = np.sum([f.outwards for f in fingers], axis=0)
     at = _ray(centre) if tcp is None else tcp
-    sight = at / np.linalg.norm(at)
-    aside = np.array([*outwards, 0.0]) - sight * float(sight[:2] @ outwards)
-    aside /= np.linalg.norm(aside)
+    sight, across, aside = _usual_axes(fingers, at)
     direction = math.cos(USUAL_TILT_RAD) * sight + math.sin(USUAL_TILT_RAD) * aside
-    normal = np.cross(direction, np.cross(sight, aside))
+    normal = np.cross(direction, across)
     assumed = rotation is None or abs(float(rotation[:, 1] @ sight)) <= math.sin(math.radians(15.0))
     if rotation is not None and not assumed:
         normal = rotation[:, 1]
@@ -333,6 +330,28 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         for f, own in zip(fingers, points, strict=True)
     )
     return PlacedOutlines(tuple(points), kept, rotation, tcp, True, sigma, normal=normal, assumed=assumed)
+
+
+def _usual_axes(fingers: Sequence[Outline], at: Array) -> tuple[Array, Array, Array]:
+    """Unit vectors (3,) of the line of sight to a point, as far as it is square to the jaws; across the fingers; and
+    square to both, to where the fingers point in the image.  Two fingers' tips are taken to be equally far away: the
+    way from one to the other shows the jaws' direction better than a short piece of a finger shows its own.
+    """
+    outwards, sight = np.sum([f.outwards for f in fingers], axis=0), at / np.linalg.norm(at)
+    if len(fingers) == 1:
+        aside = np.array([*outwards, 0.0]) - sight * float(sight[:2] @ outwards)
+        aside /= np.linalg.norm(aside)
+        return sight, np.cross(sight, aside), aside
+    tips = [f.xy.mean(axis=0) for f in fingers]
+    for _ in range(_ROUNDS):
+        way = (tips[-1] - tips[0]) / np.linalg.norm(tips[-1] - tips[0])
+        ahead = np.array([way[1], -way[0]]) * (1.0 if float(way[1] * outwards[0] - way[0] * outwards[1]) > 0.0 else -1.0)
+        tips = [f.xy[int((f.xy @ ahead).argmax())] for f in fingers]
+    across = np.array([*way, 0.0])
+    sight = sight - across * float(across @ sight)
+    sight /= np.linalg.norm(sight)
+    aside = np.cross(across, sight)
+    return sight, across, aside * (1.0 if float(aside[:2] @ ahead) > 0.0 else -1.0)
 
 
 def innermost(tips: Sequence[Array]) -> list[Array]:
