@@ -43,7 +43,8 @@ class Tilt(NamedTuple):
         ways = np.diff(places[..., :2] / places[..., 2:], axis=1)
         place, way = 0.5 * (places[:, 1:] + places[:, :-1]).reshape(-1, 3), ways.reshape(-1, 2)
         # Weighted by their lengths: a motion across each piece of an edge, times it.
-        moved = np.column_stack([-way[:, 1], way[:, 0], (way[:, 1] * place[:, 0] - way[:, 0] * place[:, 1]) / place[:, 2]])
+        farther = (way[:, 1] * place[:, 0] - way[:, 0] * place[:, 1]) / place[:, 2]
+        moved = np.column_stack([-way[:, 1], way[:, 0], farther])
         moved /= (place[:, 2] * np.sqrt(np.linalg.norm(way, axis=1)))[:, None]
         lever = place - tcp
         *along, normal = np.linalg.svd(lever, full_matrices=False)[2]

@@ -181,7 +181,9 @@ class AtReference(NamedTuple):
         """How fits near a published pose (4, 4) differ from that of exp(d) reference."""
         lever, turn = self._jacobians(cam_T_grip, reference_T)
         motion = self.motion(cam_T_grip)
-        more, travel, by_motion = np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6, 3))
+        more: Array = np.zeros((6, 6))
+        travel: Array = np.zeros(6)
+        by_motion: Array = np.zeros((0, 6, 3))
         if common is not None:
             more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
             # Of unknown size, lengths are in units of the distance, of which the motion is exact.
@@ -190,9 +192,7 @@ class AtReference(NamedTuple):
             by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
         at_T = motion @ reference_T
         unmoved = perturbation_between(at_T, reference_T)
-        return Differences(
-            self.fits, lever, turn, more, travel, by_motion, motion[:3, 3], at_T[:3, 3], unmoved
-        )
+        return Differences(self.fits, lever, turn, more, travel, by_motion, motion[:3, 3], at_T[:3, 3], unmoved)
 
     def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
         """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is

@@ -345,7 +345,8 @@ def _usual_axes(fingers: Sequence[Outline], at: Array) -> tuple[Array, Array, Ar
     tips = [f.xy.mean(axis=0) for f in fingers]
     for _ in range(_ROUNDS):
         way = (tips[-1] - tips[0]) / np.linalg.norm(tips[-1] - tips[0])
-        ahead = np.array([way[1], -way[0]]) * (1.0 if float(way[1] * outwards[0] - way[0] * outwards[1]) > 0.0 else -1.0)
+        ahead = np.array([way[1], -way[0]])
+        ahead *= 1.0 if float(ahead @ outwards) > 0.0 else -1.0
         tips = [f.xy[int((f.xy @ ahead).argmax())] for f in fingers]
     across = np.array([*way, 0.0])
     sight = sight - across * float(across @ sight)

@@ -290,9 +290,7 @@ def _check_range(jaw_range_m: tuple[float, float] | None, openings_m: Sequence[f
         )
 
 
-def _groups(
-    openings_m: Sequence[float | None] | None, grey: Iterable[NDArray[np.float32]]
-) -> dict[float, list[int]]:
+def _groups(openings_m: Sequence[float | None] | None, grey: Iterable[NDArray[np.float32]]) -> dict[float, list[int]]:
     """Indices of the images of each opening, the one with most images first.  Unknown openings are numbered; for them
     alone the images are looked at.
     """
@@ -339,9 +337,9 @@ def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str
     notes = []
     if placed.assumed:
         notes.append(
-            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight, within 15 "
-            "(standard deviation): no three long edges of the fingers meet in one point. It is in every bound of a "
-            "motion and of the absolute rotation (tilt_sigma_rad in the gripper file)"
+            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: no three "
+            "long edges of the fingers meet in one point. The tilt's standard deviation of 15 degrees is in the bounds "
+            "of motions and of the absolute rotation (tilt_sigma_rad in the gripper file)"
         )
     elif placed.flat:
         notes.append("the outline is assumed to lie in the reference's plane of x and z: its own edges show no other")

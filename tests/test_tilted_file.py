@@ -1,0 +1,225 @@
+"""A gripper file whose plane isn't that of the fingers, as one made of images may be: what a motion is off by then."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from support.meters import difference, moved
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import pose_of, reference_of
+
+from gripmon.judge.policy import PolicySettings
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import EdgeModel, FaceModel, FingerModel, Gripper, GripperModel, PointModel, contents_of
+from gripmon.model.records import Array, ValidBy
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, Bump, FingerLook
+from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD
+from gripmon.teach.hand_eye import gripper_values
+from gripmon.track.edges.taught import gripper_digest
+from gripmon.track.integrity import Separation
+
+FILE_T = nominal_cam_T_grip(np.degrees(USUAL_TILT_RAD))
+SIDES = {"left": (-0.025, -0.013), "right": (0.013, 0.025)}
+LENGTH_M, THICK_M = 0.06, 1e-3
+BOUND_SIGMAS = 4.4 * 1.2
+"""Of a bound at a risk of 1e-5, with the factor for tails."""
+STILL_M, STILL_RAD = 2e-4, 3e-3
+"""The bound of a mount that doesn't move, in these images."""
+
+
+def plates(points_m: dict[str, Array], sigma_rad: float = 0.0) -> Gripper:
+    """Flat fingers by their corners (4, 3), from one root to the other."""
+    points, edges, faces = {}, {}, []
+    for name, corners in points_m.items():
+        for k, xyz in enumerate(corners):
+            points[f"{name}{k}"] = PointModel(finger=name, xyz_m=tuple(map(float, xyz)), corner=k in (1, 2))
+        for k in range(3):
+            edges[f"{name}{k}"] = EdgeModel(start=f"{name}{k}", end=f"{name}{k + 1}")
+        faces.append(FaceModel(finger=name, points=tuple(f"{name}{k}" for k in range(4))))
+    fingers = {name: FingerModel() for name in points_m}
+    return Gripper(
+        GripperModel(
+            name="plates", fingers=fingers, points=points, edges=edges, faces=tuple(faces), tilt_sigma_rad=sigma_rad
+        )
+    )
+
+
+def true_plates() -> Gripper:
+    def corners(a: float, b: float) -> Array:
+        # Counter-clockwise for the camera, which looks along y.
+        return np.array([(b, 0.0, -LENGTH_M), (b, 0.0, 0.0), (a, 0.0, 0.0), (a, 0.0, -LENGTH_M)])
+
+    return plates({name: corners(*side) for name, side in SIDES.items()})
+
+
+def solid_plates() -> Gripper:
+    """The same for the simulator, which needs bodies: thin ones, wider at the front."""
+    front = true_plates().model
+    points, faces = dict(front.points), list(front.faces)
+    for name, (a, b) in SIDES.items():
+        low, middle = -LENGTH_M, np.array([0.5 * (a + b), 0.0, -0.5 * LENGTH_M])
+        for k, (x, z) in enumerate(((b, low), (b, 0.0), (a, 0.0), (a, low))):
+            behind = middle + 0.8 * (np.array([x, 0.0, z]) - middle) + [0.0, THICK_M, 0.0]
+            points[f"{name}_back{k}"] = PointModel(finger=name, xyz_m=tuple(map(float, behind)))
+        back = [f"{name}_back{k}" for k in range(4)]
+        faces.append(FaceModel(finger=name, points=tuple(back[::-1])))
+        for k in range(4):
+            m = (k + 1) % 4
+            faces.append(FaceModel(finger=name, points=(f"{name}{m}", f"{name}{k}", back[k], back[m])))
+    return Gripper(msgspec.structs.replace(front, points=points, faces=tuple(faces)))
+
+
+def true_pose(tilt_deg: float, roll_deg: float) -> Array:
+    """Plates tilted against the line of sight, and rolled about their z axis, with the file's TCP."""
+    pose = nominal_cam_T_grip(tilt_deg)
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    pose[:3, :3] = pose[:3, :3] @ [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    return pose
+
+
+def file_of(true_T: Array, sigma_rad: float = USUAL_TILT_SIGMA_RAD) -> Gripper:
+    """The plates' places in the image, in the file's plane."""
+    gripper, tcp, normal = true_plates(), FILE_T[:3, 3], FILE_T[:3, 1]
+    out = {}
+    for k, name in enumerate(gripper.finger_ids):
+        seen = gripper.points_grip_m()[gripper.point_finger == k] @ true_T[:3, :3].T + true_T[:3, 3]
+        out[name] = (seen * (float(normal @ tcp) / (seen @ normal))[:, None] - tcp) @ FILE_T[:3, :3]
+    return plates(out, sigma_rad)
+
+
+def fitted(true_T: Array, motion: Array) -> Array:
+    """What a fit across edges with the file's points is off by (6,) after a ``motion`` (6,) of the TCP, by SciPy."""
+    here = []
+    for gripper, pose in ((true_plates(), true_T), (file_of(true_T), FILE_T)):
+        points = gripper.points_grip_m() @ pose[:3, :3].T + pose[:3, 3]
+        here.append(gripper.outlines_m(points, np.arange(len(gripper.edge_ids)), 25))
+    truth, file = here
+    ways = np.gradient(file[..., :2] / file[..., 2:], axis=1)
+    normal = np.stack([-ways[..., 1], ways[..., 0]], axis=-1) / np.sqrt(np.linalg.norm(ways, axis=-1))[..., None]
+
+    def image(places: Array, xi: Array) -> Array:
+        by = moved(FILE_T, xi) @ np.linalg.inv(FILE_T)
+        at = places @ by[:3, :3].T + by[:3, 3]
+        return np.asarray((at[..., :2] / at[..., 2:] * normal).sum(axis=-1).ravel())
+
+    found = least_squares(lambda xi: (image(file, xi) - image(truth, motion)) * 1e6, motion, xtol=1e-14, ftol=1e-14)
+    return np.asarray(found.x - motion)
+
+
+def motions(count: int, shift_m: float, turn_deg: float) -> Array:
+    rng = np.random.default_rng(5)
+    ways = rng.normal(size=(count, 2, 3))
+    ways /= np.linalg.norm(ways, axis=2)[..., None]
+    return np.asarray(ways * np.array([shift_m, np.radians(turn_deg)])[:, None]).reshape(count, 6)
+
+
+def camera_shift(motion: Array) -> Array:
+    return np.asarray((moved(FILE_T, motion) @ np.linalg.inv(FILE_T))[:3, 3])
+
+
+def test_a_small_error_of_the_tilt_makes_the_errors_that_are_reckoned_with():
+    """Half a degree about each axis of the plane, alone."""
+    off_deg = 0.5
+    for number, true_T in enumerate((true_pose(35.0 + off_deg, 0.0), true_pose(35.0, off_deg))):
+        tilt = Tilt.of(file_of(true_T, np.radians(off_deg)), FILE_T)
+        for motion in motions(6, 2e-4, 0.1):
+            error = fitted(true_T, motion)
+            reckoned = tilt.of_motion @ camera_shift(motion)
+            # The plane's two directions are any two: the errors span the same.
+            weights, *_ = np.linalg.lstsq(reckoned.T, error, rcond=None)
+            assert np.linalg.norm(weights) == pytest.approx(1.0, abs=0.08), number
+            np.testing.assert_allclose(weights @ reckoned, error, atol=0.07 * np.abs(error).max())
+
+
+TILTS_DEG = [(20.0, 0.0), (50.0, 0.0), (35.0, -20.0), (35.0, 20.0), (20.0, 10.0), (50.0, -20.0)]
+
+
+@pytest.mark.parametrize(("tilt_deg", "roll_deg"), TILTS_DEG)
+def test_errors_of_the_assumed_tilt_are_within_the_bound_of_its_error_alone(tilt_deg: float, roll_deg: float):
+    true_T = true_pose(tilt_deg, roll_deg)
+    tilt = Tilt.of(file_of(true_T), FILE_T)
+    for shift_m, turn_deg in ((1e-3, 0.0), (5e-3, 0.0), (0.0, 0.5), (0.0, 2.0), (3e-3, 1.0), (5e-3, 2.0)):
+        for motion in motions(8, shift_m, turn_deg):
+            error, sigma = fitted(true_T, motion), tilt.of_motion @ camera_shift(motion)
+            for part, least in ((slice(0, 3), STILL_M), (slice(3, 6), STILL_RAD)):
+                assert np.linalg.norm(error[part]) < BOUND_SIGMAS * np.linalg.norm(sigma[:, part]) + least
+
+
+def test_it_turns_the_absolute_rotation_alone():
+    tilt = Tilt.of(file_of(FILE_T), FILE_T)
+    fits = Separation(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 1, 6)))
+    off = CommonError(0.0, np.zeros((0, 6)), np.zeros(6), tilt).on(fits, FILE_T).of_model[0]
+    turned = off.T @ off
+    assert not turned[:3].any()
+    expected = USUAL_TILT_SIGMA_RAD**2 * (np.eye(3) - np.outer(FILE_T[:3, 1], FILE_T[:3, 1]))
+    np.testing.assert_allclose(turned[3:, 3:], expected, atol=1e-9)
+
+
+def test_a_file_that_states_none_is_as_before():
+    exact, tilted = file_of(FILE_T, 0.0), file_of(FILE_T, 0.1)
+    assert Tilt.of(exact, FILE_T) is EXACT_PLANE
+    assert gripper_digest(exact) != gripper_digest(tilted)
+    assert "tilt_sigma_rad" in contents_of(tilted.model) and "tilt_sigma_rad" not in contents_of(exact.model)
+    assert "tilt_sigma_rad" in gripper_values(tilted.model) and "tilt_sigma_rad" not in gripper_values(exact.model)
+
+
+class Knocked(NamedTuple):
+    """Errors and bounds (n,) of the motion since the reference, in the last frames."""
+
+    error_m: Array
+    bound_m: Array
+    error_rad: Array
+    bound_rad: Array
+
+
+def knocked(true_T: Array, file: Gripper, *, still: bool = False) -> Knocked:
+    """A knock that shifts and turns the camera; none if ``still``."""
+    knock = Bump(at_s=0.95, ring_fraction=0.0, tcp_shift_m=(0.002, 0.0), translation_m=(0.002, 0.0, 0.0))
+    scenario = Scenario(
+        name="tilted",
+        fps=15.0,
+        duration_s=2.0,
+        mount=() if still else (knock,),
+        background=Background(kind="printed"),
+        fingers=FingerLook(carriers=False),
+    )
+    camera = make_camera(PAPER_LENS)
+    simulator = Simulator(camera, solid_plates(), true_T, scenario, 3)
+    reference = reference_of(FILE_T)
+    reference = msgspec.structs.replace(reference, covariance=tuple(np.diag([1e-6] * 3 + [1e-2] * 3).ravel().tolist()))
+    policy = PolicySettings(valid_by=ValidBy.REFERENCE, alert_limit_m=0.02, alert_limit_rad=0.35)
+    monitor = Monitor(camera, file, MonitorSettings(policy=policy), reference)
+    rows, first_T = [], simulator.truth(0).cam_T_grip
+    for k in range(simulator.frame_count):
+        record = monitor.process(simulator.frame(k))
+        monitor.run_pending()
+        if k >= 20 and record.measured:
+            assert record.cam_T_grip is not None and record.since_reference is not None
+            true_d = simulator.truth(k).cam_T_grip @ np.linalg.inv(first_T)
+            error, since = difference(true_d @ FILE_T, pose_of(record.cam_T_grip)), record.since_reference
+            rows.append((np.linalg.norm(error[:3]), since.position_m, np.linalg.norm(error[3:]), since.rotation_rad))
+    assert len(rows) >= 5
+    return Knocked(*np.array(rows).T)
+
+
+@pytest.mark.parametrize(("tilt_deg", "roll_deg"), [(50.0, 0.0), (35.0, 20.0), (45.0, -15.0)])
+def test_a_knock_that_a_tilted_file_measures_wrong_is_within_its_bound(tilt_deg: float, roll_deg: float):
+    true_T = true_pose(tilt_deg, roll_deg)
+    told = knocked(true_T, file_of(true_T))
+    assert (told.error_m <= told.bound_m).all() and (told.error_rad <= told.bound_rad).all()
+    if roll_deg:
+        untold = knocked(true_T, file_of(true_T, 0.0))
+        assert np.mean(untold.error_m > untold.bound_m) >= 0.8
+
+
+def test_while_the_mount_stays_a_tilted_file_costs_nothing():
+    """A file's error acts by the motion, of which the noise of a frame is none."""
+    told, untold = (knocked(FILE_T, file_of(FILE_T, sigma), still=True) for sigma in (USUAL_TILT_SIGMA_RAD, 0.0))
+    assert np.median(told.bound_m) < 1.1 * np.median(untold.bound_m)
