@@ -67,7 +67,7 @@ def from_images(arguments: Arguments) -> None:
     Use at least five images of each opening, in focus, each before another background, lit as in use.  If
     the fingers' long edges meet in one point (their vanishing point), it gives the fingers' pose in space,
     otherwise the motion of both fingers between openings; with one opening the outline is then assumed to
-    be flat and facing the camera.  The uncertainty is printed and in the reference's covariance.
+    be flat, tilted as usual.  The uncertainty is printed, in the reference's covariance and in the file.
 
     The command writes the gripper file and, with --reference-out, its reference.
     """

@@ -324,7 +324,7 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, normal)
-        sigma = USUAL_TILT_SIGMA_RAD * np.sqrt(1.0 - rotation[:, 1] ** 2)  # about x and z, not about y
+        sigma = np.array([USUAL_TILT_SIGMA_RAD, USUAL_TILT_SIGMA_RAD, 0.0])
     kept = tuple(
         tuple(piece for piece in f.pieces if np.isfinite(own[list(piece)]).all())
         for f, own in zip(fingers, points, strict=True)

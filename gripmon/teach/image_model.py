@@ -19,7 +19,6 @@ from gripmon.teach.finger_depth import PARALLEL_RAD, Outline, PlacedOutlines, le
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
-from gripmon.teach.straight_pieces import STRAIGHT_PX
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
 SHORTEST_EDGE_PX = 8.0
@@ -177,18 +176,7 @@ def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -
         and not outline.corner[runs[0][0][0]]
     ):
         runs[0] = runs.pop() + runs[0]  # a closed outline may begin within a run
-    return [run for run in runs if len(run) > 1 and _bends(outline, run)]
-
-
-def _bends(outline: Outline, run: Sequence[tuple[int, int]]) -> bool:
-    """Whether pieces with no corner between them are a curve: one is too short for an edge of its own, or would miss
-    its edge by more than straight ones may.  Others are straight edges with slight bends between them.
-    """
-    way = np.array([outline.xy[b] - outline.xy[a] for a, b in run])
-    length_px = outline.length_px[[outline.pieces.index(piece) for piece in run]]
-    turn = np.abs(np.arctan2(way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0], (way[:-1] * way[1:]).sum(axis=1)))
-    sag_px = np.minimum(length_px[:-1], length_px[1:]) * turn / 8.0
-    return bool(length_px.min() < SHORTEST_EDGE_PX or sag_px.max() > STRAIGHT_PX)
+    return [run for run in runs if len(run) > 1]
 
 
 def _curve_in_space(
