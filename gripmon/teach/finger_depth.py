@@ -19,17 +19,8 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 from gripmon.teach.straight_pieces import LONGEST_CUT_PX
+from gripmon.teach.vanishing import PARALLEL_RAD, finger_direction, missed_rad, sight_of, tip_centre
 
-LONG_PX = 30.0
-"""Least length of an edge that shows a direction: 0.1 px at each end is 0.3 degrees."""
-PARALLEL_RAD = math.radians(0.6)
-"""Largest angle by which a long edge may miss the vanishing point: twice what 30 px resolve."""
-FEWEST_PARALLEL = 3
-PARALLEL_LENGTH_SHARE = 0.5
-"""Least part of the total length of candidate edges that must run along the fingers, as in the monitor's search for
-their ends."""
-ALONG_RAD = math.radians(50.0)
-"""Largest angle between the image of an edge along a finger and the direction to its tip: perspective turns it."""
 LEAST_PLANE_COSINE = 0.25
 """Cosine between line of sight and fingers below which the contact plane is too oblique to place corners on it."""
 CORNER_TURN_SHARE = 0.75
@@ -96,7 +87,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     given = None if rotation is None else rotation[:, 2]
     direction, sigma = (given, 0.0) if given is not None else finger_direction(fingers)
     centre = tip_centre(fingers)
-    ray = _ray(centre)
+    ray = sight_of(centre)
     if direction is not None and abs(float(direction @ ray) / float(np.linalg.norm(ray))) < LEAST_PLANE_COSINE:
         direction = None
     if direction is None or sigma > FLAT_SIGMA_RAD:
@@ -125,77 +116,6 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     return PlacedOutlines(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
 
 
-def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:
-    """Unit vector (3,) out of the gripper and its standard deviation (rad); None where no three long edges agree."""
-    lines, middles, ways, lengths = [], [], [], []
-    for finger in fingers:
-        ends = np.concatenate([finger.xy[np.reshape(finger.pieces, (-1, 2))], finger.inner_xy])
-        for (a, b), length in zip(ends, np.append(finger.length_px, finger.inner_px), strict=True):
-            way = (b - a) / np.linalg.norm(b - a)
-            if length >= LONG_PX and abs(float(way @ finger.outwards)) > math.cos(ALONG_RAD):
-                middles.append(0.5 * (a + b))
-                ways.append(way)
-                lengths.append(length)
-                lines.append(np.cross(_ray(a), _ray(b)))
-    if len(lines) < FEWEST_PARALLEL:
-        return None, 0.0
-    line = np.array([n / np.linalg.norm(n[:2]) for n in lines])
-    middle, way, worth = np.array(middles), np.array(ways), np.array(lengths)
-    best: tuple[float, NDArray[np.bool_]] | None = None
-    for i in range(len(line)):
-        for j in range(i):
-            meet = np.cross(line[i], line[j])
-            if not np.linalg.norm(meet) > 1e-6:
-                continue
-            on = _missed(meet, middle, way) < PARALLEL_RAD
-            score = float(worth[on].sum())
-            enough = np.count_nonzero(on) >= FEWEST_PARALLEL and score > PARALLEL_LENGTH_SHARE * float(worth.sum())
-            if enough and (best is None or score > best[0]):
-                best = score, on
-    if best is None:
-        return None, 0.0
-    on = best[1]
-    weighted = line[on] * worth[on, None]
-    meet = np.linalg.svd(weighted)[2][2]
-    sigma = _direction_sigma(meet, middle[on], line[on])
-    outwards = np.sum([finger.outwards for finger in fingers], axis=0)
-    centre = tip_centre(fingers)
-    moved = _image_way(meet, centre)
-    sign = 1.0 if float(moved @ outwards) > 0.0 else -1.0
-    return sign * meet / np.linalg.norm(meet), sigma
-
-
-def _direction_sigma(meet: Array, middle: Array, line: Array) -> float:
-    """Standard deviation (rad) of a direction in which n lines (n, 3) through ``middle`` (n, 2) meet, each known to
-    half of :data:`PARALLEL_RAD`; large where they are nearly one line.
-    """
-    at = meet[:2] / (meet[2] if abs(meet[2]) > 1e-9 else 1e-9)
-    off = 0.5 * PARALLEL_RAD * np.linalg.norm(at - middle, axis=1)
-    information = (line[:, :2] / off[:, None]).T @ (line[:, :2] / off[:, None])
-    return float(np.sqrt(1.0 / max(float(np.linalg.eigvalsh(information)[0]), 1e-12)) / math.hypot(1.0, *at))
-
-
-def _image_way(direction: Array, xy: Array) -> Array:
-    """Direction (2,) in the image of a point's motion along a direction in space."""
-    return np.asarray(direction[:2] - direction[2] * xy)
-
-
-def _missed(meet: Array, middle: Array, way: Array) -> Array:
-    """Angles (n,) by which lines miss a point of the image plane."""
-    to = meet[:2] - meet[2] * middle
-    to = to / np.maximum(np.linalg.norm(to, axis=1), 1e-12)[:, None]
-    return np.asarray(np.arcsin(np.minimum(np.abs(to[:, 0] * way[:, 1] - to[:, 1] * way[:, 0]), 1.0)))
-
-
-def _ray(xy: Array) -> Array:
-    return np.array([xy[0], xy[1], 1.0])
-
-
-def tip_centre(fingers: Sequence[Outline]) -> Array:
-    """Centre (2,) of the foremost vertices of all fingers, ideal coordinates."""
-    return np.asarray(np.mean([f.xy[int((f.xy @ f.outwards).argmax())] for f in fingers], axis=0))
-
-
 def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tuple[int, int]]]:
     """Vertices of the tip's outline, and the pieces along the finger that follow it on both sides, outwards first.  The
     rest, e.g. a body that carries the finger, has another depth.
@@ -203,7 +123,7 @@ def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tu
     along = {
         piece
         for piece in finger.pieces
-        if _missed(direction, 0.5 * finger.xy[list(piece)].sum(axis=0)[None], _unit(finger.xy, piece)[None])[0]
+        if missed_rad(direction, 0.5 * finger.xy[list(piece)].sum(axis=0)[None], _unit(finger.xy, piece)[None])[0]
         < 2.0 * PARALLEL_RAD
     }
     links: dict[int, list[tuple[int, tuple[int, int]]]] = {}
@@ -246,14 +166,14 @@ def _in_space(
     out = np.full((len(finger.xy), 3), np.nan)
     height = float(direction @ plane_at)
     for k in tip:
-        ray = _ray(finger.xy[k])
+        ray = sight_of(finger.xy[k])
         out[k] = ray * (height / float(direction @ ray))
     if turns:
         _into_plane_of_sides(out, sorted(tip), turns, direction, height)
     for start, end in sides:
         if np.isfinite(out[end]).all() or not np.isfinite(out[start]).all():
             continue
-        out[end] = nearest_on_ray(_ray(finger.xy[end]), out[start], direction)
+        out[end] = nearest_on_ray(sight_of(finger.xy[end]), out[start], direction)
     out[out[:, 2] <= 0.0] = np.nan
     return out
 
@@ -307,14 +227,16 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
     """All fingers in one plane through the TCP: that of a calibration's x and z axes if it is seen well, or one in
     which the fingers point away from the camera as they usually do.
     """
-    at = _ray(centre) if tcp is None else tcp
+    at = sight_of(centre) if tcp is None else tcp
     sight, across, aside = _usual_axes(fingers, at)
     direction = math.cos(USUAL_TILT_RAD) * sight + math.sin(USUAL_TILT_RAD) * aside
     normal = np.cross(direction, across)
     assumed = rotation is None or abs(float(rotation[:, 1] @ sight)) <= math.sin(math.radians(15.0))
     if rotation is not None and not assumed:
         normal = rotation[:, 1]
-    points = [np.array([_ray(xy) * float(normal @ at) / float(normal @ _ray(xy)) for xy in f.xy]) for f in fingers]
+    points = [
+        np.array([sight_of(xy) * float(normal @ at) / float(normal @ sight_of(xy)) for xy in f.xy]) for f in fingers
+    ]
     for own in points:
         own[own[:, 2] <= 0.0] = np.nan
     tips = [int((f.xy @ f.outwards).argmax()) for f in fingers]
