@@ -20,7 +20,7 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Bump, FingerLook
-from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD
+from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, Outline, place
 from gripmon.teach.hand_eye import gripper_values
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.track.integrity import Separation
@@ -224,3 +224,24 @@ def test_while_the_mount_stays_a_tilted_file_costs_nothing():
     """A file's error acts by the motion, of which the noise of a frame is none."""
     told, untold = (knocked(FILE_T, file_of(FILE_T, sigma), still=True) for sigma in (USUAL_TILT_SIGMA_RAD, 0.0))
     assert np.median(told.bound_m) < 1.1 * np.median(untold.bound_m)
+
+
+def stub(name: str, left: float, right: float, outwards: tuple[float, float]) -> Outline:
+    """A finger of which little shows: wider than long, from below."""
+    xy = np.array([(left, 0.37), (left, 0.35), (right, 0.35), (right, 0.37)])
+    pieces = ((0, 1), (1, 2), (2, 3))
+    length_px = 900.0 * np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    corner = np.array([False, True, True, False])
+    return Outline(name, xy, corner, pieces, np.array(outwards), length_px, np.zeros((0, 2, 2)), np.zeros(0))
+
+
+def test_two_short_flat_fingers_are_tilted_square_to_the_way_from_tip_to_tip():
+    """Each by itself seems to point sideways: from the middle of what shows at the border to its farthest corner."""
+    placed = place([stub("left", 0.07, 0.12, (-0.7, -0.7)), stub("right", 0.32, 0.38, (-0.96, -0.28))])
+    assert placed.assumed and placed.tilt_sigma_rad == USUAL_TILT_SIGMA_RAD
+    np.testing.assert_allclose(placed.rotation[:, 0], (1.0, 0.0, 0.0), atol=1e-9)
+    depth = [float(points[:, 2].mean()) for points in placed.points]
+    assert depth[0] == pytest.approx(depth[1], rel=1e-9)
+    sight = placed.tcp - placed.rotation[:, 0] * float(placed.rotation[:, 0] @ placed.tcp)
+    along = float(placed.rotation[:, 2] @ sight) / float(np.linalg.norm(sight))
+    assert np.arccos(along) == pytest.approx(USUAL_TILT_RAD, abs=0.02) and placed.rotation[1, 2] < sight[1]
