@@ -1,4 +1,4 @@
-"""``gripmon check --sweep`` as its users meet it: tables, pictures, lenses as axes, one-line faults."""
+"""``gripmon check --sweep`` as its users meet it: tables, lenses as axes, one-line faults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -129,51 +128,34 @@ def test_what_is_no_calibrated_lens_is_said_in_one_line(tmp_path: Path, capsys: 
         assert said.startswith(f"--lens {path}") and said.count("\n") == 1
 
 
-@pytest.mark.slow("3 s: how a sweep is shown; what it finds is in the default run")
-def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "sweep.jpg"
-    options = ["--distance", "0.06:0.3:4", "--tilt", "10:60:3", "--picture", str(path)]
-    assert main(["check", str(DEMO), "--sweep", *options]) == 0
+def test_the_table_names_the_best_and_the_present_mount_and_why_others_fail(capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(DEMO), "--sweep", "--distance", "0.06:0.3:4", "--tilt", "10:60:3"]) == 0
     text = capsys.readouterr().out
     assert "12 mounts tried" in text and "\nbest " in text and "\npresent " in text
     assert "would not work: too little in view in a part of the jaw's travel" in text
     assert "translation_m: [" in text
-    picture = cv2.imread(str(path))
-    assert picture.shape[1] == 1500 and 600 < picture.shape[0] < 1200
-    assert path.stat().st_size < 300_000
-    # Thumbnails and coloured cells are there: much of it is neither paper nor ink.
-    coloured = np.ptp(picture.astype(int), axis=2) > 60
-    assert coloured[110:300].mean() > 0.3
-    grey = (np.ptp(picture.astype(int), axis=2) < 12) & (picture.mean(axis=2) < 200) & (picture.mean(axis=2) > 20)
-    assert grey[-420:].mean() > 0.3
 
 
-def test_a_gripper_without_faces_is_drawn_by_its_edges(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_gripper_without_faces_is_said_to_have_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """As one is that was inferred from images."""
     content = yaml.safe_load(DEMO.read_text())
     gripper = yaml.safe_load((DEMO.parent / content["gripper"]).read_text())
     del gripper["faces"]
     (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(gripper))
-    config, path = tmp_path / "config.yaml", tmp_path / "sweep.png"
+    config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(content | {"gripper": "gripper.yaml"}))
-    assert (
-        main(["check", str(config), "--sweep", "--distance", "0.115", "--tilt", "32,40", "--picture", str(path)]) == 0
-    )
+    assert main(["check", str(config), "--sweep", "--distance", "0.115", "--tilt", "32,40"]) == 0
     said = capsys.readouterr().out
     assert "best " in said and "no faces   The gripper file has none" in said
     assert main(["check", str(config), "--verbose"]) == 0
     assert "the gripper file has no faces: which of its own edges a finger hides is unknown" in capsys.readouterr().out
-    # The present mount's thumbnail, the second of three, shows dark lines on blank grey and little else.
-    second = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[-400:-120, 530:970]
-    assert 0.01 < (second < 80).mean() < 0.2 and (abs(second.astype(int) - 170) < 4).mean() > 0.6
 
 
-def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "none.png"
-    assert main(["check", str(DEMO), "--sweep", "--distance", "4,5", "--tilt", "30", "--picture", str(path)]) == 0
+def test_a_sweep_in_which_nothing_works_says_why(capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(DEMO), "--sweep", "--distance", "4,5", "--tilt", "30"]) == 0
     text = capsys.readouterr().out
     assert "2 mounts tried, 0 would work" in text and "2 would not work: nowhere enough in view" in text
-    assert "best as" not in text and cv2.imread(str(path)) is not None
+    assert "best as" not in text
 
 
 @pytest.mark.parametrize(
@@ -196,8 +178,7 @@ def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.
         (["--sweep", "--at", "384,700"], "--at: lies at (384.0, 700.0) px, outside of the image"),
         (["--sweep", "--at", "nan,3"], "outside of the image"),
         (["--sweep", "--tilt", "0:80:100", "--roll", "0:90:50"], "45000 mounts; at most 20000"),
-        (["--sweep", "--picture", "sweep.gif"], "--picture sweep.gif: has no known ending; .png or .jpg"),
-        (["--sweep", "--picture", f"{DEMO}/sweep.png"], f"--picture {DEMO}: can't be made"),
+        (["--sweep", "--picture", "sweep.png"], "--picture: not with --sweep, a table of what is forecast"),
     ],
 )  # fmt: skip
 def test_bad_input_is_said_in_one_line(options: list[str], said: str, capsys: pytest.CaptureFixture[str]):

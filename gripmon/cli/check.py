@@ -20,7 +20,7 @@ _OPTIONS = """
 --verbose       the forecast in numbers
 --images INPUT  images of the gripper at the reference, a folder or a video, to run the monitor over (default: the
                 recorded source, else those that were taught from)
---picture FILE  draw the first image with the edges that make the bounds as large; with --sweep the sweep (.png, .jpg)
+--picture FILE  draw the first image with the edges that make the bounds as large (.png, .jpg)
 """
 
 _LASER = """\
@@ -41,7 +41,7 @@ _EXAMPLES = """\
   gripmon check configs/demo.yaml --verbose
   gripmon check mine/arm1.yaml --images mine/first --picture doubts.png
   gripmon check configs/demo.yaml --json | python3 -m json.tool
-  gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6 --picture sweep.png
+  gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6
   gripmon check configs/folder.yaml --sweep --fov 40,60,80 --roll 0,90 --at 384,288
   gripmon check --laser laser.yaml
   gripmon check --laser laser.yaml fresh_spots.csv --arm-noise 0.0002:0.0004
@@ -79,8 +79,8 @@ def check(arguments: Arguments) -> int:
     With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
     camera, plane and laser pointer fresh spots would detect, or which they show.
 
-    With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
-    anyone drills a hole.
+    With --sweep: what other camera mounts and lenses would see, as a table, before anyone
+    drills a hole.
     """
     if arguments.laser is not None and arguments.sweep:
         raise InputError("--sweep: not with --laser; one of them")
@@ -90,7 +90,7 @@ def check(arguments: Arguments) -> int:
         arguments.refuse(("images", "picture"), "not with --laser, which has spots; leave it out")
         return _check_laser(arguments)
     if arguments.sweep:
-        arguments.refuse(("images",), "not with --sweep, which forecasts; leave it out")
+        arguments.refuse(("images", "picture"), "not with --sweep, a table of what is forecast; leave it out")
     names, why = ("arm_noise", *_MOST), "applies only to a laser calibration; add --laser LASER.yaml"
     arguments.refuse(names, why)
     if len(arguments.config) != 1:

@@ -37,11 +37,9 @@ NAMES = (*_RANGES, "lens", "at", "jaw")
 
 
 def run(arguments: Arguments) -> int:
-    """Evaluate the mounts, print the table, draw the picture."""
+    """Evaluate the mounts, print the table."""
     from gripmon.daemon.config import load_config
-    from gripmon.daemon.forecast import rig_of
     from gripmon.daemon.sweeping import as_plain, make_grid, sweep, values_in
-    from gripmon.teach.mount_picture import draw_sweep, encoded
 
     config = load_config(arguments.config[0], check_source=False)
     typed = {name: getattr(arguments, name) for name in _RANGES}
@@ -54,16 +52,10 @@ def run(arguments: Arguments) -> int:
     travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", two_numbers(arguments.jaw or "")
     if travel_m is None and arguments.jaw is not None:
         raise InputError(f"--jaw {arguments.jaw}: isn't a range; MIN:MAX in metres, within {travel}")
-    arguments.check_outputs("picture")
     grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
     with progress_bar(len(grid), "mount") as step:
         swept = sweep(config, grid, place_px, travel_m, step)
     arguments.answer(as_plain(swept), _as_text(swept))
-    if arguments.picture is not None:
-        drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
-        arguments.save("picture", encoded(drawn, arguments.picture.suffix))
-        if not arguments.json:
-            print(f"picture    {arguments.picture}")
     return EXIT_DONE
 
 
