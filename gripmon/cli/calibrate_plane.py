@@ -44,7 +44,7 @@ IMAGE...                image file, or folder with images
 _EXAMPLES = """\
   gripmon calibrate plane on_plate.png --camera camera.yaml --target circles:8x8:0.008:0.004 \\
       --gripper gripper.yaml --jaw-opening 0.034 --corners rough.yaml --out hand_eye.yaml
-  gripmon calibrate plane plate/ --camera camera.yaml --target chequerboard:14x12:0.006 --infer \\
+  gripmon calibrate plane plate/ --camera camera.yaml --target circles:12x10:0.008:0.004 --infer \\
       --corners rough.yaml --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml
   gripmon calibrate plane plate/*.png --config arm1.yaml --target charuco:14x12:0.006:0.0044 \\
       --out hand_eye.yaml --picture hand_eye.png
@@ -64,7 +64,7 @@ def plane(arguments: Arguments) -> None:
     each, are averaged.
 
     The gripper is given (--gripper), or inferred from the same images (--infer): the four innermost
-    corners of two parallel fingertips form a rectangle about the TCP.
+    corners of two parallel fingertips form a rectangle about the TCP.  This needs a plate of discs.
 
     --corners names a file with rough positions, several pixels off is fine:
       corners:

@@ -136,6 +136,17 @@ def name_of(target: Target) -> str:
     return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
 
 
+def refuse_squares(target: Target) -> None:
+    """:class:`TargetError` for a pattern of squares, before which a gripper that isn't known can't be found: their
+    edges look like the outlines of fingers that stand on them.
+    """
+    if not isinstance(target, CircleGrid):
+        raise TargetError(
+            f"{name_of(target)}: the edges of its squares can't be told from the outlines of an unknown gripper; "
+            "discs, such as circles:12x10:0.008:0.004, or a gripper file (gripmon gripper from-images makes one)"
+        )
+
+
 def refuse_other_size(target: Target, recorded: str | None, made: str = "the camera was calibrated with") -> None:
     """Raise :class:`OtherSizeError` if the target ``recorded`` in a file (as :func:`name_of` writes it; None: none is)
     has the same pattern in another size: no image contradicts a wrong size, and what is measured scales with it.

@@ -32,7 +32,7 @@ from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
 from gripmon.model.response import in_light, response_of
-from gripmon.model.targets import Target, TargetError, parse_target, refuse_other_size
+from gripmon.model.targets import Target, TargetError, parse_target, refuse_other_size, refuse_squares
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.drawing import draw_on_plate
@@ -45,7 +45,6 @@ from gripmon.teach.outlines import (
     points_in_gripper,
     rough_pose,
 )
-from gripmon.teach.plate_print import plate_print
 from gripmon.track.edges.taught import TaughtEdges, gripper_digest
 
 Rough = Mapping[str, tuple[float, float]]
@@ -100,20 +99,16 @@ class KnownGripper:
 
 @dataclass(frozen=True, slots=True)
 class UnknownGripper:
-    """Calibrates with rough outlines alone, and infers the gripper, too.  ``target``: the plate, so that its print is
-    distinguished from the fingers.
-    """
+    """Calibrates with rough outlines alone, and infers the gripper, too."""
 
     camera: GivenCamera
-    target: Target | None = None
 
     def measure(self, image: Image, sighting: Sighting, rough: Rough | None) -> ImageOnPlate:
         """Raises :class:`CalibrationError`."""
         if rough is None:
             raise InputError("an unknown gripper needs rough corners")
         outline, camera = outlines_of(rough), make_camera(self.camera.lens)
-        printed = plate_print(camera, plate_pose(self.camera.lens, sighting)[0], sighting, self.target, image)
-        corners, snapped = measure_outlines(camera, image, outline, printed)
+        corners, snapped = measure_outlines(camera, image, outline)
         return ImageOnPlate(
             calibrate_image(self.camera, sighting, corners, None), {}, replace(outline, points=snapped.points)
         )
@@ -258,14 +253,17 @@ def calibrate_plane(
     calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, named as in
     :func:`gripmon.teach.outlines.outlines_of`.  ``jaw_opening_m`` is that in the images; nominal if None.
     ``response``: how grey levels follow the light, linear or srgb; auto: as the images show it.
+    :class:`~gripmon.model.targets.TargetError` for a chequerboard or ChArUco board without a gripper,
     :class:`~gripmon.model.targets.OtherSizeError` for the pattern of the camera's target in another size, unless
     ``other_target`` confirms it.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
+    if gripper is None:
+        refuse_squares(target)
     refuse_other_size(target, None if other_target else given.target)
     method = (
-        UnknownGripper(given, target)
+        UnknownGripper(given)
         if gripper is None
         else KnownGripper(given, gripper, checked_opening(gripper, jaw_opening_m), cam_T_grip)
     )

@@ -83,31 +83,29 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
     return Line(line.ends_px, line.covariance_px2, line.inlier, line.rms_px, line.seen, rival_px)
 
 
-def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None) -> Line | None:
+def settle_line(points: EdgePoints, start_px: Array) -> Line | None:
     """Robust straight line (Tukey's biweight, its width from the points' own scatter) from a start (2,); None if too
-    few points lie there.  ``worth`` (k,): the points' information, 1 on average; equal if None.
+    few points lie there.
     """
-    given = np.ones(len(points.way)) if worth is None else worth
-    root = np.sqrt(given)
     design = np.column_stack([1.0 - points.way, points.way])
     ends_px, width, scale = start_px, _START_PX, _FLOOR_PX
     for _ in range(_ROUNDS):
-        residual = root * (points.offset_px - design @ ends_px)
+        residual = points.offset_px - design @ ends_px
         weight = tukey_weights(np.abs(residual), width)
         near = np.abs(residual) < width
         if np.count_nonzero(near) < FEWEST_POINTS:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
         width = min(TUKEY * scale, _START_PX)
-        weighted = design * (root * weight)[:, None]
-        normal = weighted.T @ (design * root[:, None])
+        weighted = design * weight[:, None]
+        normal = weighted.T @ design
         if not np.linalg.cond(normal) < 1e6:
             return None
         step = np.linalg.solve(normal, weighted.T @ residual)
         ends_px = ends_px + step
         if np.abs(step).max() < _SETTLED_PX:
             break
-    residual = root * (points.offset_px - design @ ends_px)
+    residual = points.offset_px - design @ ends_px
     inlier = np.abs(residual) < width
     if np.count_nonzero(inlier) < FEWEST_POINTS:
         return None

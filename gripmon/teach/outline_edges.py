@@ -18,8 +18,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
 from gripmon.teach.lines import EdgePoints, Line, settle_line
-from gripmon.teach.outlines import INNERMOST, Outline
-from gripmon.teach.plate_print import PlatePrint, estimate_blur_px, line_offsets, look_at, rough_line
+from gripmon.teach.outlines import Outline
 from gripmon.track.edges.kernel import FEWEST_FREE
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
@@ -42,12 +41,9 @@ SEEN_SHARE = 0.4
 """Least part of its search lines that must show an edge."""
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
-LEAST_INFORMATION_SHARE = 0.1
-"""Least information of a search line in front of a print, over the 90 % quantile of all; others are dropped."""
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
-_LINE_UPDATES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,27 +69,19 @@ class _Base:
     way: Array
 
 
-def find_outline(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> FoundOutline:
-    """The outline on the edges that the image shows; in front of a known print, which has edges of its own, by
-    :mod:`~gripmon.teach.plate_print`.  Raises :class:`CalibrationError` with the name of the corner or edge that is
-    outside of the image, not seen, or not a corner.
+def find_outline(camera: Camera, image: Image, outline: Outline) -> FoundOutline:
+    """The outline on the edges that the image shows.  Raises :class:`CalibrationError` with the name of the corner or
+    edge that is outside of the image, not seen, or not a corner.
     """
     points = outline.points
     _check_inside(camera, outline)
-    before: list[SeenEdge] = []
     for turn in range(_ROUNDS):
         seen, bases = [], []
         for a, b in outline.edges:
             names = f"{outline.names[a]} to {outline.names[b]}"
             base, reach_px = _lay(camera, points[a], points[b], REACH_PX if turn == 0 else FINAL_REACH_PX, names)
-            if printed is None:
-                seen.append(_line(camera, image, base, reach_px, names, anywhere=turn == 0))
-            else:
-                finger = _side(outline, a)
-                known_px = float(before[len(seen)].width_px[0]) if before else None
-                seen.append(_line_before(image, printed, base, reach_px, names, finger, known_px))
+            seen.append(_line(camera, image, base, reach_px, names, anywhere=turn == 0))
             bases.append(base)
-        before = seen
         found = _meet(camera, outline, points, bases, [edge.line.ends_px for edge in seen])
         moved_px = float(np.linalg.norm(found - points, axis=1).max())
         points = found
@@ -167,56 +155,6 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
     return SeenEdge(line, points, np.asarray(found.width_px[near]))
 
 
-def _side(outline: Outline, point: int) -> float:
-    """The side of its edges on which the finger of a ``point`` lies: 1 to the right when going along them, else -1."""
-    inner = {name: outline.points[outline.names.index(name)] for name in INNERMOST}
-    own = outline.names[point].partition("_")[0]
-    other = "right" if own == "left" else "left"
-    near, far = inner[f"{own}_inner_near"], inner[f"{own}_inner_far"]
-    along, away = near - far, near + far - inner[f"{other}_inner_near"] - inner[f"{other}_inner_far"]
-    return 1.0 if along[0] * away[1] - along[1] * away[0] > 0.0 else -1.0
-
-
-def _line_before(
-    image: Image, printed: PlatePrint, base: _Base, reach_px: float, names: str, finger: float, known_px: float | None
-) -> SeenEdge:
-    """The edge of a finger, on the side ``finger`` of the base, in front of a known print: near the base and with the
-    blur ``known_px`` if that is given, else anywhere within reach.
-    """
-    scene = look_at(image, printed, base.uv_px, base.normal, reach_px + 6.0, finger)
-    ends_px = rough_line(scene, base.way, reach_px) if known_px is None else np.zeros(2)
-    row = np.arange(len(base.way))
-    seen: SeenEdge | None = None
-    blur_px = 1.0 if known_px is None else known_px
-    for turn in range(_LINE_UPDATES):
-        if known_px is None and turn < 2:
-            blur_px = estimate_blur_px(scene, base.way, ends_px)
-        asked = line_offsets(scene, base.way, ends_px, blur_px)
-        used = asked.worth > LEAST_INFORMATION_SHARE * np.quantile(asked.worth, 0.9)
-        worth = asked.worth[used] / asked.worth[used].mean()
-        points = EdgePoints(
-            base.way[used], asked.offset_px[used], worth, row[used], np.zeros(int(used.sum()), np.intp),
-            row[used], np.array([int(used.sum())]),
-        )  # fmt: skip
-        line = settle_line(points, ends_px, worth)
-        if line is None or np.abs(line.ends_px).max() > reach_px + 1.0:
-            seen = None
-            break
-        moved_px = float(np.abs(line.ends_px - ends_px).max())
-        ends_px = line.ends_px
-        seen = SeenEdge(line, points, np.full(len(worth), blur_px), worth)
-        if turn > 1 and moved_px < 0.01:
-            break
-    if seen is None or seen.line.seen < SEEN_SHARE:
-        share = 0.0 if seen is None else 100.0 * seen.line.seen
-        raise CalibrationError(
-            f"{names}: where it stands out from the plate's print, {share:.0f} % of it shows one straight edge within "
-            f"{reach_px:.0f} px; at least {100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, the target as "
-            "it was described, fingers of another brightness than the print"
-        )
-    return seen
-
-
 def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
     """The line (2,), its offsets at both ends, that most points support, weighted by ``worth`` (k,); of similar ones
     the closest to the rough line.
@@ -288,21 +226,17 @@ _LEAST_PX = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SeenEdge:
-    """A line with the ``points`` (k,) it was chosen from, their edges' ``width_px`` (k,), and their information
-    ``worth`` (k,), 1 on average; equal if None.
-    """
+    """A line with the ``points`` (k,) it was chosen from, and their edges' ``width_px`` (k,)."""
 
     line: Line
     points: EdgePoints
     width_px: Array
-    worth: Array | None = None
 
     def design(self) -> tuple[Array, Array]:
-        """Rows (m, 2) and values (m,) of the weighted least squares whose solution is the line."""
+        """Rows (m, 2) and values (m,) of the least squares whose solution is the line."""
         inlier = self.line.inlier
         way = self.points.way[inlier]
-        root = np.ones(len(way)) if self.worth is None else np.sqrt(self.worth[inlier])
-        return np.column_stack([1.0 - way, way]) * root[:, None], self.points.offset_px[inlier] * root
+        return np.column_stack([1.0 - way, way]), self.points.offset_px[inlier]
 
 
 def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
@@ -345,13 +279,9 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
     return float(np.square(stretch.T @ residual).sum()), float(stretch.shape[1] - np.square(basis.T @ stretch).sum())
 
 
-def measure_outlines(
-    camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
-) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of an unknown gripper's fingertips, from their rough outlines; ``printed`` and errors as in
-    :func:`find_outline`.
-    """
-    snapped = find_outline(camera, image, outline, printed)
+def measure_outlines(camera: Camera, image: Image, outline: Outline) -> tuple[FingerCorners, FoundOutline]:
+    """Corners of an unknown gripper's fingertips, from their rough outlines; errors as in :func:`find_outline`."""
+    snapped = find_outline(camera, image, outline)
     corners = list(outline.corners)
     names = tuple(outline.names[k] for k in corners)
     return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped

@@ -32,7 +32,7 @@ from gripmon.io.wire.session import check_name
 from gripmon.model.atomic import writable_folder, write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import IMAGE_SUFFIXES
-from gripmon.model.targets import OtherSizeError, name_of, parse_target
+from gripmon.model.targets import OtherSizeError, name_of, parse_target, refuse_squares
 from gripmon.teach.messages import encoded
 
 SETUP, VIEW = "setup.yaml", "view.jpg"
@@ -284,6 +284,7 @@ class Project:
     def _gripper(self) -> list[Line] | None:
         words = BY_NAME["gripper"].command(self.values)
         if words is None:
+            refuse_squares(target_in(self.values))
             lines = [jaws(self.values["jaw_range"]), Line("the step Hand and eye makes the gripper file", "OK")]
             self._accept("gripper")
             return lines

@@ -157,14 +157,14 @@ def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSe
             target = read_yaml(camera).get("target")
         lens, _ = read_lens(camera)
         check_size(str(image), shown, lens.width_px, lens.height_px)
-    known = isinstance(target, str)
+    known = isinstance(target, str) and target.startswith("circles")
     words = ["gripmon", "calibrate", "plane", image, "--camera", camera or "camera.yaml"]
     words += ["--target", camera if known else "TARGET", "--infer", "--corners", folder / ROUGH]
     words += ["--gripper-out", folder / "gripper.yaml", "--out", folder / "hand_eye.yaml"]
     plate = (
         f"the plate is assumed to be the camera's target, {target}; for another one give --target"
         if known
-        else "TARGET is the plate, such as circles:12x10:0.008:0.004"
+        else "TARGET is the plate, of discs, such as circles:12x10:0.008:0.004"
     )
     note = f"{plate}; with jaws that move also --jaw-range MIN:MAX (m)"
     picture = Picture(image.name, shown, None, str(image))
