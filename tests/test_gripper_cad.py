@@ -295,7 +295,7 @@ def test_the_command_writes_a_file_that_loads_and_a_picture(tmp_path: Path, caps
     words = ("--unit", "mm", "--jaw-range", "0:0.06", "--camera", camera, "--view", "0.115:32", "--picture", picture)
     assert from_cad(*paths, *words, "--out", out) == 0
     printed = capsys.readouterr().out
-    assert "jaw: 0.0 to 60.0 mm, as drawn 34.0 mm" in printed and f"written: {out} (the gripper g)" in printed
+    assert "jaw: 0.0 to 60.0 mm, in the file 34.0 mm" in printed and f"written: {out}" in printed
     gripper = read_gripper(out)
     assert any("round" in line for line in out.read_text().splitlines()) and gripper.jaw_max_m == 0.06
     assert picture.stat().st_size > 10_000

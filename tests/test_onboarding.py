@@ -67,10 +67,7 @@ def true_of(found: Coincidence, lens: LensSettings) -> np.ndarray:
     ("target", "known"),
     [
         ("discs", False),
-        *(
-            pytest.param(name, True, marks=pytest.mark.slow("2 s each; inferred by default"))
-            for name in TARGETS
-        ),
+        *(pytest.param(name, True, marks=pytest.mark.slow("2 s each; inferred by default")) for name in TARGETS),
     ],
 )
 def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
@@ -150,7 +147,7 @@ def test_the_inferred_gripper_is_the_true_one_and_a_monitor_takes_it():
     method = UnknownGripper(GivenCamera(PAPER_LENS))
     seen = method.measure(image("discs"), sight("discs"), rough(outline_pixels(TRUE), 4))
     result = average([seen.coincidence], True)
-    gripper = HandEyeOnPlate(result, method, (seen,), (), (), image("discs")).gripper("new", (0.0, 0.06))
+    gripper = HandEyeOnPlate(result, method, (seen,), (), (), image("discs")).result("new", (0.0, 0.06)).gripper
     model, true = gripper.model, sharp_gripper()
     assert outline.names == tuple(model.points)
     for name in gripper.corner_ids:

@@ -85,7 +85,7 @@ def plane(arguments: Arguments) -> None:
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
     from gripmon.model.targets import name_of
-    from gripmon.teach.hand_eye import calibrate_plane, gripper_values
+    from gripmon.teach.hand_eye import calibrate_plane
 
     _check_options(arguments)
     cv2.setNumThreads(1)
@@ -103,10 +103,10 @@ def plane(arguments: Arguments) -> None:
     # In full even if a file named it: the hand/eye calibration records its target nowhere else.
     described = name_of(target) if is_target_file(arguments.target) else arguments.target
     provenance = provenance_of(arguments.command_line(target=described), list(dict.fromkeys([*paths, *given.files])))
-    made = found.gripper(arguments.name, arguments.jaw_range, arguments.jaw_opening, provenance)
+    made = found.result(arguments.name, arguments.jaw_range, arguments.jaw_opening, provenance)
     written = [path for path in (arguments.gripper_out, arguments.out) if path is not None]
-    arguments.save("gripper_out", lambda: gripper_values(made.model))
-    arguments.save("out", found.document(made, provenance))
+    arguments.save("gripper_out", made.text().encode())
+    arguments.save("out", made.reference(provenance))
     note(f"warning: {warning}" for warning in found.fit.warnings)
     notes = [*given.notes, *found.notes]
     values = {**found.values(), "notes": notes, "written": [str(path) for path in written]}

@@ -15,10 +15,14 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from gripmon.model.errors import InputError
 from gripmon.model.units import jaw_opening_in, jaw_range_in
+
+if TYPE_CHECKING:
+    from gripmon.model.provenance import Provenance
+    from gripmon.teach.result import GripperResult
 
 _T = TypeVar("_T")
 REQUIRED = {"required": True}
@@ -226,6 +230,16 @@ class Arguments(argparse.Namespace):
                 from gripmon.daemon.calibrations import write_document
 
                 write_document(made, path)
+
+    def save_gripper(self, made: GripperResult, provenance: Provenance) -> None:
+        """Write what the options name of a gripper, its file, reference and picture, and print its summary."""
+        self.save("out", made.text().encode())
+        if getattr(self, "reference_out", None) is not None:
+            self.save("reference_out", made.reference(provenance))
+        self.save("picture", made.picture)
+        paths = (getattr(self, name, None) for name in ("out", "reference_out", "picture"))
+        written = [str(path) for path in paths if path is not None]
+        self.answer({**made.values(), "written": written}, [*made.summary(), *(f"written: {each}" for each in written)])
 
 
 def _option(name: str) -> str:

@@ -40,6 +40,7 @@ FILE...                 .stl, .obj, .ply, .dae, .cao: one per finger, or both in
 --name NAME             the gripper's name (default: FILE's; for several FILEs that of --out)
 --picture FILE.png      also draw the model in the view
 --force                 replace existing files
+--json                  one JSON object instead of text; m
 """
 
 _EXAMPLES = """\
@@ -104,13 +105,12 @@ def from_cad(arguments: Arguments) -> None:
     if missing:
         raise InputError(f"{missing[0]}: there is no such file; a mesh, URDF or .cao")
     name = arguments.name or (arguments.out.stem if len(arguments.file) > 1 else None)
+    provenance = provenance_of(arguments.command_line(), arguments.file)
     made = gripper_from_cad(
         arguments.file, unit=arguments.unit, name=name, camera=camera, cam_T_grip=cam_T_grip,
         jaw_range_m=arguments.jaw_range, jaw_opening_m=arguments.jaw_opening, joint=arguments.joint,
         body=arguments.body, frame=arguments.frame, approach=arguments.approach, length_m=arguments.length,
         bevel_m=UNTOLD_BEVEL_M if arguments.bevel is None else arguments.bevel,
-        provenance=provenance_of(arguments.command_line(), arguments.file), progress=progress_bar,
+        provenance=provenance, progress=progress_bar,
     )  # fmt: skip
-    arguments.save("out", made.text().encode())
-    arguments.save("picture", made.picture)
-    print("\n".join([*made.summary(), f"written: {arguments.out} (the gripper {made.model.name})"]))
+    arguments.save_gripper(made, provenance)

@@ -78,7 +78,6 @@ def from_images(arguments: Arguments) -> None:
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.fingers import UnclearPartsError
     from gripmon.teach.from_images import gripper_from_images
-    from gripmon.teach.hand_eye import gripper_values
 
     arguments.check_outputs("out", "reference_out", "picture")
     cv2.setNumThreads(1)
@@ -95,10 +94,4 @@ def from_images(arguments: Arguments) -> None:
     except UnclearPartsError as unclear:
         arguments.save("picture", unclear.picture(image_in(images[0])))
         raise
-    arguments.save("out", gripper_values(found.gripper.model))
-    arguments.save("reference_out", lambda: found.document(provenance))
-    arguments.save("picture", found.picture)
-    outputs = arguments.out, arguments.reference_out, arguments.picture
-    written = [str(path) for path in outputs if path is not None]
-    lines = [*found.summary(), *(f"written: {path}" for path in written)]
-    arguments.answer({**found.values(), "written": written}, lines)
+    arguments.save_gripper(found, provenance)

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.geometry import make_transform, to_record
+from gripmon.model.geometry import make_transform
 from gripmon.model.gripper import Gripper, GripperError
 from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
@@ -35,7 +34,7 @@ from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
 from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
 from gripmon.teach.motion_depth import move
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.teach.result import GripperResult
 
 MOST_IMAGES = 200
 FEW_IMAGES = 10
@@ -45,84 +44,33 @@ WORST_OUTLINE_PX = 1.0
 """Standard deviation of an outline from which it is refused: search lines at work reach 3 px to either side."""
 
 
-@dataclass(frozen=True)
-class GripperFromImages:
-    """``gripper`` and its pose: ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error, position of the TCP
-    then rotation, camera axes.  ``opening_m``: at which the coordinates hold; ``outline_sigma_px``: median standard
-    deviation of the outline's vertices from their scatter over the images, and ``images``, the number of these, both at
-    this opening; ``left_out``: images that weren't used, and why; ``notes``: what is unknown or was assumed.
+@dataclass(frozen=True, kw_only=True)
+class GripperFromImages(GripperResult):
+    """A gripper from images with its pose.  ``outline_sigma_px``: median standard deviation of the outline's vertices
+    from their scatter over the images; ``left_out``: images that weren't used, and why; ``seen``: what the others show,
+    ``shown`` the first of them.
     """
 
-    gripper: Gripper
     cam_T_grip: Array
     covariance: Array
-    opening_m: float | None
     outline_sigma_px: float
-    images: int
     left_out: dict[str, str]
-    notes: tuple[str, ...]
-    lens: LensSettings
     seen: OpeningSeen
     shown: Image
-    names: tuple[str, ...]
-    rms_px: float
 
     def picture(self) -> Image:
         """The first image used, with outline, scatter and fingers; BGR."""
-        return draw_outlines(self.shown, self.seen, self.names)
+        return draw_outlines(self.shown, self.seen, self.gripper.finger_ids)
 
     def values(self) -> dict[str, Any]:
         """The result as plain values: m, rad, px."""
-        model, transform = self.gripper.model, to_record(self.cam_T_grip)
-        fingers = {}
-        for name in self.gripper.finger_ids:
-            own = [e for e in model.edges.values() if model.points[e.start].finger == name]
-            fingers[name] = {
-                "edges": sum(edge.kind == "contour" for edge in own),
-                "inner_edges": sum(edge.kind == "crease" for edge in own),
-                "corners": sum(point.corner for point in model.points.values() if point.finger == name),
-            }
-        return {
-            "fingers": fingers,
-            "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
-            "covariance": self.covariance.ravel().tolist(),
-            "jaw_opening_m": self.opening_m,
-            "outline_sigma_px": self.outline_sigma_px,
-            "images": self.images,
-            "left_out": self.left_out,
-            "notes": self.notes,
-        }
+        own = {"outline_sigma_px": self.outline_sigma_px, "images": self.images, "left_out": self.left_out}
+        return {**super().values(), **own}
 
-    def summary(self) -> list[str]:
-        """What a person should know."""
-        lines = [f"left out: {file}: {why}" for file, why in self.left_out.items()]
-        for name, finger in self.values()["fingers"].items():
-            corners, edges, inner = finger["corners"], finger["edges"], finger["inner_edges"]
-            lines.append(f"{name}: {edges} edges of its outline, {inner} inner ones, {corners} corners")
-        lines.append(f"outline known to {self.outline_sigma_px:.3f} px (median), by {self.images} images")
-        x, y, z = (1e3 * value for value in self.cam_T_grip[:3, 3].tolist())
-        sx, sy, sz = (1e3 * self.covariance[k, k] ** 0.5 for k in range(3))
-        lines.append(f"TCP in the camera frame  {x:.2f} {y:.2f} {z:.2f} mm  +- {sx:.2f} {sy:.2f} {sz:.2f} mm")
-        return [*lines, *(f"note: {note}" for note in self.notes)]
-
-    def document(self, provenance: Provenance) -> HandEyeCalibration:
-        """The reference, as a file holds it."""
-        pixel_m = float(self.cam_T_grip[2, 3]) / self.lens.fx_px
-        return HandEyeCalibration(
-            camera=self.lens,
-            gripper=CalibratedGripper(name=self.gripper.name, sha256=gripper_digest(self.gripper)),
-            jaw_opening_m=self.opening_m,
-            cam_T_grip=to_record(self.cam_T_grip),
-            covariance=tuple(self.covariance.ravel().tolist()),
-            residuals=HandEyeResiduals(
-                rms_m=self.rms_px * pixel_m,
-                rms_px=self.rms_px,
-                corners=len(self.gripper.corner_ids),
-                images=self.images,
-            ),
-            warnings=self.notes,
-            provenance=provenance,
-        )
+    def about(self) -> list[str]:
+        """How well the outline is known, and which images weren't used."""
+        known = f"outline known to {self.outline_sigma_px:.3f} px (median), by {self.images} images"
+        return [known, *(f"left out: {file}: {why}" for file, why in self.left_out.items())]
 
 
 def gripper_from_images(
@@ -219,12 +167,12 @@ def gripper_from_images(
     rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
     used = len(seen.matte.kept)
     shown = taken[groups[first][seen.matte.kept[0]]][1]
-    names = tuple(outline.name for outline in outlines)
+    rms_px = float(np.sqrt(np.square(rms).mean()))
     return GripperFromImages(
-        gripper, cam_T_grip, covariance, opening_m, outline_px, used, left_out,
-        tuple(notes), camera,
-        seen,
-        shown, names, float(np.sqrt(np.square(rms).mean())),
+        gripper=gripper, notes=tuple(notes), lens=camera, cam_T_grip=cam_T_grip, covariance=covariance,
+        opening_m=opening_m, corners=len(gripper.corner_ids), images=used, rms_px=rms_px,
+        rms_m=rms_px * float(cam_T_grip[2, 3]) / camera.fx_px, outline_sigma_px=outline_px,
+        left_out=left_out, seen=seen, shown=shown,
     )  # fmt: skip
 
 

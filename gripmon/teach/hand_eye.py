@@ -12,12 +12,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera, plate_pose
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.plane import Coincidence, KnownCorners
 from gripmon.calibrate.plane import calibrate_plane as calibrate_image
 from gripmon.calibrate.plane_average import PlaneCalibration, against, average
@@ -26,7 +25,7 @@ from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
-from gripmon.model.gripper import Gripper, GripperError, GripperModel
+from gripmon.model.gripper import Gripper, GripperError
 from gripmon.model.images import check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
@@ -45,7 +44,8 @@ from gripmon.teach.outlines import (
     points_in_gripper,
     rough_pose,
 )
-from gripmon.track.edges.taught import TaughtEdges, gripper_digest
+from gripmon.teach.result import GripperResult
+from gripmon.track.edges.taught import TaughtEdges
 
 Rough = Mapping[str, tuple[float, float]]
 Pose = tuple[Array, Array]
@@ -142,18 +142,37 @@ class HandEyeOnPlate:
         """Whether the gripper is inferred from the same images."""
         return isinstance(self.method, UnknownGripper)
 
-    def gripper(
+    def result(
         self,
         name: str = "gripper",
         jaw_range_m: tuple[float, float] | None = None,
         jaw_opening_m: float | None = None,
         provenance: Provenance | None = None,
+    ) -> GripperResult:
+        """The known gripper, or the one inferred from the images (``jaw_range_m``: the range of its jaw), where it
+        stands.
+        """
+        known = self.method.gripper if isinstance(self.method, KnownGripper) else None
+        gripper = known or self._inferred(self.method.camera, name, jaw_range_m, jaw_opening_m, provenance)
+        opening_m = self.method.jaw_opening_m if isinstance(self.method, KnownGripper) else None
+        if opening_m is None and gripper.has_jaw:
+            opening_m = gripper.jaw_nominal_m
+        return GripperResult(
+            gripper=gripper, notes=self.fit.warnings, lens=self.method.camera.lens, cam_T_grip=self.fit.cam_T_grip,
+            covariance=self.fit.covariance, opening_m=opening_m, rms_m=self.fit.rms_m, rms_px=self.fit.rms_px,
+            corners=sum(len(image.corners.names) for image in self.fit.images), images=len(self.fit.images),
+        )  # fmt: skip
+
+    def _inferred(
+        self,
+        given: GivenCamera,
+        name: str,
+        jaw_range_m: tuple[float, float] | None,
+        jaw_opening_m: float | None,
+        provenance: Provenance | None,
     ) -> Gripper:
-        """The gripper: the known one, or the one inferred from the images (``jaw_range_m``: the range of its jaw)."""
-        if isinstance(self.method, KnownGripper):
-            return self.method.gripper
         outlines = [image.outline for image in self.images if image.outline is not None]
-        outline, camera = outlines[0], make_camera(self.method.camera.lens)
+        outline, camera = outlines[0], make_camera(given.lens)
         # Corners from all images jointly, ends of edges as their mean.
         alike = [one.points for one in outlines if one.names == outline.names]
         points_m = np.mean([points_in_gripper(camera, outline, uv_px, self.cam_T_grip) for uv_px in alike], axis=0)
@@ -162,27 +181,6 @@ class HandEyeOnPlate:
             return Gripper(inferred_model(name, outline, points_m, jaw_range_m, jaw_opening_m, provenance))
         except GripperError as error:
             raise CalibrationError(f"the corners don't form a gripper: {error}") from None
-
-    def document(self, gripper: Gripper, provenance: Provenance) -> HandEyeCalibration:
-        """The content of the calibration's file."""
-        opening_m = self.method.jaw_opening_m if isinstance(self.method, KnownGripper) else None
-        if opening_m is None and gripper.has_jaw:
-            opening_m = gripper.jaw_nominal_m
-        return HandEyeCalibration(
-            camera=self.method.camera.lens,
-            gripper=CalibratedGripper(name=gripper.name, sha256=gripper_digest(gripper)),
-            jaw_opening_m=opening_m,
-            cam_T_grip=to_record(self.fit.cam_T_grip),
-            covariance=tuple(self.fit.covariance.ravel().tolist()),
-            residuals=HandEyeResiduals(
-                rms_m=self.fit.rms_m,
-                rms_px=self.fit.rms_px,
-                corners=sum(len(image.corners.names) for image in self.fit.images),
-                images=len(self.fit.images),
-            ),
-            warnings=self.fit.warnings,
-            provenance=provenance,
-        )
 
     def values(self) -> dict[str, Any]:
         """The result as plain values: m, rad, px."""
@@ -344,17 +342,6 @@ def _sighting(image: Image, target: Target, name: str) -> Sighting:
     if found.larger:
         raise TargetError(f"{name}: {found.reason}; its full size")
     raise CalibrationError(found.reason)
-
-
-def gripper_values(model: GripperModel) -> dict[str, Any]:
-    """A gripper as in its file: without keys that have their default."""
-    out: dict[str, Any] = msgspec.to_builtins(model)
-    out["fingers"] = {
-        name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()
-    }
-    plain = {"kind": "contour", "brighter": "any", "bevel_m": 0.0}
-    out["edges"] = {name: {k: v for k, v in edge.items() if v != plain.get(k)} for name, edge in out["edges"].items()}
-    return {key: value for key, value in out.items() if value not in (None, [], (), 0.0)}
 
 
 def measure_tracked(

@@ -12,61 +12,34 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
-from gripmon.model.gripper import UNTOLD_BEVEL_M, WIDEST_BEVEL_M, Gripper, GripperError, GripperModel
+from gripmon.model.gripper import UNTOLD_BEVEL_M, WIDEST_BEVEL_M, Gripper, GripperError
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
-from gripmon.model.records import Array, Image
+from gripmon.model.records import Array
 from gripmon.teach.cad.depth import DepthMap, Pinhole
 from gripmon.teach.cad.files import UNITS_M
 from gripmon.teach.cad.frame import AXES, axes_of, check_level, frame_of
 from gripmon.teach.cad.jaw import jaw_of
 from gripmon.teach.cad.outline import outline_shape
 from gripmon.teach.cad.parts import LONGEST_M, STRAIGHT_NOTE, Parts, read_parts
-from gripmon.teach.cad.picture import draw_gripper
 from gripmon.teach.cad.solid import Shape, cut, is_solid, solid_shape
 from gripmon.teach.cad.surface import Surface
-from gripmon.teach.cad.written import gripper_text, model_of
+from gripmon.teach.cad.written import model_of
+from gripmon.teach.result import GripperResult
 
 
-@dataclass(frozen=True)
-class CadGripper:
-    """A gripper from CAD: its ``model`` and the ``notes`` on it; ``origins``: the file, bodies or links of each finger;
-    ``grip_T_cad`` (4, 4); ``camera`` and ``cam_T_grip``: the view that was given, None without one.
+@dataclass(frozen=True, kw_only=True)
+class CadGripper(GripperResult):
+    """A gripper from CAD, in the view that was given, if one was; ``origins``: the file, bodies or links of each
+    finger; ``grip_T_cad`` (4, 4).
     """
 
-    model: GripperModel
-    gripper: Gripper
-    shapes: dict[str, Shape]
     origins: tuple[str, ...]
     grip_T_cad: Array
-    camera: Camera | None
-    cam_T_grip: Array | None
-    notes: tuple[str, ...]
 
-    def text(self) -> str:
-        """The gripper file (YAML), with comments."""
-        return gripper_text(self.model, self.notes)
-
-    def summary(self) -> list[str]:
-        """A summary for people: each finger's corners, edges, faces and size, the jaw's range, and the notes."""
-        lines = []
-        for (finger, shape), origin in zip(self.shapes.items(), self.origins, strict=True):
-            used = shape.points_m[sorted({p for edge in shape.edges for p in edge})]
-            size = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(used, axis=0))
-            counts = f"{len(shape.corners)} corners, {len(shape.edges)} edges, {len(shape.loops)} faces"
-            lines.append(f"{finger} ({origin}): {counts}, {size} mm")
-        if self.model.jaw is not None:
-            jaw = self.model.jaw
-            lines.append(
-                f"jaw: {1e3 * jaw.min_m:.1f} to {1e3 * jaw.max_m:.1f} mm, as drawn {1e3 * jaw.nominal_m:.1f} mm"
-            )
-        return [*lines, *(f"note: {note}" for note in self.notes)]
-
-    def picture(self) -> Image:
-        """The model in the view, BGR: outlines, creases, corners by name.  ValueError without a view."""
-        if self.camera is None or self.cam_T_grip is None:
-            raise ValueError("no view: a camera and cam_T_grip")
-        return draw_gripper(self.camera, self.gripper, self.cam_T_grip)
+    def called(self, finger: str) -> str:
+        """A finger with where it comes from."""
+        return f"{finger} ({self.origins[self.gripper.finger_ids.index(finger)]})"
 
 
 def gripper_from_cad(
@@ -131,7 +104,11 @@ def gripper_from_cad(
     except GripperError as error:
         raise InputError(f"{files[0]}: {_what_shows(shapes)} ({error}); another view, or --length") from None
     notes += [_on_bevels(bevel_m), *gripper.notes]
-    return CadGripper(model, gripper, shapes, parts.origins, grip_T_tip @ tip_T_cad, camera, cam_T_grip, tuple(notes))
+    lens = None if camera is None else camera.settings
+    return CadGripper(
+        gripper=gripper, notes=tuple(notes), lens=lens, cam_T_grip=cam_T_grip, origins=parts.origins,
+        grip_T_cad=grip_T_tip @ tip_T_cad,
+    )  # fmt: skip
 
 
 def _shapes(
