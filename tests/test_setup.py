@@ -27,11 +27,11 @@ from gripmon.cli import main
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.overlay import outlines_of, overlay
+from gripmon.daemon.robot_file import reference_text
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import other_target, target_in
 from gripmon.daemon.setup.lines import Line
-from gripmon.daemon.setup.robot_file import reference_text
 from gripmon.daemon.setup.site import CaptureOrder, StepRequest
 from gripmon.daemon.setup.steps import defaults, in_fields
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved

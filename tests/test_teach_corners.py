@@ -15,6 +15,7 @@ from support.simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plai
 from support.taught_by_hand import Rig, make_rig
 from support.taught_scenes import CAMERA, bevelled, image_of, scene
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.cli import main
 from gripmon.daemon.config import Settings, builtin_config, load_config, read_gripper
@@ -28,7 +29,7 @@ from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor
 from gripmon.teach.accuracy import forecast_accuracy
-from gripmon.teach.corner_pose import CameraError, PoseRefused, place, pose_from_corners, usual_view
+from gripmon.teach.corner_pose import PoseRefused, place, pose_from_corners, usual_view
 from gripmon.teach.inset import unstated_inset_m
 from gripmon.teach.session import Setup
 from gripmon.teach.views import TeachingImage
@@ -173,7 +174,7 @@ def test_the_pose_is_as_good_as_its_covariance_says():
     """Over poses, openings that are reported wrongly, and cameras that are calibrated wrongly, by what is stated."""
     gripper, rng = sharp_gripper(), np.random.default_rng(8)
     sigma_m, sigma_px = 1e-4, 4.0
-    error = CameraError(("fx_px", "cx_px", "cy_px"), np.diag([sigma_px**2] * 3))
+    error = GivenCamera(PAPER_LENS, ("fx_px", "cx_px", "cy_px"), np.diag([sigma_px**2] * 3))
     squares = []
     for trial in range(24):
         off = rng.normal(0.0, sigma_px, 3)

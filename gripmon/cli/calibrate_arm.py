@@ -170,13 +170,13 @@ def robot_world(arguments: Arguments) -> None:
     from gripmon.calibrate.api import calibrate_robot_world
     from gripmon.calibrate.documents import robot_world_document
     from gripmon.calibrate.tables import read_arm_poses
-    from gripmon.daemon.calibrations import read_given_camera
+    from gripmon.daemon.calibrations import camera_in
     from gripmon.daemon.targets import target_of
     from gripmon.model.provenance import provenance_of
 
     arguments.check_outputs("out")
     target = None if arguments.target is None else target_of(arguments.target)
-    camera = None if arguments.camera is None else read_given_camera(arguments.camera)
+    camera = None if arguments.camera is None else camera_in(arguments.camera)
     poses = read_arm_poses(arguments.data, camera, target, progress_bar, other_target=arguments.other_target)
     note(poses.unseen)
     found = calibrate_robot_world(

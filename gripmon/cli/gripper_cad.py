@@ -92,13 +92,13 @@ def from_cad(arguments: Arguments) -> None:
     outlines are those of one view: --camera with --reference, or with a rough --view.  Make such a file
     again when the camera moves by more than some degrees.
     """
-    from gripmon.daemon.teaching.views import read_view
+    from gripmon.daemon.calibrations import view_in
     from gripmon.model.gripper import UNTOLD_BEVEL_M
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.cad import gripper_from_cad
 
     arguments.check_outputs("out", "picture")
-    camera, cam_T_grip = read_view(arguments.camera, arguments.reference, arguments.view)
+    camera, cam_T_grip = view_in(arguments.camera, arguments.reference, arguments.view)
     if arguments.picture is not None and (camera is None or cam_T_grip is None):
         raise InputError("--picture: needs a view; add --camera and --reference or --view")
     missing = [path for path in arguments.file if not path.is_file()]

@@ -1,4 +1,6 @@
-"""Calibrations from files of ``gripmon calibrate``, a configuration, a monitor's state or its estimates."""
+"""What options and files name: a camera, a gripper's pose, the inputs of a calibration.  One reader for all of them, of
+files of ``gripmon calibrate``, a robot's own, a configuration, a monitor's state or its estimates.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +14,28 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.documents import HandEyeCalibration
+from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.checks import covariance_of
 from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_document, read_settings, read_yaml
+from gripmon.daemon.robot_file import is_robot_reference, robot_reference
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
-from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import LARGEST_BYTES, image_paths
 from gripmon.model.provenance import Provenance
-from gripmon.model.records import Array, FrameRecord
+from gripmon.model.records import Array, FrameRecord, Transform
 from gripmon.model.targets import Target, refuse_other_size
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.teach.hand_eye import calibrate_plane, checked_opening, measure_tracked
+from gripmon.teach.mounts import Mount, towards
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
 
@@ -66,6 +71,10 @@ def _of_yaml(path: Path, values: dict[str, object]) -> Calibrated:
         return readers[str(values["schema"])](path)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
+    if is_robot_reference(values):
+        return _robot(path, values)
+    if "model" in values:
+        return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
     kind = kind_of(values)
     raise InputError(f"{path}: holds no calibration{f', it is {kind}' if kind else ''}; {_RIGHT}")
 
@@ -123,8 +132,18 @@ def _configuration(path: Path) -> Calibrated:
         config.settings.camera,
         cam_T_grip=reference.cam_T_grip,
         covariance=reference.covariance,
+        gripper=CalibratedGripper(name=config.gripper.name, sha256=gripper_digest(config.gripper)),
         pose_notes=(f"the configured reference {reference.reference_id}", *_uncertainty(reference.covariance)),
     )
+
+
+def _robot(path: Path, values: dict[str, object]) -> Calibrated:
+    settings = robot_reference(path, values)
+    told, covariance = settings.cam_T_grip, covariance_of(settings)
+    return Calibrated(
+        str(path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
+        covariance=covariance, pose_notes=tuple(_uncertainty(covariance)),
+    )  # fmt: skip
 
 
 def _state(path: Path, data: bytes) -> Calibrated:
@@ -179,14 +198,53 @@ def _uncertainty(covariance: tuple[float, ...]) -> list[str]:
     return [f"one standard deviation along and about the camera's x, y, z: {mm} mm (TCP), {degrees} degrees"]
 
 
-def read_given_camera(path: Path) -> GivenCamera:
-    """A valid calibrated camera with its covariance.  :class:`~gripmon.model.errors.InputError`."""
-    found = read_camera(path)
+def camera_in(path: Path) -> GivenCamera:
+    """The camera in a file, with its covariance if the file has one.  :class:`~gripmon.model.errors.InputError`."""
+    found = read_calibrated(path)
+    if found.lens is None:
+        raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
     try:
-        make_camera(found.camera)
+        make_camera(found.lens)
     except ValueError as error:
         raise InputError(f"{path}: camera.{error}") from None
-    return GivenCamera.calibrated(found)
+    count = len(found.parameters)
+    covariance = np.reshape(found.lens_covariance, (count, count)) if count else None
+    return GivenCamera(found.lens, found.parameters, covariance, found.target)
+
+
+def pose_in(path: Path) -> tuple[Array, Array]:
+    """``cam_T_grip`` (4, 4) in a file, and the covariance (6, 6) of its error.
+    :class:`~gripmon.model.errors.InputError`.
+    """
+    found = read_calibrated(path)
+    if found.cam_T_grip is None:
+        raise InputError(
+            f"{path}: holds no cam_T_grip; a file of gripmon calibrate plane, a configuration, or cam_T_grip with "
+            "position_sigma_m and rotation_sigma_rad",
+            "reference",
+        )
+    return from_record(found.cam_T_grip), np.reshape(found.covariance, (6, 6))
+
+
+def view_in(
+    camera: Path | None, reference: Path | None, rough: tuple[float, float] | None
+) -> tuple[Camera | None, Array | None]:
+    """A camera and ``cam_T_grip`` (4, 4), None if not given; a reference's file may also hold its camera.
+
+    ``rough``: distance (m) of the TCP, which is in the middle of the image, and tilt of the optical axis from the
+    gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
+    """
+    cam_T_grip = None if reference is None else pose_in(reference)[0]
+    lens = None if camera is None else camera_in(camera).lens
+    if lens is None and reference is not None:
+        lens = read_calibrated(reference).lens
+    if rough is None:
+        return None if lens is None else make_camera(lens), cam_T_grip
+    if lens is None:
+        raise InputError("is missing: a rough view needs one; a file of gripmon calibrate intrinsics", "camera")
+    made = make_camera(lens)
+    middle = 0.5 * (made.width_px - 1.0), 0.5 * (made.height_px - 1.0)
+    return made, Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).cam_T_grip(towards(made, middle))
 
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
@@ -247,7 +305,7 @@ def plane_inputs(
     if jaw_opening_m is None and known is not None and loaded is not None and known.has_jaw:
         jaw_opening_m = loaded.jaw_opening_m
         notes = (f"jaw opening assumed to be {jaw_opening_m:g} m; --jaw-opening M if it was another",)
-    given = None if camera is None else read_given_camera(camera)
+    given = None if camera is None else camera_in(camera)
     if given is None:
         assert loaded is not None, "the caller asks for a camera"
         given = GivenCamera(loaded.settings.camera)

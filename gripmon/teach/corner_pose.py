@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.bundle import LensModel, lens_vector, model_of, parameter_names
+from gripmon.calibrate.bundle import GivenCamera, LensModel, lens_vector, model_of, parameter_names
 from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
@@ -75,14 +75,6 @@ class PoseRefused(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class CameraError:
-    """Uncertainty of a camera: ``covariance`` (n, n) of its ``parameters``, named as in its calibration file."""
-
-    parameters: tuple[str, ...]
-    covariance: Array
-
-
-@dataclass(frozen=True, slots=True)
 class CornerPose:
     """``cam_T_grip`` (4, 4), the covariance (6, 6) of its error, the ``corners`` it is computed from, and the weighted
     root mean square of their residuals, 1 where their covariances hold.  ``rival``: another pose fits them as well.  An
@@ -101,7 +93,7 @@ def pose_from_corners(
     gripper: Gripper,
     snapped: Snapped,
     by_hand_px: Mapping[str, Array],
-    camera_error: CameraError | None = None,
+    camera_error: GivenCamera | None = None,
     exact: bool = False,
 ) -> CornerPose:
     """Pose of the gripper from corners that were measured or set by hand; ``exact``: its edges are as sharp as the file
@@ -175,7 +167,7 @@ _Seen = tuple[Camera, float | None] | tuple[Camera, float | None, Array]
 
 
 def _error_sources(
-    camera: Camera, gripper: Gripper, snapped: Snapped, error: CameraError | None
+    camera: Camera, gripper: Gripper, snapped: Snapped, error: GivenCamera | None
 ) -> list[tuple[_Seen, _Seen]]:
     """Other sources of error, independent of each other: each a pair of inputs, a part of a standard deviation below
     and above.
@@ -186,7 +178,7 @@ def _error_sources(
         step_m = _STEP * snapped.jaw_sigma_m
         low_m, high_m = (float(np.clip(opening_m + s, gripper.jaw_min_m, gripper.jaw_max_m)) for s in (-step_m, step_m))
         sources.append(((camera, low_m), (camera, high_m)))
-    if error is not None and error.parameters:
+    if error is not None and error.covariance is not None and error.parameters:
         lens = camera.settings
         model = LensModel(model_of(lens), lens.width_px, lens.height_px)
         vector = lens_vector(lens)

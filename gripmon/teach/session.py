@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from gripmon import __version__
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.io.sources import Source, Waiting
 from gripmon.judge.drift import foresee
 from gripmon.judge.inspection import inspect
@@ -32,7 +33,6 @@ from gripmon.monitor import CORNER_COUNTS, MonitorSettings
 from gripmon.teach.accuracy import Promise, forecast_accuracy
 from gripmon.teach.api import Picture
 from gripmon.teach.corner_pose import (
-    CameraError,
     CornerPose,
     PoseRefused,
     Prior,
@@ -92,7 +92,7 @@ class Setup:
     gripper: Gripper
     settings: MonitorSettings
     reference: ReferenceRecord | None
-    camera_error: CameraError | None = None
+    camera_error: GivenCamera | None = None
     distance_m: tuple[float, float] | None = None
 
     def prior(self, jaw_opening_m: float | None) -> Prior:

@@ -19,12 +19,11 @@ from benchmarks.outlines import Beside, beside, drawn_outlines, projected_outlin
 from benchmarks.real import untrue, way
 from benchmarks.real_figures import Figures
 from benchmarks.real_runs import CONFIG, Limit, Run
-from gripmon.daemon.calibrations import read_calibrated, read_given_camera
+from gripmon.daemon.calibrations import camera_in, pose_in
 from gripmon.daemon.config import read_gripper
 from gripmon.io.sources.files import TIMESTAMPS_NAME
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import InputError
-from gripmon.model.geometry import from_record
 from gripmon.model.images import image_paths
 
 DRAWN = ROOT / "tests" / "data" / "real_outlines.json"
@@ -166,10 +165,8 @@ def _measured(made: Made, values: dict[str, Any]) -> Made:
         told = (made.folder / TIMESTAMPS_NAME).is_file()
         values["jaw"] = {"source": "frames"} if told else {"source": "fixed", "opening_m": gripper.jaw_nominal_m}
     (made.folder / CONFIG).write_text(yaml.safe_dump(values))
-    camera = make_camera(read_given_camera(made.folder / "camera.yaml").lens)
-    found = read_calibrated(made.folder / "reference.yaml").cam_T_grip
-    assert found is not None
-    cam_T_grip = from_record(found)
+    camera = make_camera(camera_in(made.folder / "camera.yaml").lens)
+    cam_T_grip = pose_in(made.folder / "reference.yaml")[0]
     drawn = drawn_outlines(DRAWN, made.name)
     off = None if drawn is None else beside(drawn, projected_outline(gripper, camera, cam_T_grip))
     return replace(made, distance_m=float(cam_T_grip[2, 3]), off=off)

@@ -224,7 +224,8 @@ def read_gripper(gripper_path: Path) -> Gripper:
 
 def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: CalibrationFiles) -> ReferenceRecord:
     file = calibrated.paths.get("reference", path)
-    fault = None if calibrated.hand_eye is None else calibrated_mismatch(calibrated.hand_eye, settings.camera, gripper)
+    made = calibrated.hand_eye
+    fault = None if made is None else calibrated_mismatch(made.camera, made.gripper, settings.camera, gripper)
     if fault is not None:
         raise ConfigError.of(file, fault)
     try:

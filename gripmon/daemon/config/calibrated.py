@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
+from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration
 from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import named_file, read_document
 from gripmon.model.camera import LensSettings
@@ -50,16 +50,20 @@ def read_camera(path: Path) -> CameraCalibration:
     return calibration
 
 
-def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Gripper) -> Fault | None:
-    """Why a hand/eye calibration doesn't belong to this camera and gripper; None if it does."""
-    if hand_eye.camera != camera:
+def mismatch(
+    made_camera: LensSettings | None, made: CalibratedGripper | None, camera: LensSettings, gripper: Gripper
+) -> Fault | None:
+    """Why a hand/eye calibration, made with a camera and a gripper as far as it tells, doesn't belong to these; None if
+    it does.
+    """
+    if made_camera not in (None, camera):
         return Fault("camera", "isn't the configuration's camera", "the hand/eye calibration made with the same camera")
-    if hand_eye.gripper.sha256 != gripper_digest(gripper):
-        name = hand_eye.gripper.name
+    if made is not None and made.sha256 != gripper_digest(gripper):
+        name = made.name
         same = " with other contents" if name == gripper.name else ""
         wrong = f"is {name}{same}, the configuration has {gripper.name}"
         right = "the hand/eye calibration made with the same gripper file; gripmon calibrate plane makes it again"
-        if hand_eye.gripper.sha256 == gripper_digest(gripper, name):
+        if made.sha256 == gripper_digest(gripper, name):
             wrong, right = f"{wrong}, the same except for its name", f"name: {name} in the gripper file"
         return Fault("gripper", wrong, right)
     return None

@@ -20,11 +20,11 @@ from gripmon.calibrate.target_print import print_target
 from gripmon.daemon.config import read_gripper
 from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.robot_file import reference_text
 from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import target_in
 from gripmon.daemon.setup.lines import Line, findings, jaws, last_line
-from gripmon.daemon.setup.robot_file import reference_text
 from gripmon.daemon.setup.steps import BY_NAME, STEPS, Step, needed, own_camera, written
 from gripmon.daemon.teaching.source import open_named
 from gripmon.io.sources import Source, Waiting

@@ -10,30 +10,28 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
-import numpy as np
 
-from gripmon.calibrate.documents import HandEyeCalibration
-from gripmon.daemon.calibrations import read_calibrated
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.daemon.calibrations import camera_in, pose_in, read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch
 from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
-from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import read_settings, read_yaml
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
-from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import check_size, image_in
-from gripmon.model.records import ReferenceRecord, Transform
+from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_picture, told_response
-from gripmon.teach.corner_pose import CameraError, corners_fault
+from gripmon.teach.corner_pose import corners_fault
 from gripmon.teach.outlines import RoughCorners
 from gripmon.teach.page_server import OutlineSession
 from gripmon.teach.session import Setup
@@ -153,9 +151,9 @@ def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSe
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
     shown, target = image_in(image), None
     if camera is not None:
-        with contextlib.suppress(ConfigError):  # read_lens reports what is wrong
+        with contextlib.suppress(ConfigError):  # camera_in reports what is wrong
             target = read_yaml(camera).get("target")
-        lens, _ = read_lens(camera)
+        lens = camera_in(camera).lens
         check_size(str(image), shown, lens.width_px, lens.height_px)
     known = isinstance(target, str) and target.startswith("circles")
     words = ["gripmon", "calibrate", "plane", image, "--camera", camera or "camera.yaml"]
@@ -183,61 +181,28 @@ def _gripper(path: Path | None) -> tuple[Gripper, Path]:
 
 def _calibrations(
     camera_path: Path | None, reference_path: Path | None, gripper: Gripper
-) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, CameraError | None]:
-    """Camera, gripper, settings and reference from files; a reference's file also contains its camera."""
-    lens, error = (None, None) if camera_path is None else read_lens(camera_path)
+) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, GivenCamera]:
+    """Camera, gripper, settings and reference from files; a reference's file may also contain its camera."""
+    given = None if camera_path is None else camera_in(camera_path)
     reference = None
     if reference_path is not None:
-        values = read_yaml(reference_path)
-        if lens is not None and "cam_T_grip" in values and "schema" not in values:
-            reference = _section(reference_path, values)
-        else:
-            lens, reference = _hand_eye(reference_path, lens, gripper)
-    if lens is None:
+        pose_in(reference_path)  # says what a file without one holds
+        found = read_calibrated(reference_path)
+        given = given or (None if found.lens is None else GivenCamera(found.lens))
+        assert found.cam_T_grip is not None
+        reference = configured(found.cam_T_grip, found.covariance)
+        fault = None if given is None else mismatch(found.lens, found.gripper, given.lens, gripper)
+        if fault is not None:
+            wrong = fault.wrong.replace("the configuration's camera", "the one given")
+            wrong = wrong.replace("the configuration has", "the one given is")
+            raise InputError(f"{reference_path}: {fault.key}: {wrong}; {fault.right}", "reference")
+    if given is None:
         right = "a file of gripmon calibrate intrinsics, or a configuration"
         raise InputError(f"is missing; {right}", "camera")
-    try:
-        camera = make_camera(lens)
-    except ValueError as fault:
-        raise InputError(f"{camera_path or reference_path}: camera.{fault}") from None
+    camera = make_camera(given.lens)
     if reference is not None:
         _check_view(camera, gripper, reference, str(reference_path))
-    return camera, gripper, MonitorSettings(), reference, error
-
-
-def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
-    """The camera of a calibration or configuration, or of a file with only a section ``camera``; with its error, if the
-    file has one.  :class:`~gripmon.model.errors.InputError`.
-    """
-    if path.is_file() and path.suffix in (".yaml", ".yml"):
-        values = read_yaml(path)
-        if "model" in values and "schema" not in values:
-            lens: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
-            return lens, None
-    found = read_calibrated(path)
-    if found.lens is None:
-        raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
-    if not found.parameters:
-        return found.lens, None
-    return found.lens, CameraError(found.parameters, np.reshape(found.lens_covariance, (len(found.parameters), -1)))
-
-
-def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
-    """A file of ``gripmon calibrate plane``, which must be made with this camera (if given) and this gripper."""
-    made = read_document(path, HandEyeCalibration)
-    fault = mismatch(made, lens or made.camera, gripper)
-    if fault is not None:
-        wrong = fault.wrong.replace("the configuration's camera", "the one given")
-        wrong = wrong.replace("the configuration has", "the one given is")
-        raise InputError(f"{path}: {fault.key}: {wrong}; {fault.right}", "reference")
-    return made.camera, configured(made.cam_T_grip, made.covariance)
-
-
-def _section(path: Path, values: dict[str, Any]) -> ReferenceRecord:
-    """A file with only a section ``reference``: a robot's own hand/eye calibration."""
-    settings = read_settings(path, ReferenceSettings, values)
-    transform = Transform(settings.cam_T_grip.translation_m, settings.cam_T_grip.rotation_xyzw)
-    return configured(transform, covariance_of(settings))
+    return camera, gripper, MonitorSettings(), reference, given
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:
