@@ -21,6 +21,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.visibility import (
     FEWEST_CORNERS,
+    Freedom,
     Rig,
     behind_another_finger,
     border,
@@ -129,10 +130,15 @@ def test_the_border_is_that_of_the_corner_nearest_to_it():
     assert nearest.side == "right"
 
 
+def limits_of(free: Freedom) -> np.ndarray:
+    """(6, 2), NaN where nothing was found."""
+    return np.array([*free.shift_m.values(), *free.turn_rad.values()], dtype=float)
+
+
 @pytest.mark.parametrize(("axis", "step"), [(0, 2e-4), (1, 2e-4), (2, 1e-3), (3, 2e-3), (4, 2e-3)])
 def test_the_camera_may_move_until_it_happens(axis: int, step: float):
     """The camera is moved on in small steps until fewer than three corners, or edges, are left."""
-    limits = freedom(rig(), nominal_cam_T_grip(), 0.034).limits
+    limits = limits_of(freedom(rig(), nominal_cam_T_grip(), 0.034))
     for k, sign in enumerate((-1.0, 1.0)):
         if np.isnan(limits[axis, k]):
             assert axis == 2 and sign < 0.0, "only backwards nothing leaves the image"
@@ -163,7 +169,7 @@ def test_the_share_of_the_jaws_travel_is_counted_in_small_steps():
 @pytest.mark.parametrize("lens", [PAPER_LENS, FISHEYE_LENS], ids=["paper", "fisheye"])
 def test_other_lenses_lose_the_fingers_just_beyond_the_limit(lens: LensSettings):
     known = rig(lens)
-    limits = freedom(known, nominal_cam_T_grip(), 0.034).limits
+    limits = limits_of(freedom(known, nominal_cam_T_grip(), 0.034))
     for axis, k in itertools.product(range(6), range(2)):
         if np.isfinite(limits[axis, k]):
             way = (-1.0, 1.0)[k] * np.eye(6)[axis]
@@ -177,7 +183,7 @@ def test_a_gripper_in_no_image_has_neither_border_nor_freedom():
     seen = see(rig(), away, 0.034)
     assert not seen.enough and border(rig(), seen) is None
     assert seen.reason == "0 corners visible (8 outside of the image)"
-    assert (freedom(rig(), away, 0.034).limits == 0.0).all()
+    assert (limits_of(freedom(rig(), away, 0.034)) == 0.0).all()
     travel = over_jaw(rig(), away)
     assert travel.share == 0.0 and len(travel.gaps) == 1
 

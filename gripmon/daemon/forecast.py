@@ -12,16 +12,12 @@ from gripmon.daemon.config import Config
 from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast_values import (
     Accuracy,
-    BorderValues,
-    Bounds,
-    CameraFreedom,
     CameraValues,
     CornerView,
     DriftForecast,
     EdgeView,
     FarthestEdge,
     Forecast,
-    GapValues,
     GripperValues,
     InView,
     JawAccuracy,
@@ -56,8 +52,6 @@ from gripmon.teach.inset import made_from_images
 from gripmon.teach.mounts import Mount
 from gripmon.teach.visibility import (
     FEWEST_CORNERS,
-    SOUGHT_M,
-    SOUGHT_RAD,
     Rig,
     border,
     freedom,
@@ -68,7 +62,6 @@ from gripmon.track.edges.kernel import FEWEST_EDGES
 
 __all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
 
-_AXES = ("x", "y", "z")
 _DIRECTIONS = (
     "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
 )  # fmt: skip
@@ -106,9 +99,9 @@ def forecast(config: Config) -> Forecast:
         edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
         accuracy=_accuracy(config),
         valid_by=policy.valid_by,
-        protection=None if found is None else _bounds(found.protection),
-        since_reference=None if both is None else _bounds(both.since_reference),
-        absolute=None if both is None else _bounds(both.absolute),
+        protection=None if found is None else found.protection,
+        since_reference=None if both is None else both.since_reference,
+        absolute=None if both is None else both.absolute,
         protection_if_bevelled=None if found is None else _if_bevelled(config),
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
@@ -167,7 +160,7 @@ def limits_warning(config: Config) -> str | None:
     return f"{config.path}: {told} (monitor.policy)"
 
 
-def _if_bevelled(config: Config) -> Bounds | None:
+def _if_bevelled(config: Config) -> Protection | None:
     """The protection level if no edge is sharp; None if edges are known as they appear, because they were taught or the
     gripper file was made from images, or if the file is stated to be exact.
     """
@@ -175,11 +168,7 @@ def _if_bevelled(config: Config) -> Bounds | None:
     if rig.taught is not None or made_from_images(rig.gripper) or rig.settings.model_sigma_m == 0.0:
         return None
     bevelled = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
-    return _bounds(forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).protection)
-
-
-def _bounds(protection: Protection) -> Bounds:
-    return Bounds(protection.position_m, protection.rotation_rad, protection.risk)
+    return forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).protection
 
 
 def _camera(config: Config) -> CameraValues:
@@ -308,7 +297,6 @@ def _recalibration(config: Config, expected: AccuracyForecast) -> RecalibrationF
 def _in_view(config: Config) -> InView:
     rig, cam_T_grip = rig_of(config), config.cam_T_grip
     sight = see(rig, cam_T_grip, config.jaw_opening_m)
-    near = border(rig, sight)
     return InView(
         corners=sight.corners,
         edges=sight.edges,
@@ -319,25 +307,10 @@ def _in_view(config: Config) -> InView:
         behind_another_finger=tuple(
             name for name, behind in zip(rig.gripper.landmark_ids, sight.behind, strict=True) if behind
         ),
-        border=None
-        if near is None
-        else BorderValues(**near.by_side_px, smallest_px=near.smallest_px, corner=near.corner, side=near.side),
-        camera_may_move=_freedom(config, rig) if sight.enough else None,
+        border=border(rig, sight),
+        camera_may_move=freedom(rig, cam_T_grip, config.jaw_opening_m) if sight.enough else None,
         limit_m=config.settings.monitor.policy.limit_m,
         jaw_travel=_jaw_travel(config, rig),
-    )
-
-
-def _freedom(config: Config, rig: Rig) -> CameraFreedom:
-    free = freedom(rig, config.cam_T_grip, config.jaw_opening_m)
-    amounts: Any = [tuple(None if math.isnan(v) else v for v in pair) for pair in free.limits.tolist()]
-    return CameraFreedom(
-        shift_m=dict(zip(_AXES, amounts[:3], strict=True)),
-        turn_rad=dict(zip(_AXES, amounts[3:], strict=True)),
-        shift_reason=dict(zip(_AXES, free.reasons[:3], strict=True)),
-        turn_reason=dict(zip(_AXES, free.reasons[3:], strict=True)),
-        sought_m=SOUGHT_M,
-        sought_rad=SOUGHT_RAD,
     )
 
 
@@ -350,7 +323,7 @@ def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
     bounds = [None if each is None else each.protection for _, each in certain]
     return JawTravelForecast(
         share=travel.share,
-        gaps=tuple(GapValues(*gap) for gap in travel.gaps),
+        gaps=travel.gaps,
         corners=(int(travel.corners.min()), int(travel.corners.max())),
         edges=(int(travel.edges.min()), int(travel.edges.max())),
         from_m=config.gripper.jaw_min_m,

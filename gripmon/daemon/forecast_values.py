@@ -7,11 +7,10 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records import Array
+from gripmon.model.records import Array, Protection
+from gripmon.teach.visibility import Border, Freedom, Gap
 
 Vector = tuple[float, float, float]
-TwoSided = tuple[float | None, float | None]
-"""Amounts in negative and in positive direction; None: beyond the range that was searched."""
 
 
 class PoseValues(msgspec.Struct, frozen=True):
@@ -168,47 +167,6 @@ class Accuracy(msgspec.Struct, frozen=True):
     drift: DriftForecast | None
 
 
-class Bounds(msgspec.Struct, frozen=True):
-    """Protection levels: bounds on the error of a transform, and the risk of exceeding them."""
-
-    position_m: float
-    rotation_rad: float
-    risk: float
-
-
-class BorderValues(msgspec.Struct, frozen=True):
-    """The smallest distance of a visible corner from each side of the image, and the smallest of all (px)."""
-
-    left: float
-    right: float
-    top: float
-    bottom: float
-    smallest_px: float
-    corner: str
-    side: str
-
-
-class CameraFreedom(msgspec.Struct, frozen=True):
-    """How far the camera may move along each axis alone (m, rad) before too little is visible, and what is missing
-    then.
-    """
-
-    shift_m: dict[str, TwoSided]
-    turn_rad: dict[str, TwoSided]
-    shift_reason: dict[str, tuple[str | None, str | None]]
-    turn_reason: dict[str, tuple[str | None, str | None]]
-    sought_m: float
-    sought_rad: float
-
-
-class GapValues(msgspec.Struct, frozen=True):
-    """Openings at which nothing can be measured (m)."""
-
-    from_m: float
-    to_m: float
-    reason: str
-
-
 class OpeningCertainty(msgspec.Struct, frozen=True):
     """The TCP's uncertainty over the openings, and the bounds that are compared with the alert limits."""
 
@@ -224,7 +182,7 @@ class JawTravelForecast(msgspec.Struct, frozen=True):
     """The part of the jaw's travel in which enough is visible; corners and edges: least and most."""
 
     share: float
-    gaps: tuple[GapValues, ...]
+    gaps: tuple[Gap, ...]
     corners: tuple[int, int]
     edges: tuple[int, int]
     from_m: float
@@ -242,8 +200,8 @@ class InView(msgspec.Struct, frozen=True):
     enough: bool
     reason: str | None
     behind_another_finger: tuple[str, ...]
-    border: BorderValues | None
-    camera_may_move: CameraFreedom | None
+    border: Border | None
+    camera_may_move: Freedom | None
     limit_m: float
     jaw_travel: JawTravelForecast | None
 
@@ -270,10 +228,10 @@ class Forecast(msgspec.Struct, frozen=True):
     edges: tuple[EdgeView, ...]
     accuracy: Accuracy
     valid_by: str
-    protection: Bounds | None
-    since_reference: Bounds | None
-    absolute: Bounds | None
-    protection_if_bevelled: Bounds | None
+    protection: Protection | None
+    since_reference: Protection | None
+    absolute: Protection | None
+    protection_if_bevelled: Protection | None
     alert_limit_m: float
     alert_limit_rad: float
     reachable: bool

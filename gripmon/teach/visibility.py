@@ -9,10 +9,12 @@ jaw's travel in which the view suffices.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -177,32 +179,33 @@ SOUGHT_RAD = np.pi
 STEP_PX = 16.0
 """Image motion between two views that are examined; a narrower gap in the view may be missed."""
 
-_SIDES = ("left", "right", "top", "bottom")
+TwoSided = tuple[float | None, float | None]
+"""Amounts in negative and in positive direction; None: beyond the range that was searched."""
 
 
-@dataclass(frozen=True, slots=True)
-class Border:
-    """Distance of the visible corners from the image's border: the smallest on each side, px; and the smallest of all,
-    with its corner and side.
-    """
+class Border(msgspec.Struct, frozen=True):
+    """The smallest distance of a visible corner from each side of the image, and the smallest of all (px)."""
 
-    by_side_px: dict[str, float]
+    left: float
+    right: float
+    top: float
+    bottom: float
     smallest_px: float
     corner: str
     side: str
 
 
-@dataclass(frozen=True, slots=True)
-class Freedom:
-    """How far the camera may move along each single axis before the monitor can't measure any more.
-
-    ``limits`` (6, 2): shift (m) along, then turn (rad) about the camera's own x, y, z, in negative and in positive
-    direction, all as positive amounts; NaN where the view suffices over the whole range examined.  ``reasons`` (6
-    pairs): what is missing beyond.
+class Freedom(msgspec.Struct, frozen=True):
+    """How far the camera may move along each single axis, x, y and z, before the monitor can't measure any more: shift
+    (m) along and turn (rad) about the camera's own axes, and what is missing beyond.
     """
 
-    limits: Array
-    reasons: tuple[tuple[str | None, str | None], ...]
+    shift_m: dict[str, TwoSided]
+    turn_rad: dict[str, TwoSided]
+    shift_reason: dict[str, tuple[str | None, str | None]]
+    turn_reason: dict[str, tuple[str | None, str | None]]
+    sought_m: float = SOUGHT_M
+    sought_rad: float = SOUGHT_RAD
 
 
 def moved_camera(cam_T_grip: Array, motion: Array) -> Array:
@@ -221,17 +224,22 @@ def border(rig: Rig, sight: LandmarkView) -> Border | None:
     u, v = sight.uv_px[which].T
     distances = np.stack([u, rig.camera.width_px - 1.0 - u, v, rig.camera.height_px - 1.0 - v])
     side, corner = np.unravel_index(int(distances.argmin()), distances.shape)
-    by_side_px = dict(zip(_SIDES, distances.min(axis=1).tolist(), strict=True))
-    return Border(by_side_px, float(distances.min()), rig.gripper.landmark_ids[which[corner]], _SIDES[side])
+    sides = Border.__struct_fields__[:4]
+    nearest = dict(zip(sides, distances.min(axis=1).tolist(), strict=True))
+    name = rig.gripper.landmark_ids[which[corner]]
+    return Border(**nearest, smallest_px=float(distances.min()), corner=name, side=sides[side])
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
     """How far the camera may shift and turn along each of its axes at a fixed jaw opening, to 1/4000 of a step: some
     micrometres.
     """
-    found = [_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for axis in np.eye(6) for sign in (-1.0, 1.0)]
-    limits = np.reshape([amount for amount, _ in found], (6, 2))
-    return Freedom(limits, tuple((found[k][1], found[k + 1][1]) for k in range(0, 12, 2)))
+    found = [[_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for sign in (-1.0, 1.0)] for axis in np.eye(6)]
+    amounts: list[TwoSided] = [(low[0], high[0]) for low, high in found]
+    reasons = [(low[1], high[1]) for low, high in found]
+    shift_m, turn_rad = (dict(zip("xyz", part, strict=True)) for part in (amounts[:3], amounts[3:]))
+    shift_reason, turn_reason = (dict(zip("xyz", part, strict=True)) for part in (reasons[:3], reasons[3:]))
+    return Freedom(shift_m, turn_rad, shift_reason, turn_reason)
 
 
 def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> float:
@@ -240,13 +248,13 @@ def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> floa
     """
     axes = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
     limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, 4.0 * STEP_PX, halvings=7)[0] for axis in axes]
-    return float(np.nan_to_num(limits, nan=np.inf).min())
+    return min((limit for limit in limits if limit is not None), default=math.inf)
 
 
 def _limit(
     rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 12
-) -> tuple[float, str | None]:
-    """The amount of a motion along the unit vector ``axis`` (6,) after which the view doesn't suffice, and why; NaN if
+) -> tuple[float | None, str | None]:
+    """The amount of a motion along the unit vector ``axis`` (6,) after which the view doesn't suffice, and why; None if
     it always does.
     """
 
@@ -260,7 +268,7 @@ def _limit(
         return 0.0, reason
     while sight.enough:
         if bad >= sought:
-            return float("nan"), None
+            return None, None
         good = bad
         bad = min(bad + _step(rig, cam_T_grip, jaw_opening_m, axis, good, sight, step_px), sought)
         sight = view(bad)
@@ -304,7 +312,7 @@ def _first_failing(
     return bad, there
 
 
-class Gap(NamedTuple):
+class Gap(msgspec.Struct, frozen=True):
     """A range of openings in which the view doesn't suffice, and the reason (in its middle)."""
 
     from_m: float
