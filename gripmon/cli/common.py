@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import itertools
 import json
 import math
 import re
@@ -231,15 +232,18 @@ class Arguments(argparse.Namespace):
 
                 write_document(made, path)
 
-    def save_gripper(self, made: GripperResult, provenance: Provenance) -> None:
-        """Write what the options name of a gripper, its file, reference and picture, and print its summary."""
+    def save_gripper(self, made: GripperResult, provenance: Provenance, **taken: list[str]) -> None:
+        """Write what the options name of a gripper, its file, reference and picture, and print its summary, after what
+        was ``taken``: lines by their keys in JSON.
+        """
         self.save("out", made.text().encode())
         if getattr(self, "reference_out", None) is not None:
             self.save("reference_out", made.reference(provenance))
         self.save("picture", made.picture)
         paths = (getattr(self, name, None) for name in ("out", "reference_out", "picture"))
         written = [str(path) for path in paths if path is not None]
-        self.answer({**made.values(), "written": written}, [*made.summary(), *(f"written: {each}" for each in written)])
+        lines = [*itertools.chain(*taken.values()), *made.summary(), *(f"written: {each}" for each in written)]
+        self.answer({**made.values(), **taken, "written": written}, lines)
 
 
 def _option(name: str) -> str:

@@ -73,8 +73,7 @@ def from_images(arguments: Arguments) -> None:
     """
     import cv2
 
-    from gripmon.daemon.calibrations import camera_in, pose_in
-    from gripmon.io.sources.files import openings_beside
+    from gripmon.daemon.gripper_images import images_inputs
     from gripmon.model.images import image_in, image_paths
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.fingers import UnclearPartsError
@@ -83,13 +82,12 @@ def from_images(arguments: Arguments) -> None:
     arguments.check_outputs("out", "reference_out", "picture")
     cv2.setNumThreads(1)
     images = image_paths(arguments.image)
-    camera, reference = camera_in(arguments.camera).lens, arguments.reference and pose_in(arguments.reference)
-    files = [path for path in (*images, arguments.camera, arguments.reference) if path is not None]
-    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys(files)))
+    given = images_inputs(images, arguments.camera, arguments.reference)
+    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*images, *given.files])))
     try:
         found = gripper_from_images(
-            images, camera, openings_m=openings_beside(images), distance_m=arguments.distance,
-            finger_width_m=arguments.finger_width, reference=reference, jaw_range_m=arguments.jaw_range,
+            images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
+            finger_width_m=arguments.finger_width, reference=given.reference, jaw_range_m=arguments.jaw_range,
             fingers=arguments.fingers, within=arguments.within or (), name=arguments.name, provenance=provenance,
             response=arguments.response, progress=progress_bar,
         )  # fmt: skip

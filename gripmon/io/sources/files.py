@@ -7,7 +7,6 @@ import itertools
 import logging
 import math
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -119,18 +118,6 @@ def opening_beside(path: Path) -> float | None:
     table = path.parent / TIMESTAMPS_NAME
     row = read_table(table).get(path.name) if table.exists() else None
     return None if row is None else row.jaw_opening_m
-
-
-def openings_beside(paths: Sequence[Path]) -> list[float | None] | None:
-    """The jaw opening (m) of each image; None if no table has one.  :class:`SourceError` if it has those of some."""
-    openings = [opening_beside(path) for path in paths]
-    if all(opening is None for opening in openings):
-        return None
-    unknown = next((path for path, opening in zip(paths, openings, strict=True) if opening is None), None)
-    if unknown is not None:
-        right = f"jaw_opening_m in {unknown.parent / TIMESTAMPS_NAME} for all of them, or for none"
-        raise SourceError(f"{unknown}: its jaw opening isn't known and that of others is; {right}")
-    return openings
 
 
 def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
