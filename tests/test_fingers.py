@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gripmon.model.staying import Edges, edges_that_stay, enclosed
 from gripmon.teach.fingers import Parts, UnclearPartsError, find_fingers
-from gripmon.teach.staying import Edges, edges_that_stay, enclosed
 
 SHAPE = (240, 320)
 

@@ -44,10 +44,9 @@ FEWEST_PLACES = 100
 
 _GAMMAS = np.arange(0.4, 3.61, 0.2)
 _MOST_IMAGES, _MOST_PIXELS, _MOST_PLACES = 24, 40_000_000, 2000
-_STAYS = 0.35  # quantile over the images of a pixel's gradient: borders that most of them show
 _NEAR_PX, _FAR_PX = 2.5, 5.0  # range beside a border where its sides are read
 _BETWEEN_PX = 1.5
-_LEAST_STEP, _LEAST_GRADIENT = 0.06, 0.004  # parts of the full scale
+_LEAST_STEP = 0.06  # part of the full scale
 _UNEVEN = 0.15  # largest scatter of a side, as part of the step
 _NOISE = 0.01  # least standard deviation of a grey level, part of the full scale
 _DRAWS, _RISK = 400, 0.1
@@ -183,38 +182,18 @@ def _levels(image: Image) -> NDArray[np.float32]:
 
 
 def _borders(grey: Sequence[NDArray[np.float32]]) -> _Borders:
-    """Pixels on the ridges of the gradient that stays: what most images show in one place."""
-    import cv2
+    """Pixels on the strongest edges that stay, whose direction (doubled angles) and place most images agree on."""
+    from gripmon.model.staying import LEAST_CHANGING, edges_that_stay
 
-    steep = []
-    xx, xy, yy = np.zeros((3, *grey[0].shape))
-    for image in grey:
-        smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-        dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, *order) / np.float32(8.0) for order in ((1, 0), (0, 1)))
-        square = dx * dx + dy * dy + np.float32(1e-9)
-        steep.append(np.sqrt(square))
-        xx, xy, yy = xx + dx * dx / square, xy + dx * dy / square, yy + dy * dy / square
-    count = int(_STAYS * len(grey))
-    stays = np.partition(np.stack(steep), count, axis=0)[count]
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    normal = np.dstack([np.cos(angle), np.sin(angle)])
-    alike = np.hypot(xx - yy, 2.0 * xy) > 0.6 * len(grey)
-    row, column = np.mgrid[: stays.shape[0], : stays.shape[1]]
-    beside = [
-        cv2.remap(
-            stays, (column + s * normal[:, :, 0]).astype(np.float32), (row + s * normal[:, :, 1]).astype(np.float32),
-            cv2.INTER_LINEAR,
-        )
-        for s in (-1.0, 1.0)
-    ]  # fmt: skip
-    ridge = alike & (stays > beside[0]) & (stays >= beside[1])
-    edge = int(2 * _FAR_PX)
-    ridge[:edge] = ridge[-edge:] = ridge[:, :edge] = ridge[:, -edge:] = False
-    ridge &= stays > max(3.0 * float(np.median(stays)), _LEAST_GRADIENT)
-    y, x = np.nonzero(ridge)
-    strongest = np.argsort(-stays[y, x])[:_MOST_PLACES]
+    edges = edges_that_stay([255.0 * image for image in grey])
+    strength = np.where(edges.stays & (edges.most_changing >= LEAST_CHANGING), edges.share, 0.0)
+    rim = int(2 * _FAR_PX)
+    strength[:rim] = strength[-rim:] = strength[:, :rim] = strength[:, -rim:] = 0.0
+    y, x = np.nonzero(strength)
+    strongest = np.argsort(-strength[y, x], kind="stable")[:_MOST_PLACES]
     y, x = y[strongest], x[strongest]
-    return _Borders(x.astype(float), y.astype(float), normal[y, x])
+    across = edges.across_rad[y, x].astype(float)
+    return _Borders(x.astype(float), y.astype(float), np.column_stack([np.cos(across), np.sin(across)]))
 
 
 class _Read(NamedTuple):

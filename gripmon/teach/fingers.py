@@ -13,7 +13,7 @@ import numpy as np
 
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array, Image
-from gripmon.teach.staying import Bits, Edges, Plane
+from gripmon.model.staying import Bits, Edges, Plane
 
 SHORTEST_OUTLINE_PX = 40.0
 """Shortest outline of a finger in view: 8 px across a tip and twice 16 px along it are the least that six parameters of

@@ -13,11 +13,11 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
+from gripmon.model.staying import Bits, Plane
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.staying import Bits, Plane
 from gripmon.teach.straight_pieces import Chain, fit_chain, runs, without_outliers
 
 _BESIDE_PX = 9.0

@@ -1,6 +1,6 @@
 """A gripper in images before changing backgrounds: which pixels are its own, at common places and grey levels.
 
-Which pixels, edges that stay tell (:mod:`~gripmon.teach.staying`), not grey levels: those of a wall stay as well, and a
+Which pixels, edges that stay tell (:mod:`~gripmon.model.staying`), not grey levels: those of a wall stay as well, and a
 gripper's own change with light and exposure.  A real mount has play, so that images show the gripper displaced by a
 pixel or so: each is moved back, first by the direction of edges, and then adjusted to the others' grey levels.
 """
@@ -19,7 +19,7 @@ from scipy.spatial.distance import squareform
 from gripmon.model.errors import NoResultError
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.records import Array, Image
-from gripmon.teach.staying import LEAST_SLOPE, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
+from gripmon.model.staying import LEAST_SLOPE, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
 from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 5

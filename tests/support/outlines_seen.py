@@ -10,11 +10,11 @@ from scipy.spatial import ConvexHull
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
+from gripmon.model.staying import Edges
 from gripmon.teach.fingers import outwards_from
 from gripmon.teach.image_outline import FingerSeen, OpeningSeen
 from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import FROM_BORDER_PX
-from gripmon.teach.staying import Edges
 from gripmon.teach.straight_pieces import Chain
 
 

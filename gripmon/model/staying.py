@@ -84,6 +84,12 @@ class Edges:
         return np.asarray((self.share > self.limit) & self.ridge)
 
     @property
+    def most_changing(self) -> float:
+        """Part of the tenth of the image that changes most where edges come and go."""
+        part = cv2.blur(self.changing.astype(np.float32), (CELL_PX, CELL_PX))
+        return float(np.quantile(part, 0.9))
+
+    @property
     def strength(self) -> Plane:
         """The share (h, w) on ridges and a pixel beside them, else 0."""
         on = np.where(self.ridge, self.share, 0.0).astype(np.float32)
