@@ -26,13 +26,14 @@ from gripmon.calibrate.documents import (
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.calibrated import read_camera
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.judge.statefile import Calibration, Owner, pack
 from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.model.geometry import perturb, to_record
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.records import Cause, MonitorState, ReferenceRecord, to_json
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.scenario import Sensor
 from gripmon.track.edges.taught import gripper_digest
 

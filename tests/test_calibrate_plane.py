@@ -20,11 +20,12 @@ from gripmon.cli import main
 from gripmon.daemon.config import load_config, read_gripper
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.daemon.config.typed import to_settings
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.targets import OtherSizeError, parse_target, refuse_other_size
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.disturbance import srgb_dn
 from gripmon.track.edges.taught import gripper_digest
 

@@ -14,8 +14,8 @@ from support.laser_scenes import write_csv
 from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.world import calibrated, predict
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.laser import spot_image
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")

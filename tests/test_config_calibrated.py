@@ -14,10 +14,11 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.daemon.config import ConfigError, is_second, load_config, load_second, read_gripper
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.judge.statefile import calibration_of
 from gripmon.model.geometry import to_record
 from gripmon.model.provenance import provenance_of
+from gripmon.model.yaml_text import as_yaml
 from gripmon.track.edges.taught import gripper_digest
 
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"

@@ -15,10 +15,10 @@ from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.setup import NAMES
 from gripmon.model.geometry import inverse_jacobian, invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.laser import spot_image
 
 

@@ -18,11 +18,11 @@ from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.cli import main
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.geometry import invert, perturbation_between
 from gripmon.model.provenance import provenance_of
 from gripmon.model.targets import parse_target
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.plates import points_of
 
 LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)

@@ -16,11 +16,11 @@ from support.simulated import STRONG_LENS
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.daemon.sweeping import make_grid
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.provenance import provenance_of
+from gripmon.model.yaml_text import as_yaml
 
 DEMO = builtin_config("demo.yaml")
 

@@ -21,10 +21,11 @@ from gripmon.cli import main
 from gripmon.daemon.config import Settings, builtin_config, load_config, read_gripper
 from gripmon.daemon.config.settings import JawSettings
 from gripmon.daemon.config.typed import to_settings
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
 from gripmon.model.provenance import Provenance
+from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor

@@ -20,7 +20,7 @@ from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.config.checks import covariance_of
-from gripmon.daemon.config.yaml_file import as_yaml, kind_of, read_document, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import kind_of, read_document, read_settings, read_yaml
 from gripmon.daemon.robot_file import is_robot_reference, robot_reference
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
@@ -34,6 +34,7 @@ from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, FrameRecord, Transform
 from gripmon.model.targets import Target, refuse_other_size
 from gripmon.model.units import in_degrees, in_mm
+from gripmon.model.yaml_text import as_yaml
 from gripmon.teach.hand_eye import calibrate_plane, checked_opening, measure_tracked
 from gripmon.teach.mounts import Mount, towards
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of

@@ -11,10 +11,11 @@ from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.daemon.config.checks import reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError, to_settings
-from gripmon.daemon.config.yaml_file import as_yaml, read_document, read_yaml
+from gripmon.daemon.config.yaml_file import read_document, read_yaml
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.records import Array, Transform
+from gripmon.model.yaml_text import as_yaml
 
 _RIGHT = (
     "a file of gripmon calibrate plane, or cam_T_grip: {translation_m: [x, y, z], rotation_xyzw: [x, y, z, w]}, or "

@@ -19,7 +19,7 @@ import numpy as np
 from gripmon import __version__
 from gripmon.analyse.comparison import Comparison, compare
 from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
-from gripmon.daemon.config.yaml_file import lines_of, yaml_value
+from gripmon.daemon.config.yaml_file import lines_of
 from gripmon.daemon.watch import is_refused
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
@@ -29,6 +29,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
 from gripmon.model.targets import name_of
+from gripmon.model.yaml_text import yaml_value
 from gripmon.record.viewer import free_port
 from gripmon.simulate import (
     CALIBRATION_KINDS,

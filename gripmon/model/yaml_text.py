@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -74,3 +75,41 @@ def parse_yaml(text: str) -> Any:
         raise YamlFault("", "is nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:
         raise YamlFault("", f"not YAML: {error}") from None
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
+    """Quotes texts that this loader, or one of YAML 1.1, would not read as text."""
+
+
+_Dumper.yaml_implicit_resolvers = {
+    first: [*Loader.yaml_implicit_resolvers.get(first, ()), *yaml.SafeDumper.yaml_implicit_resolvers.get(first, ())]
+    for first in {*Loader.yaml_implicit_resolvers, *yaml.SafeDumper.yaml_implicit_resolvers}
+}
+
+
+def as_yaml(value: dict[str, Any], *, inline: bool = False) -> str:
+    """Text from which :func:`parse_yaml` reads the same mapping; ``inline``: lists of plain values in one line."""
+    flow, width = (None, 160) if inline else (False, 120)
+    text: str = yaml.dump(
+        value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=width
+    )
+    return text
+
+
+def in_one_line(value: Any) -> str:
+    """Any plain value as YAML in one line."""
+    text: str = yaml.dump(
+        value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=True, width=10**9
+    )
+    return text.strip().removesuffix("\n...")
+
+
+def yaml_value(value: Any) -> str:
+    """A value on one line that is valid in both YAML and JSON."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(yaml_value(item) for item in value)}]"

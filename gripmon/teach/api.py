@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -12,7 +11,6 @@ from typing import Any, Protocol
 
 import cv2
 import msgspec
-import yaml
 
 from gripmon import __version__
 from gripmon.io.sources.files import TIMESTAMPS_NAME, opening_beside
@@ -25,6 +23,7 @@ from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.model.response import Response, ResponseSeen, response_of
+from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.drawing import draw_taught
 from gripmon.teach.kept import Kept, as_frames, kept, with_help
@@ -286,27 +285,9 @@ _HEADER = """\
 """
 
 
-_WORDS = ("true", "false", "null", "yes", "no", "on", "off", "y", "n")
-
-
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
-    """Quotes text wherever YAML could take it for something else."""
-
-
-def _text(dumper: _Dumper, text: str) -> Any:
-    plain = re.fullmatch(r"[A-Za-z_][\w./-]*", text) and text.lower() not in _WORDS
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
-
-
-_Dumper.add_representer(str, _text)
-
-
 def to_yaml(model: TaughtModel) -> str:
     """The file's text; reading it gives exactly the same model."""
-    values = _without_nothing(msgspec.to_builtins(model))
-    return _HEADER + yaml.dump(
-        values, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=160, allow_unicode=True
-    )
+    return _HEADER + as_yaml(_without_nothing(msgspec.to_builtins(model)), inline=True)
 
 
 def _without_nothing(value: Any) -> Any:

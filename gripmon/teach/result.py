@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
-import yaml
 
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -17,6 +15,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.gripper import SIZE_UNKNOWN, Gripper, GripperModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
+from gripmon.model.yaml_text import in_one_line
 from gripmon.teach.drawing import draw_gripper
 from gripmon.track.edges.taught import gripper_digest
 
@@ -149,12 +148,12 @@ def _lines(model: GripperModel, notes: Sequence[str]) -> Iterator[str]:
         about = f"  # {_ABOUT[key]}" if key in _ABOUT else ""
         if isinstance(value, dict) and key != "jaw":
             yield f"{key}:{about}"
-            yield from (f"  {_flow(name)}: {_flow(part)}" for name, part in value.items())
+            yield from (f"  {in_one_line(name)}: {in_one_line(part)}" for name, part in value.items())
         elif isinstance(value, list):
             yield f"{key}:{about}"
-            yield from (f"  - {_flow(part)}" for part in value)
+            yield from (f"  - {in_one_line(part)}" for part in value)
         else:
-            yield f"{key}: {_flow(value)}{about}"
+            yield f"{key}: {in_one_line(value)}{about}"
 
 
 def _short(part: Any) -> Any:
@@ -165,9 +164,3 @@ def _short(part: Any) -> Any:
     if isinstance(part, dict):
         return {key: _short(value) for key, value in part.items()}
     return [_short(value) for value in part] if isinstance(part, list | tuple) else part
-
-
-def _flow(value: Any) -> str:
-    """A value as one line of YAML."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**9, allow_unicode=True)
-    return re.sub(r"\n\.\.\.$", "", text.strip())

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.setup import LaserSetup, spots_on_plane
 from gripmon.model.geometry import perturb
 from gripmon.model.provenance import provenance_of
 from gripmon.model.records import Array, Image
+from gripmon.model.yaml_text import as_yaml
 from gripmon.simulate.laser import spot_image
 from support.laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
 

@@ -16,8 +16,8 @@ import msgspec
 
 from gripmon.daemon.config import Config, SecondConfig, load_config
 from gripmon.daemon.config.typed import ConfigError
-from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.records import MonitorState, RecordedConfiguration, RecordedFile
+from gripmon.model.yaml_text import as_yaml
 
 _LEFT_OUT = ("source", "publish", "ros2", "state", "view")
 _PLAIN_NAME = re.compile(r"[^/\\\x00]{1,255}")

@@ -1,18 +1,16 @@
-"""gripmon's YAML files, read as settings and written."""
+"""gripmon's YAML files, read as settings and written with comments."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import yaml
 
 import gripmon
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
-from gripmon.model.yaml_text import Loader, YamlFault, parse_yaml
+from gripmon.model.yaml_text import YamlFault, parse_yaml, yaml_value
 
 _T = TypeVar("_T")
 _LINES, _SEE = "`key: value` lines, indented with blanks", "`key: value` lines; see configs/demo.yaml"
@@ -137,19 +135,6 @@ def read_document(path: Path, kind: type[_T]) -> _T:
     raise ConfigError(path, "schema", wrong, f"schema: {tag}, {wanted}")
 
 
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
-    """Quotes only texts that the loader would not read as text."""
-
-
-_Dumper.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers
-
-
-def as_yaml(value: dict[str, Any]) -> str:
-    """Text from which :func:`read_yaml` reads the same mapping."""
-    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
-    return text
-
-
 def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
     """The lines of a section, each with its description; ``off``: commented out, for defaults.
 
@@ -172,17 +157,6 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
         description = _described(field.type)
         lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
     return "\n".join(lines)
-
-
-def yaml_value(value: Any) -> str:
-    """A value on one line that is valid in both YAML and JSON."""
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return f"[{', '.join(yaml_value(item) for item in value)}]"
 
 
 def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:

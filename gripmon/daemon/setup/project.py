@@ -19,7 +19,7 @@ from gripmon.calibrate.lattice import to_bytes, to_grey
 from gripmon.calibrate.target_print import print_target
 from gripmon.daemon.config import read_gripper
 from gripmon.daemon.config.calibrated import read_camera
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.robot_file import reference_text
 from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture
@@ -33,6 +33,7 @@ from gripmon.model.atomic import writable_folder, write_atomically
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import IMAGE_SUFFIXES
 from gripmon.model.targets import OtherSizeError, name_of, parse_target, refuse_squares
+from gripmon.model.yaml_text import as_yaml
 from gripmon.teach.messages import encoded
 
 SETUP, VIEW = "setup.yaml", "view.jpg"

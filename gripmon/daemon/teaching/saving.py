@@ -17,7 +17,7 @@ from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
 from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml, yaml_value
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
 from gripmon.daemon.teaching.written import config_text, with_taught
 from gripmon.io.sources import SourceError, open_source
@@ -26,6 +26,7 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
+from gripmon.model.yaml_text import as_yaml, yaml_value
 from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
 from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Evaluation, Labels, TeachSession

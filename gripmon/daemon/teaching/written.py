@@ -14,7 +14,7 @@ import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.config import Config, Settings, load_config
-from gripmon.daemon.config.yaml_file import lines_of, yaml_value
+from gripmon.daemon.config.yaml_file import lines_of
 from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.io.sources import FolderSettings, SourceError
 from gripmon.io.sources.files import opening_beside
@@ -22,6 +22,7 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.records import ReferenceRecord, ValidBy
+from gripmon.model.yaml_text import yaml_value
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.corner_pose import CornerPose
 from gripmon.teach.messages import SaveOrder
