@@ -186,7 +186,8 @@ def _borders(grey: Sequence[NDArray[np.float32]]) -> _Borders:
     from gripmon.model.staying import LEAST_CHANGING, edges_that_stay
 
     edges = edges_that_stay([255.0 * image for image in grey])
-    strength = np.where(edges.stays & (edges.most_changing >= LEAST_CHANGING), edges.share, 0.0)
+    # The steepest that stay most surely: a finger's own texture stays, too, and changes with no background.
+    strength = np.where(edges.stays & (edges.most_changing >= LEAST_CHANGING), edges.slope * edges.share, 0.0)
     rim = int(2 * _FAR_PX)
     strength[:rim] = strength[-rim:] = strength[:, :rim] = strength[:, -rim:] = 0.0
     y, x = np.nonzero(strength)

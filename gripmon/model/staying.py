@@ -20,7 +20,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -64,7 +64,8 @@ _BAND_VALUES = 8e6
 class Edges:
     """What the images (n, h, w) show of edges: ``share`` (h, w), 0 to 1, of the images with an edge of one direction;
     ``across_rad`` (h, w), that direction of the gradient, modulo pi; ``ridge`` (h, w), where the slope has its maximum
-    across; ``changing`` (h, w), where edges come and go; ``by_chance``, the mean share by chance.
+    across; ``changing`` (h, w), where edges come and go; ``by_chance``, the mean share by chance; ``slope`` (h, w), the
+    one that all but a third of the images exceed, grey levels a pixel.
     """
 
     share: Plane
@@ -72,6 +73,7 @@ class Edges:
     ridge: Bits
     changing: Bits
     by_chance: float
+    slope: Plane = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     @property
     def limit(self) -> float:
@@ -106,7 +108,7 @@ def edges_that_stay(images: Sequence[Plane]) -> Edges:
     share, across_rad = _share(images, full)
     chance, _ = _share(_displaced(images), full)
     changing = (high > CHANGING_SLOPES * noise) & (high > CHANGING_FACTOR * usual)
-    edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()))
+    edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()), usual)
     return replace(edges, changing=changing & (share < max(edges.limit, 0.6)))
 
 
