@@ -21,7 +21,7 @@ from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Bump, FingerLook
 from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, Outline, place
-from gripmon.teach.hand_eye import gripper_values
+from gripmon.teach.result import GripperResult
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.track.integrity import Separation
 
@@ -168,7 +168,8 @@ def test_a_file_that_states_none_is_as_before():
     assert Tilt.of(exact, FILE_T) is EXACT_PLANE
     assert gripper_digest(exact) != gripper_digest(tilted)
     assert "tilt_sigma_rad" in contents_of(tilted.model) and "tilt_sigma_rad" not in contents_of(exact.model)
-    assert "tilt_sigma_rad" in gripper_values(tilted.model) and "tilt_sigma_rad" not in gripper_values(exact.model)
+    texts = [GripperResult(gripper=each).text() for each in (tilted, exact)]
+    assert "tilt_sigma_rad" in texts[0] and "tilt_sigma_rad" not in texts[1]
 
 
 class Knocked(NamedTuple):

@@ -17,7 +17,7 @@ IMAGE...                image file, or folder with images
                         hand/eye calibration: its frame is kept.  Of gripmon calibrate plane, or cam_T_grip with
                         position_sigma_m and rotation_sigma_rad
 --jaw-range MIN:MAX     range of the jaw opening (m); otherwise as far again as the images show to either side
---fingers {1,2}         how many fingers the images show; with 1, another one isn't expected (default: 2)
+--fingers {{1,2}}         how many fingers the images show; with 1, another one isn't expected (default: 2)
 --within LEFT,TOP,RIGHT,BOTTOM...
                         where in the image the fingers are (px), if something else stays in it, too; given twice, one
                         finger in each

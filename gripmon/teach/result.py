@@ -136,6 +136,7 @@ _ABOUT = {
     "faces": "loops of points, counter-clockwise seen from outside; they decide what is visible",
     "jaw": "openings (m): smallest, largest, and the one at which the coordinates below hold",
     "scale_sigma": "standard deviation of a factor on all lengths; 1: the size is unknown",
+    "tilt_sigma_rad": "standard deviation of the tilt of the plane that the fingers' points lie in (rad)",
 }
 
 
