@@ -16,12 +16,13 @@ import gripmon
 from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.cli import main
 from gripmon.daemon.config import read_gripper
+from gripmon.daemon.gripper_images import images_taken
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import SIZE_UNKNOWN, Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Frame, ReferenceRecord, ValidBy, Verdict
+from gripmon.model.records import Array, Frame, ReferenceRecord, Transform, ValidBy, Verdict
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
@@ -318,18 +319,53 @@ def test_wrong_input_says_what_would_be_right(box: tuple) -> None:
             gripper_from_images(wrong, PAPER_LENS, **values)
 
 
+def _camera_file(path: Path) -> Path:
+    lens = {"model": "paper", **{k: getattr(PAPER_LENS, k) for k in PAPER_LENS.__struct_fields__}}
+    camera = {
+        "schema": "gripmon.camera_calibration/1", "camera": lens, "parameters": [], "covariance": [],
+        "provenance": {"gripmon": "0", "time": "2026-01-01T00:00:00", "command": "test"},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(camera))
+    return path
+
+
+def test_the_command_takes_a_video_as_it_is(box: tuple, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also in a folder; a robot that waits shows one view several times, which counts once."""
+    images, _ = box
+    folder = tmp_path / "film"
+    folder.mkdir()
+    height, width = images[0].shape
+    writer = cv2.VideoWriter(str(folder / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
+    for image in images:
+        for _ in range(5):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    camera, out = _camera_file(tmp_path / "camera.yaml"), tmp_path / "gripper.yaml"
+    words = ["gripper", "from-images", str(folder), "--camera", str(camera), "--distance", "0.115:0.002"]
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["videos"] == images_taken([folder / "a.mp4"]).notes == [
+        f"{folder / 'a.mp4'}: 30 of 150 frames are used, one in 2, without 45 that show the view of the one before"
+    ]  # fmt: skip
+    assert said["images"] + len(said["left_out"]) == 30
+    model = read_gripper(out)
+    pose = from_record(Transform(**said["cam_T_grip"]))
+    points = CAMERA.project(model.points_grip_m()[model.corner_points] @ pose[:3, :3].T + pose[:3, 3])
+    true = read_gripper(BOX_FINGERS).points_grip_m() @ nominal_cam_T_grip()[:3, :3].T + nominal_cam_T_grip()[:3, 3]
+    away = np.linalg.norm(points[:, None] - CAMERA.project(true)[None], axis=2).min(axis=1)
+    assert len(away) >= 5 and np.median(away) < 0.5
+    (folder / "a.mp4").write_bytes(b"no video")
+    assert main(["gripper", "from-images", str(folder), "--camera", str(camera), "--out", str(tmp_path / "b")]) == 2
+    assert "can't be opened as a video" in capsys.readouterr().err
+
+
 def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images, found = box
     folder = tmp_path / "free"
     folder.mkdir()
     for k, image in enumerate(images):
         cv2.imwrite(str(folder / f"{k:03d}.png"), image)
-    lens = {"model": "paper", **{k: getattr(PAPER_LENS, k) for k in PAPER_LENS.__struct_fields__}}
-    camera = {
-        "schema": "gripmon.camera_calibration/1", "camera": lens, "parameters": [], "covariance": [],
-        "provenance": {"gripmon": "0", "time": "2026-01-01T00:00:00", "command": "test"},
-    }  # fmt: skip
-    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    _camera_file(tmp_path / "camera.yaml")
     wrong = ["gripper", "from-images", "nowhere", "--camera", str(tmp_path / "camera.yaml")]
     assert main([*wrong, "--out", str(tmp_path / "gripper.yaml")]) == 2
     assert "nowhere: the file is missing; an image file, or a folder with images" in capsys.readouterr().err

@@ -7,7 +7,8 @@ import argparse
 from gripmon.cli.common import REQUIRED, RESPONSE, RESPONSE_OPTION, Arguments, Command, jaw_range, length, progress_bar
 
 _OPTIONS = f"""
-IMAGE...                image file, or folder with images
+IMAGE...                image file, video file, or folder with images or videos; of a video some frames at equal
+                        distances are taken, those that show another view
 --camera FILE.yaml      file of gripmon calibrate intrinsics
 --distance M:SIGMA      distance of the fingertips from the camera along its axis, with its standard deviation (m),
                         which is in every protection level
@@ -73,17 +74,18 @@ def from_images(arguments: Arguments) -> None:
     """
     import cv2
 
-    from gripmon.daemon.gripper_images import images_inputs
-    from gripmon.model.images import image_in, image_paths
+    from gripmon.daemon.gripper_images import images_inputs, images_taken
+    from gripmon.model.images import images_of_one_camera
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.fingers import UnclearPartsError
     from gripmon.teach.from_images import gripper_from_images
 
     arguments.check_outputs("out", "reference_out", "picture")
     cv2.setNumThreads(1)
-    images = image_paths(arguments.image)
+    taken = images_taken(arguments.image)
+    images = taken.images
     given = images_inputs(images, arguments.camera, arguments.reference)
-    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*images, *given.files])))
+    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*taken.files, *given.files])))
     try:
         found = gripper_from_images(
             images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
@@ -92,6 +94,6 @@ def from_images(arguments: Arguments) -> None:
             response=arguments.response, progress=progress_bar,
         )  # fmt: skip
     except UnclearPartsError as unclear:
-        arguments.save("picture", unclear.picture(image_in(images[0])))
+        arguments.save("picture", unclear.picture(next(images_of_one_camera(images))[1]))
         raise
-    arguments.save_gripper(found, provenance)
+    arguments.save_gripper(found, provenance, videos=taken.notes)

@@ -9,7 +9,7 @@ import re
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gripmon.model.errors import InputError
 from gripmon.model.jpeg import jpeg_fault
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
 IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
+VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
 LARGEST_BYTES = 1 << 30
 """Larger files are neither images nor tables: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
@@ -26,6 +27,13 @@ JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND"
 _PNG_END_BYTES = 8
 """Length of the last chunk's name and checksum (bytes)."""
+
+
+class NamedImage(NamedTuple):
+    """An image that is no file of its own, as a video's frame, with the name to call it by."""
+
+    name: str
+    image: Image
 
 
 def natural_key(name: str) -> tuple[list[Any], str]:
@@ -52,8 +60,8 @@ def image_paths(names: Sequence[str | Path]) -> list[Path]:
     return paths
 
 
-def images_of_one_camera(images: Sequence[str | Path | Image]) -> Iterator[tuple[str, Image]]:
-    """Yield each image with its name ("image 1", ... for arrays); all must have one size.
+def images_of_one_camera(images: Sequence[str | Path | NamedImage | Image]) -> Iterator[tuple[str, Image]]:
+    """Yield each image with its name ("image 1", ... for arrays without one); all must have one size.
     :class:`~gripmon.model.errors.InputError` for one that can't be read, has another size, or equals an earlier one.
     """
     seen: dict[bytes, str] = {}
@@ -61,6 +69,8 @@ def images_of_one_camera(images: Sequence[str | Path | Image]) -> Iterator[tuple
     for number, given in enumerate(images, 1):
         if isinstance(given, str | Path):
             name, image = str(given), image_in(Path(given))
+        elif isinstance(given, NamedImage):
+            name, image = given
         else:
             name, image = f"image {number}", given
         # A duplicate image would make every uncertainty too small.

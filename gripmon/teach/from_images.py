@@ -20,7 +20,7 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import make_transform
 from gripmon.model.gripper import Gripper, GripperError
-from gripmon.model.images import check_size, images_of_one_camera
+from gripmon.model.images import NamedImage, check_size, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
@@ -74,7 +74,7 @@ class GripperFromImages(GripperResult):
 
 
 def gripper_from_images(
-    images: Sequence[str | Path | Image],
+    images: Sequence[str | Path | NamedImage | Image],
     camera: LensSettings,
     *,
     openings_m: Sequence[float | None] | None = None,

@@ -15,11 +15,10 @@ from gripmon.io.sources.files import FolderSettings, VideoSettings
 from gripmon.io.sources.lerobot import INFO, LeRobotSettings, open_dataset
 from gripmon.io.sources.stored import file_system
 from gripmon.model.errors import one_line
-from gripmon.model.images import IMAGE_SUFFIXES, natural_key
+from gripmon.model.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key
 
 ANNOTATION_SUFFIX = ".gripmon.mcap"
 """Ending of the files that ``gripmon dataset --annotate`` writes beside recordings; these are not episodes."""
-_VIDEOS = frozenset({".mp4", ".mkv", ".avi", ".mov", ".webm"})
 
 
 class Episode(msgspec.Struct, frozen=True):
@@ -89,7 +88,7 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         if suffix == ".mcap":
             for camera in cameras or (None,):
                 add(path, BagSettings, [path], camera=camera)
-        elif suffix in _VIDEOS and not remote:
+        elif suffix in VIDEO_SUFFIXES and not remote:
             add(path, VideoSettings, [path])
     for folder, inner in folders.items():
         images = any(Path(path).suffix.lower() in IMAGE_SUFFIXES for path in inner)
