@@ -18,7 +18,7 @@ from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsE
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.straight_pieces import Chain, fit_chain, runs, without_outliers
+from gripmon.teach.straight_pieces import Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""
@@ -216,9 +216,9 @@ def _fingers(
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
-            chain = fit_chain(camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px)
-            if chain is not None:
-                chains[id(part)].append(chain)
+            chains[id(part)] += fit_chains(
+                camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
+            )
         step()
     shares = [sum(map(_length_px, chains[id(part)])) / max(in_view[id(part)], 1) for part in parts.fingers]
     if min(shares) < LEAST_SEEN:

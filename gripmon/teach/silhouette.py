@@ -36,6 +36,14 @@ ALIKE_STATIONS = 41
 FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
+CLEAR_NOISES = 6.0
+"""Contrast over a pixel's noise, at least a grey level, from which an image alone shows the finger's border there; and
+grey levels of two backgrounds so far apart are different ones."""
+FEWEST_CLEAR = 4
+"""Least number of images that show the border so: one of five may show something else there."""
+FEWEST_BACKGROUNDS = 2
+"""Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
+within a background the grey level on the finger's side changes, and the image isn't used there."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -160,6 +168,8 @@ def measure_transitions(
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
+    clear, different = backgrounds_beside(contrast, noise)
+    usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
     if blur_px is None:
@@ -176,6 +186,18 @@ def measure_transitions(
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness)
+
+
+def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """How many images (s,) show a clear contrast (n, s) at each station, and how many different backgrounds (s,) these
+    have: groups of grey levels with gaps between them.
+    """
+    least = CLEAR_NOISES * max(noise, 1.0)
+    clear = np.abs(contrast) > least
+    levels = np.sort(np.where(clear, contrast, np.inf), axis=0)
+    with np.errstate(invalid="ignore"):
+        gaps = (np.diff(levels, axis=0) > least) & np.isfinite(levels[1:])
+    return np.count_nonzero(clear, axis=0), np.count_nonzero(gaps, axis=0) + clear.any(axis=0)
 
 
 def _usual(finger: Array, within: NDArray[np.bool_]) -> Array:

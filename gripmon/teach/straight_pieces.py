@@ -32,6 +32,11 @@ STRAIGHT_PX = 0.2
 """Largest distance of a line from its edge, besides its own scatter: the accuracy wanted of an outline."""
 WORST_RMS_PX = 0.5
 """Largest scatter about a piece: at least twice what a curve leaves about its pieces."""
+WORST_SIGMA_PX = 1.0
+"""Standard deviation of a piece's ends, from the scatter over the images, from which it is left out: search lines at
+work reach 3 px to either side."""
+LEAST_USABLE = 0.6
+"""Least part of a piece's stations that are measured: what lies between others is bridged, not the most of it."""
 LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
@@ -165,7 +170,7 @@ class _Line:
     seen: float
 
 
-def fit_chain(
+def fit_chains(
     camera: Camera,
     images: NDArray[np.float32],
     noise: float,
@@ -173,9 +178,9 @@ def fit_chain(
     outward: Array,
     closed: bool,
     blur_px: float,
-) -> Chain | None:
+) -> list[Chain]:
     """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
-    gripper.  None where no straight piece of at least 8 px is left.
+    gripper.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
     """
     if closed:
         points, outward = _from_a_corner(points, outward)
@@ -198,15 +203,36 @@ def fit_chain(
             k = max(k - 1, 0)
         else:
             k += 1
-    if not found or (closed and len(found) < 3):
-        return None
-    found = _without_rounding(camera, images, noise, ideal, outward, blur_px, found, closed)
-    if closed and len(found) < 3:
-        return None
-    return _joined(camera, ideal, [line for _, line in found], [span for span, _ in found], closed)
+    out = []
+    for part, whole in _connected(found, ideal, closed):
+        part = _without_rounding(camera, images, noise, ideal, outward, blur_px, part, whole)
+        if not whole or len(part) >= 3:
+            out.append(_joined(camera, ideal, [line for _, line in part], [span for span, _ in part], whole))
+    return out
 
 
 _Found = tuple[tuple[int, int], _Line]
+
+
+def _connected(found: list[_Found], ideal: Array, closed: bool) -> list[tuple[list[_Found], bool]]:
+    """Pieces in groups without a gap between them; and whether each group is closed."""
+    if not found:
+        return []
+    count = len(found)
+    apart = [
+        float(np.linalg.norm(ideal[found[(k + 1) % count][0][0]] - ideal[found[k][0][1]])) > _GAP_PX
+        for k in range(count if closed else count - 1)
+    ]
+    if not any(apart):
+        return [(found, closed)]
+    first = apart.index(True) + 1 if closed else 0
+    groups: list[list[_Found]] = [[]]
+    for k in range(count):
+        at = (first + k) % count
+        groups[-1].append(found[at])
+        if k + 1 < count and apart[at]:
+            groups.append([])
+    return [(group, False) for group in groups]
 
 
 def _without_rounding(
@@ -304,7 +330,7 @@ def _measured(
         uv, normal = stations.uv_px, stations.normal
         found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
         usable = found.usable.copy()
-        if np.count_nonzero(usable) < 4:
+        if np.count_nonzero(usable) < max(4.0, LEAST_USABLE * len(usable)):
             return None
         at = to_ideal_px(camera, uv + found.offset_px[:, None] * normal)
         line, inlier = _robust_line(at, usable)
@@ -316,12 +342,15 @@ def _measured(
     residual = at[inlier] @ line[0] - line[1]
     if float(np.sqrt(np.square(residual).mean())) > WORST_RMS_PX:
         return None
-    signs = [float(np.sign(n @ line[0])) for n, _ in folds]
+    signs = np.array([float(np.sign(n @ line[0])) for n, _ in folds])
+    normals = signs[:, None] * np.array([n for n, _ in folds])
+    distances = signs * np.array([d for _, d in folds])
+    at_ends = jackknife_sigma(normals @ np.transpose(ends) - distances[:, None])
+    if float(at_ends.max()) > WORST_SIGMA_PX:
+        return None
     return _Line(
-        line[0], line[1], np.array([s * n for s, (n, _) in zip(signs, folds, strict=True)]),
-        np.array([s * d for s, (_, d) in zip(signs, folds, strict=True)]),
-        float(np.sqrt(np.square(residual).mean())), float(inlier.mean()),
-    )  # fmt: skip
+        line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean())
+    )
 
 
 def _stations_on(
