@@ -28,7 +28,9 @@ from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Creep, FingerLook, FingerMark, Light, Sensor
+from gripmon.teach.fingers import UnclearPartsError
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
+from gripmon.teach.image_borders import Border
 from gripmon.teach.image_size import NOMINAL_DISTANCE_M
 from gripmon.teach.silhouette import backgrounds_beside
 
@@ -101,13 +103,51 @@ def test_of_few_images_what_is_written_is_right_and_the_rest_is_left_out(name: s
     assert all(re.search("of a finger's outline shows|may be fingers|one finger is seen", why) for why in reasons)
 
 
+def test_a_border_before_one_background_is_named_and_marked() -> None:
+    """Right of the right finger there is a grey band in all images, which fades into what changes."""
+    simulator = moving_robot(**SCENES["plain look"])
+    images, covered = images_of(simulator)[:12], coverage(simulator)
+    away = cv2.distanceTransform((covered < 0.5).astype(np.uint8), cv2.DIST_L2, 5)
+    band = np.clip((34.0 - away) / 24.0, 0.0, 1.0) * (1.0 - covered)
+    row, column = np.indices(band.shape)
+    band *= np.clip((row - 250.0) / 40.0, 0.0, 1.0) * (column > 580)
+    rng = np.random.default_rng(1)
+    shown = [
+        np.clip(np.rint(image * (1.0 - band) + 150.0 * band + rng.normal(0.0, 0.7, band.shape)), 0, 255)
+        for image in images
+    ]
+    wanted = "along the right finger's outer border .* the background is the same there in all images; add"
+    with pytest.raises(UnclearPartsError, match=wanted) as caught:
+        gripper_from_images([image.astype(np.uint8) for image in shown], PAPER_LENS, distance_m=DISTANCE)
+    unseen = np.vstack(caught.value.unseen_px)
+    assert len(unseen) > 100 and np.mean(unseen[:, 0] > 500) > 0.8
+    drawn = caught.value.picture(images[0])
+    row, column = np.rint(unseen[len(unseen) // 2]).astype(int)[::-1]
+    assert drawn[row, column].tolist() == [40, 40, 255]
+
+
+@pytest.mark.parametrize(
+    ("clear", "same", "words"),
+    [
+        (2, False, "usually 2 of 7 images have a background there that differs from it, .* something bright behind it"),
+        (6, True, "the background is the same there in all images; add images with brighter and darker ones"),
+        (6, False, "images contradict each other there; add images with something bright and plain behind it"),
+    ],
+)
+def test_what_would_help_depends_on_what_is_missing(clear: int, same: bool, words: str) -> None:
+    border = Border("the finger's tip", 90, 0.42, np.zeros((0, 2)), clear, 7, same, brighter=True)
+    assert re.search(f"along the finger's tip 42 % of the outline shows: {words}", border.words())
+
+
 def test_a_border_counts_where_different_backgrounds_show_it() -> None:
-    contrast = np.array([
-        [50.0, 50.0, 0.0, 50.0, 9.0],
-        [51.0, -30.0, 0.0, 0.0, 30.0],
-        [52.0, 20.0, 3.0, 0.0, 60.0],
-        [50.0, 0.0, -2.0, 0.0, 90.0],
-    ])
+    contrast = np.array(
+        [
+            [50.0, 50.0, 0.0, 50.0, 9.0],
+            [51.0, -30.0, 0.0, 0.0, 30.0],
+            [52.0, 20.0, 3.0, 0.0, 60.0],
+            [50.0, 0.0, -2.0, 0.0, 90.0],
+        ]
+    )
     clear, different = backgrounds_beside(contrast, 1.0)
     assert clear.tolist() == [4, 3, 0, 1, 4] and different.tolist() == [1, 3, 0, 1, 4]
     clear, different = backgrounds_beside(contrast, 3.0)

@@ -50,14 +50,18 @@ class Parts:
 
 
 class UnclearPartsError(NoResultError):
-    """Which parts are the fingers isn't clear.  ``parts``: masks (h, w) of those that may be."""
+    """Which parts are the fingers isn't clear.  ``parts``: masks (h, w) of those that may be; ``unseen_px``: points
+    (k, 2) of their outlines that don't show.
+    """
 
-    def __init__(self, text: str, parts: list[Bits], still: Bits):
+    def __init__(self, text: str, parts: list[Bits], still: Bits, unseen_px: Sequence[Array] = ()):
         super().__init__(text)
-        self.parts, self.still = parts, still
+        self.parts, self.still, self.unseen_px = parts, still, unseen_px
 
     def picture(self, shown: Image) -> Image:
-        """The image (h, w[, 3]) with what stays (blue) and what may be a finger (green, numbered); BGR."""
+        """The image (h, w[, 3]) with what stays (blue), what may be a finger (green, numbered), and what of its outline
+        doesn't show (red); BGR.
+        """
         grey = shown if shown.ndim == 2 else shown.mean(axis=2)
         out = cv2.cvtColor(np.clip(grey * (255.0 / max(float(grey.max()), 1.0)), 0, 255).astype(np.uint8), 8)
         for number, (mask, colour) in enumerate(
@@ -68,6 +72,8 @@ class UnclearPartsError(NoResultError):
             if number:
                 at = np.argwhere(mask).mean(axis=0)[::-1].round().astype(int)
                 cv2.putText(out, str(number), tuple(at.tolist()), cv2.FONT_HERSHEY_SIMPLEX, 0.8, colour, 2, cv2.LINE_AA)
+        for point in np.rint(np.vstack([np.zeros((0, 2)), *self.unseen_px])).astype(int).tolist():
+            cv2.circle(out, point, 2, (40, 40, 255), -1, cv2.LINE_AA)
         return out
 
 

@@ -27,6 +27,7 @@ from gripmon.model.records import Array, Image
 from gripmon.model.response import in_light, response_of
 from gripmon.teach.finger_depth import PlacedOutlines, place
 from gripmon.teach.fingers import Box, UnclearPartsError
+from gripmon.teach.image_borders import WELL_SEEN
 from gripmon.teach.image_drawing import draw_outlines
 from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines
 from gripmon.teach.image_motion import SAME_OPENING_M
@@ -37,9 +38,6 @@ from gripmon.teach.motion_depth import move
 from gripmon.teach.result import GripperResult
 
 MOST_IMAGES = 200
-FEW_IMAGES = 10
-"""Images below which something of the background may stand by chance where an outline is, in several of them: in the
-simulator 4 to 26 % of an outline lay a pixel beside the truth with five images, 1 % with twenty."""
 WORST_OUTLINE_PX = 1.0
 """Standard deviation of an outline from which it is refused: search lines at work reach 3 px to either side."""
 
@@ -154,6 +152,7 @@ def gripper_from_images(
         assert reference is not None
         cam_T_grip, covariance = reference
     notes += unit_notes(size, why) if reference is None else []
+    notes += [border.words() for border in seen.borders if border.share < WELL_SEEN][:2]
     notes += _assumptions(placed, reference is not None, left_out, len(taken))
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     outline_px = float(np.hypot(np.median(sigmas), light.sigma_px))
@@ -301,11 +300,6 @@ def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str
         notes.append(
             "round fingertips are assumed to lie in the plane of their sides. Corrections of the camera's tilt, and of "
             "motions of some per cent of the distance, are too small or too large by what they stand out of it"
-        )
-    if count - len(left_out) < FEW_IMAGES:
-        notes.append(
-            f"{count - len(left_out)} images: pieces of the outline may be wrong by some pixels, which their scatter "
-            f"doesn't show; look at the picture, or take {FEW_IMAGES} images and more"
         )
     if left_out:
         notes.append(f"{len(left_out)} of {count} images left out")

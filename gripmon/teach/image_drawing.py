@@ -16,12 +16,13 @@ _CORNER: Colour = (0, 255, 255)
 _INNER: Colour = (0, 144, 255)
 _TEXT: Colour = (255, 255, 255)
 _SCATTER: Colour = (64, 64, 255)
+_UNSEEN: Colour = (255, 64, 255)
 _ENLARGED = 50.0
 
 
 def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Image:
     """Draw outlines by finger, corners as circles, and inner edges; at each vertex its scatter, three standard
-    deviations, enlarged.
+    deviations, enlarged; what of the outline doesn't show, as dots.
     """
     canvas = Canvas(image, 2 if image.shape[1] < 1000 else 1)
     for number, (finger, name) in enumerate(zip(seen.fingers, names, strict=True)):
@@ -34,10 +35,13 @@ def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Imag
             _draw_vertices(canvas, chain, colour)
         centre = np.argwhere(finger.mask)[:, ::-1].mean(axis=0)
         write(canvas.picture, name, canvas.pixel(centre), colour, 0.6)
+    unseen = np.vstack([np.zeros((0, 2)), *(border.unseen_px for border in seen.borders)])
+    for at in unseen:
+        canvas.circle(at, 1.5, _UNSEEN)
     sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     text = (
         f"{len(seen.matte.kept)} images, outline to {np.median(sigmas):.3f} px (median), blur {seen.blur_px:.1f} px; "
-        f"red: 3 sigma, x {_ENLARGED:g}"
+        f"red: 3 sigma, x {_ENLARGED:g}{'; pink dots: not seen' if len(unseen) else ''}"
     )
     write(canvas.picture, text, (12, canvas.picture.shape[0] - 14), _TEXT, 0.5)
     return canvas.picture

@@ -15,6 +15,7 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.model.staying import Bits, Plane
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
+from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
@@ -48,7 +49,7 @@ class FingerSeen:
 @dataclass(frozen=True)
 class OpeningSeen:
     """What the images of one opening show.  ``left_out``: index of each image that isn't used, and why; ``blur_px`` of
-    the outline; ``rest`` (h, w): what stays as well and is no finger.
+    the outline; ``rest`` (h, w): what stays as well and is no finger; ``borders``: what shows of each, worst first.
     """
 
     matte: Matte
@@ -56,6 +57,7 @@ class OpeningSeen:
     left_out: dict[int, str]
     blur_px: float
     rest: Bits
+    borders: tuple[Border, ...]
 
 
 def see_opening(
@@ -96,8 +98,8 @@ def see_opening(
                 break
             matte = _moved_back(matte, moved, stations)
         step()
-    seen = _fingers(camera, matte, contours, parts, found.blur_px, step)
-    return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest)
+    seen, borders = _fingers(camera, matte, contours, parts, found.blur_px, step)
+    return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest, borders)
 
 
 def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) -> tuple[Stations, Transitions]:
@@ -205,32 +207,48 @@ def _fingers(
     parts: Parts,
     blur_px: float,
     step: Callable[[], None],
-) -> tuple[FingerSeen, ...]:
-    """The fingers with the chains of their outlines."""
+) -> tuple[tuple[FingerSeen, ...], tuple[Border, ...]]:
+    """The fingers with the chains of their outlines, and how much of each border that is."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
+    along = []
     for part, contour in contours:
         stations = _stations(contour, part, parts.rest)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
+        along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
                 camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
             )
         step()
+    centres_px = [np.argwhere(part)[:, ::-1].mean(axis=0) for part in parts.fingers]
+    own = [chains[id(part)] for part in parts.fingers]
+    borders = tuple(borders_of(_names(centres_px), parts.outwards, centres_px, along, own, matte.mean.shape))
+    worst = [border for border in borders if border.share < WELL_SEEN][:2] or borders[:1]
     shares = [sum(map(_length_px, chains[id(part)])) / max(in_view[id(part)], 1) for part in parts.fingers]
     if min(shares) < LEAST_SEEN:
         raise UnclearPartsError(
             f"only {100.0 * min(shares):.0f} % of a finger's outline shows against the backgrounds, at least "
-            f"{100.0 * LEAST_SEEN:.0f} %: more images, before brighter and darker backgrounds",
+            f"{100.0 * LEAST_SEEN:.0f} %: {'; '.join(border.words() for border in worst)}",
             list(parts.fingers),
             matte.still,
+            [border.unseen_px for border in borders],
         )
     if not all(chains.values()):
         raise NoResultError("a finger has no straight or curved edge of 8 px; fingertips in view and in focus")
-    return tuple(
+    fingers = tuple(
         FingerSeen(part, tuple(chains[id(part)]), tuple(find_inner_edges(camera, matte, part)), outwards)
         for part, outwards in zip(parts.fingers, parts.outwards, strict=True)
     )
+    return fingers, borders
+
+
+def _names(centres_px: Sequence[Array]) -> list[str]:
+    """The fingers in words of the picture."""
+    if len(centres_px) == 1:
+        return ["finger"]
+    across = int(np.abs(centres_px[1] - centres_px[0]).argmax()) == 0
+    return ["left finger", "right finger"] if across else ["upper finger", "lower finger"]

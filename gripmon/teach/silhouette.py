@@ -70,7 +70,8 @@ class Transitions:
     ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
     edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
-    each image's transitions over that of all.
+    each image's transitions over that of all; ``clear`` and ``different`` (s,) as :func:`backgrounds_beside` has them;
+    ``level`` (s,) of the finger, grey.
     """
 
     offset_px: Array
@@ -80,6 +81,9 @@ class Transitions:
     shift_px: Array
     worth: Array
     sharpness: Array
+    clear: NDArray[np.intp]
+    different: NDArray[np.intp]
+    level: Array
 
 
 def folds_of(count: int) -> NDArray[np.intp]:
@@ -185,7 +189,7 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

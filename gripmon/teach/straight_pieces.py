@@ -348,9 +348,7 @@ def _measured(
     at_ends = jackknife_sigma(normals @ np.transpose(ends) - distances[:, None])
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
-    return _Line(
-        line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean())
-    )
+    return _Line(line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean()))
 
 
 def _stations_on(
