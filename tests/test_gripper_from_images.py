@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -32,6 +33,7 @@ from gripmon.teach.fingers import UnclearPartsError
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
 from gripmon.teach.image_borders import Border
 from gripmon.teach.image_size import NOMINAL_DISTANCE_M
+from gripmon.teach.matte import BLOCK_PX, blocks, grey_levels
 from gripmon.teach.silhouette import backgrounds_beside
 
 DEPTH_M = 0.115
@@ -136,7 +138,41 @@ def test_a_border_before_one_background_is_named_and_marked() -> None:
 )
 def test_what_would_help_depends_on_what_is_missing(clear: int, same: bool, words: str) -> None:
     border = Border("the finger's tip", 90, 0.42, np.zeros((0, 2)), clear, 7, same, brighter=True)
-    assert re.search(f"along the finger's tip 42 % of the outline shows: {words}", border.words())
+    assert re.search(f"along the finger's tip 42 % of the outline shows: {words}$", border.words())
+    between = replace(border, name="the left finger's inner border").words()  # what the jaws hold stays as well
+    assert between.endswith(", and with nothing between the jaws") == (same and clear == 6)
+
+
+@pytest.mark.parametrize(("quality", "written"), [(40, True), (15, False)])
+def test_blocks_of_strong_compression_are_no_edges_and_are_named(quality: int, written: bool) -> None:
+    """Their borders lie on a grid that stays in all images."""
+    simulator = moving_robot(**SCENES["plain look"])
+    coded = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for image in images_of(simulator)[:15]]
+    images = [cv2.imdecode(data, cv2.IMREAD_UNCHANGED) for data in coded]
+    words = "the images are compressed strongly .* a higher quality"
+    if not written:
+        with pytest.raises(NoResultError, match=words):
+            gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+        return
+    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    assert any(re.match(words, note) for note in found.notes)
+    away = beside_truth_px(chains_of(found), coverage(simulator))
+    assert np.mean(away > 1.0) < 0.01 and np.quantile(away, 0.95) < 0.4
+    for edge in (edge for finger in found.seen.fingers for edge in finger.inner):
+        along, across = np.sort(np.abs(edge.uv_px[1] - edge.uv_px[0]))[::-1]
+        axis = int(np.argmin(np.abs(edge.uv_px[1] - edge.uv_px[0])))
+        beside = abs((float(edge.uv_px[:, axis].mean()) + 0.5 + BLOCK_PX / 2) % BLOCK_PX - BLOCK_PX / 2)
+        assert across > 0.005 * along or beside > 0.2
+
+
+def test_steps_at_coded_blocks_are_told_from_the_images(box: tuple) -> None:
+    images = box[0][:3]
+    by_quality = []
+    for quality in (20, 40, 75):
+        coded = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for image in images]
+        by_quality.append(blocks([grey_levels(cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) for data in coded]))
+    assert by_quality[0] > by_quality[1] > by_quality[2] > 1.2
+    assert abs(blocks([grey_levels(image) for image in images]) - 1.0) < 0.05
 
 
 def test_a_border_counts_where_different_backgrounds_show_it() -> None:

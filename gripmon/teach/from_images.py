@@ -33,7 +33,7 @@ from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, fin
 from gripmon.teach.image_motion import SAME_OPENING_M
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
-from gripmon.teach.matte import FEWEST_IMAGES, grey_levels, image_sets, smallest_noise
+from gripmon.teach.matte import FEWEST_IMAGES, STRONG_BLOCKS, blocks, grey_levels, image_sets, smallest_noise
 from gripmon.teach.motion_depth import move
 from gripmon.teach.result import GripperResult
 
@@ -114,9 +114,11 @@ def gripper_from_images(
     groups = _groups(openings_m, stored)
     notes = [*light.notes]
     left_out: dict[str, str] = {}
+    hint = _compressed([image for _, image in taken[::10]])
+    notes += [hint] if hint else []
     with progress(None, "step") as step:
         see = partial(see_opening, made, least_noise=least, step=step, fingers=fingers, within=within)
-        seen, around = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out)
+        seen, around = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out, hint)
         outlines = finger_outlines(made, seen)
         pose = None if reference is None else reference[0]
         at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
@@ -182,9 +184,10 @@ def _see_openings(
     files: Sequence[str],
     notes: list[str],
     left_out: dict[str, str],
+    hint: str,
 ) -> tuple[OpeningSeen, dict[float, OpeningSeen]]:
     """What the images of the first opening show, and of each other opening with enough images; adds to ``notes`` and
-    ``left_out``.
+    ``left_out``.  ``hint``: what refusals end with.
     """
     seen: dict[float, OpeningSeen] = {}
     for opening, own in groups.items():
@@ -194,6 +197,8 @@ def _see_openings(
         try:
             seen[opening] = see([grey[k] for k in own])
         except NoResultError as refused:
+            if hint:
+                refused.args = (f"{refused}; {hint}",)
             if len(groups) > 1:
                 of = f"{len(own)} of {len(files)} images show one opening, from {files[own[0]]} to {files[own[-1]]}"
                 refused.args = (f"{of}; of them {refused}",)
@@ -203,6 +208,17 @@ def _see_openings(
     if seen[first].rest.any():
         notes.append("what joins the fingers, or stays elsewhere in the image, isn't used")
     return seen[first], {opening: seen[opening] for opening in others}
+
+
+def _compressed(images: Sequence[Image]) -> str:
+    """A hint that images are compressed strongly; empty if they aren't."""
+    coarse = blocks([grey_levels(image) for image in images])
+    if coarse <= STRONG_BLOCKS:
+        return ""
+    return (
+        f"the images are compressed strongly (steps at the borders of coded blocks are {coarse:.1f} times those "
+        "elsewhere): a higher quality, 90 for JPEG"
+    )
 
 
 def _check(

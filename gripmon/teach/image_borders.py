@@ -47,7 +47,9 @@ class Border:
                 f"at least {FEWEST_CLEAR}; add images with something {kind} behind it"
             )
         if self.same:
-            return f"{shown}: the background is the same there in all images; add images with brighter and darker ones"
+            empty = ", and with nothing between the jaws" if self.name.endswith("inner border") else ""
+            always = "the background is the same there in all images"
+            return f"{shown}: {always}; add images with brighter and darker ones{empty}"
         return f"{shown}: images contradict each other there; add images with something {kind} and plain behind it"
 
 

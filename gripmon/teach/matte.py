@@ -32,6 +32,11 @@ CLEARLY_BETTER = 1.1
 """Likeness at another displacement over that at none, from which it is one: edges are as alike a pixel beside."""
 LEAST_LIKENESS = 0.5
 """Least share of the gripper's edges that an image must show, over the usual share: more is hidden, or elsewhere."""
+BLOCK_PX = 8
+"""Side of the blocks that JPEG and most video coders code apart."""
+STRONG_BLOCKS = 1.7
+"""Difference of grey levels across the blocks' borders over that elsewhere, from which images are compressed strongly:
+1.0 without compression, 1.3 to 1.9 at JPEG's quality 75, 1.5 to 2.5 at 40, 1.7 to 3.3 at 20."""
 SMALLEST_PART = 100
 """Smallest part of a gripper (px): a tip of 10 x 10 px."""
 MOST_STILL_SHARE = 0.9
@@ -71,6 +76,19 @@ def grey_levels(image: Image) -> Plane:
 def smallest_noise(image: Image) -> float:
     """Standard deviation of a pixel by rounding alone, in grey levels of 0 to 255."""
     return 255.0 * quantum(image) / full_scale(image) / 12.0**0.5
+
+
+def blocks(images: Sequence[Plane]) -> float:
+    """How much larger grey levels' differences (at most 8) are across the borders of coded blocks than elsewhere, in
+    images (h, w); 1 in those that aren't compressed, or were scaled since.
+    """
+    each = np.zeros(BLOCK_PX)
+    for image in images:
+        for way in (image, image.T):
+            steps = np.minimum(np.abs(np.diff(way, axis=1)), 8.0).mean(axis=0)
+            steps = steps[: len(steps) // BLOCK_PX * BLOCK_PX]
+            each += steps.reshape(-1, BLOCK_PX).mean(axis=0)
+    return float(each[-1] / max(float(np.median(each)), 1e-6))
 
 
 def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], None] = lambda: None) -> Matte:
