@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -203,8 +204,23 @@ def fit_chains(
             k = max(k - 1, 0)
         else:
             k += 1
+
+    def joined(before: _Found, after: _Found) -> bool:
+        ends = ideal[before[0][1]], ideal[after[0][0]]
+        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX:
+            return True
+        # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
+        (_, one), (_, other) = before, after
+        distances = np.array([[one.distance], [other.distance]])
+        meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
+        return all(
+            float(np.linalg.norm(meet - end)) < LONGEST_CUT_PX
+            and _goes_on(camera, images, noise, end, meet, outward[[at]], blur_px)
+            for end, at in zip(ends, (before[0][1], after[0][0]), strict=True)
+        )
+
     out = []
-    for part, whole in _connected(found, ideal, closed):
+    for part, whole in _connected(found, joined, closed):
         part = _without_rounding(camera, images, noise, ideal, outward, blur_px, part, whole)
         if not whole or len(part) >= 3:
             out.append(_joined(camera, ideal, [line for _, line in part], [span for span, _ in part], whole))
@@ -214,15 +230,14 @@ def fit_chains(
 _Found = tuple[tuple[int, int], _Line]
 
 
-def _connected(found: list[_Found], ideal: Array, closed: bool) -> list[tuple[list[_Found], bool]]:
-    """Pieces in groups without a gap between them; and whether each group is closed."""
+def _connected(
+    found: list[_Found], joined: Callable[[_Found, _Found], bool], closed: bool
+) -> list[tuple[list[_Found], bool]]:
+    """Pieces in groups, each of which is ``joined`` to the next; and whether each group is closed."""
     if not found:
         return []
     count = len(found)
-    apart = [
-        float(np.linalg.norm(ideal[found[(k + 1) % count][0][0]] - ideal[found[k][0][1]])) > _GAP_PX
-        for k in range(count if closed else count - 1)
-    ]
+    apart = [not joined(found[k], found[(k + 1) % count]) for k in range(count if closed else count - 1)]
     if not any(apart):
         return [(found, closed)]
     first = apart.index(True) + 1 if closed else 0
