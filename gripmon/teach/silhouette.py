@@ -194,13 +194,15 @@ def measure_transitions(
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """How many images (s,) show a clear contrast (n, s) at each station, and how many different backgrounds (s,) these
-    have: groups of grey levels with gaps between them.
+    have: ranges of grey levels, as wide as a clear contrast is high, that hold some.
     """
     least = CLEAR_NOISES * max(noise, 1.0)
     clear = np.abs(contrast) > least
     levels = np.sort(np.where(clear, contrast, np.inf), axis=0)
-    with np.errstate(invalid="ignore"):
-        gaps = (np.diff(levels, axis=0) > least) & np.isfinite(levels[1:])
+    lowest = np.where(np.isfinite(levels[0]), levels[0], 0.0)
+    # Of many images the levels leave no gaps, so that their range is divided.
+    steps = np.floor((np.where(np.isfinite(levels), levels, lowest) - lowest) / least)
+    gaps = np.diff(steps, axis=0) > 0.0
     return np.count_nonzero(clear, axis=0), np.count_nonzero(gaps, axis=0) + clear.any(axis=0)
 
 
