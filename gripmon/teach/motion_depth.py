@@ -87,15 +87,13 @@ def _move(
 ) -> tuple[PlacedOutlines, Moved]:
     why = ""
     try:
-        if placed.flat:
-            direction = None if pose is None else pose[0][:, 0]
-            found = fit_motion(camera, fingers, seen, around, travel=travel, direction=direction)
-        else:
-            found = fit_motion(camera, fingers, seen, around, placed=placed)
+        direction = None if pose is None else pose[0][:, 0]
+        shown = None if placed.flat else placed
+        found = fit_motion(camera, fingers, seen, around, placed=shown, travel=travel, direction=direction)
         if found.turned:
             # Which of its points' distance the jaws report isn't known, and a gripper file's fingers don't turn.
             return placed, Moved({}, None, found.turned)
-        if placed.flat:
+        if found.by_motion:
             placed, found = place_by_motion(fingers, found, pose, absolute=travel is not None)
         return placed, Moved(found.moved, found)
     except Unfit as unfit:
