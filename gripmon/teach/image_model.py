@@ -22,7 +22,7 @@ from gripmon.teach.inner_edges import InnerEdge
 from gripmon.teach.vanishing import PARALLEL_RAD
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
-SHORTEST_EDGE_PX = 8.0
+SHORTEST_EDGE_PX = 4.0
 MEETS_PX = 2.0
 """Largest distance, besides its own scatter, by which the line of an inner edge may miss the outline's corner that it
 runs to: with a bevel of 0.25 mm, 100 mm away, it misses it by as much."""

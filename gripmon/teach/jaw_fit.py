@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,10 +80,9 @@ def fit_motion(
     standard deviation, and ``direction`` (3,), where a calibration tells both.  ``loose``: how one finger, or each of
     two, moves, whatever that is; ``placed``, or an assumption, is needed then.  Raises :class:`Unfit`.
     """
-    ways = [(placed, None, None)] if placed is not None else []
-    if not loose:
-        ways.append((None, travel, direction))
-    fit, best = _best_of([_Fit(camera, fingers, seen, around, *way, loose=loose) for way in ways], loose=loose)
+    make = partial(_Fit, camera, fingers, seen, around, loose=loose)
+    fits = [] if placed is None else [make(placed, None, None)]
+    fit, best = _best_of(fits if loose else [*fits, make(None, travel, direction)], loose=loose)
     turned = fit.turned(fit.checked(best))
     return fit.result(fit.finer(best), turned)
 

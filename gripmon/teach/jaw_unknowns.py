@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import Outline, PlacedOutlines
+from gripmon.teach.finger_depth import LONG_PX, Outline, PlacedOutlines
 from gripmon.teach.image_motion import Unfit, along_finger, contact, rough_shift_px
 from gripmon.teach.image_outline import OpeningSeen
 
@@ -119,6 +119,7 @@ class Jaws:
             depth = np.concatenate([p[:, 2] for p in self.placed.points])
             q = np.where(np.isfinite(depth), 1.0 / depth, 1.0)
         self.pairs = self._corresponding(way) if len(self.fingers) == 2 else np.zeros((0, 2), int)
+        self.sliding = self._sliding(way)
         self.shape = q
         self.extra = 6 if self.placed is None else 2
         tail = np.zeros((len(self.openings), self.each))
@@ -136,6 +137,15 @@ class Jaws:
         nearest = [(i, int(j)) for i, j in enumerate(angle.argmin(axis=1)) if angle[i, j] < CORRESPOND_RAD]
         pairs = [(i, j) for i, j in nearest if angle[:, j].argmin() == i]
         return np.array([(self.tips[0][i], self.tips[1][j]) for i, j in pairs], int).reshape(-1, 2)
+
+    def _sliding(self, way: Array) -> NDArray[np.intp]:
+        """Long pieces (p, 2) that move along themselves, so that nothing shows how far away their ends are; a short one
+        may end where it passes behind another edge, farther away than that.
+        """
+        pieces = self.ends[::STATIONS][self.length_px >= LONG_PX]
+        along = self.rays[pieces[:, 1], :2] - self.rays[pieces[:, 0], :2]
+        across = np.abs(along[:, 0] * way[1] - along[:, 1] * way[0])
+        return np.asarray(pieces[across < math.sin(CORRESPOND_RAD) * np.linalg.norm(along, axis=1)])
 
     def _planes(self, q: Array) -> Array:
         if self.placed is not None:
@@ -197,6 +207,7 @@ class Jaws:
         out = [
             (q - expected) / (OFF_PLANE if self.placed is None else AS_PLACED),
             self._off_beside(self.rays / q[:, None], way),
+            self._off_parallel(self.rays / q[:, None], way),
             way[2:] / SQUARE,
             (tail[:, 1:4] / self.common).ravel(),
         ]
@@ -225,6 +236,15 @@ class Jaws:
             between, sigma = (last - first)[None], BESIDE_ROUGHLY
         between /= np.linalg.norm(between, axis=1)[:, None]
         return np.asarray(np.cross(between, way).ravel() / sigma)
+
+
+    def _off_parallel(self, points: Array, way: Array) -> Array:
+        """How far edges that move along themselves aren't parallel to the travel."""
+        if self.placed is not None:
+            return np.zeros(0)
+        run = points[self.sliding[:, 1]] - points[self.sliding[:, 0]]
+        run /= np.linalg.norm(run, axis=1)[:, None]
+        return np.asarray(np.cross(run, way).ravel() / BESIDE)
 
 
 def _roughly(finger: Outline, shift: Array, of_parts: Array) -> Array:
