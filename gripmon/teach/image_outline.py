@@ -104,7 +104,8 @@ def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) ->
     """Stations along all contours, and the transitions measured there."""
     if not contours:
         raise NoResultError("nothing that stays has an outline; the gripper's fingertips in view")
-    each = [_stations(contour, part, rest) for part, contour in contours]
+    near = _near(rest)
+    each = [_stations(contour, part, near) for part, contour in contours]
     stations = Stations(
         np.vstack([s.uv_px for s in each]),
         np.vstack([s.normal for s in each]),
@@ -120,12 +121,19 @@ def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) ->
     return stations, found
 
 
-def _stations(contour: Array, part: Bits, rest: Bits) -> Stations:
-    """Stations along a part's contour; where it is cut off from the rest of what stays, or near it, isn't outline."""
-    stations = stations_along(contour, part)
+def _near(rest: Bits) -> Bits:
+    """Pixels (h, w) on what stays and is no finger, or beside it."""
     size = 2 * int(_BESIDE_PX) + 1
-    near = cv2.dilate(rest.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
-    column, row = np.clip(np.rint(contour).astype(int), 0, np.array(rest.shape[::-1]) - 1).T
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.asarray(cv2.dilate(rest.astype(np.uint8), shape) > 0)
+
+
+def _stations(contour: Array, part: Bits, near: Bits) -> Stations:
+    """Stations along a part's contour; where it is cut off from the rest of what stays, or ``near`` it, isn't
+    outline.
+    """
+    stations = stations_along(contour, part)
+    column, row = np.clip(np.rint(contour).astype(int), 0, np.array(near.shape[::-1]) - 1).T
     return replace(stations, inside=stations.inside & ~near[row, column])
 
 
@@ -139,14 +147,20 @@ def _blurred(found: Transitions) -> dict[int, str]:
     }
 
 
+def _middle(stations: Stations) -> tuple[Array, float]:
+    """Centre (2,) of an outline in view, px, and its root mean square distance from it."""
+    at = stations.uv_px[stations.inside]
+    centre = at.mean(axis=0)
+    return centre, float(np.sqrt(np.square(at - centre).sum(axis=1).mean()))
+
+
 def _displaced(stations: Stations, found: Transitions) -> Array:
     """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the outline's centre
-    in pixels at its usual distance from it; robust least squares.
+    in pixels at its usual distance from it (:func:`_middle`); robust least squares.
     """
     chosen = found.usable
-    normal, centre = stations.normal[chosen], stations.uv_px[chosen].mean(axis=0)
-    arm = stations.uv_px[chosen] - centre
-    size = float(np.sqrt(np.square(arm).sum(axis=1).mean()))
+    centre, size = _middle(stations)
+    normal, arm = stations.normal[chosen], stations.uv_px[chosen] - centre
     design = np.column_stack([normal, (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / size])
     out = np.zeros((len(found.worth), 3))
     for k in range(len(out)):
@@ -161,9 +175,7 @@ def _displaced(stations: Stations, found: Transitions) -> Array:
 
 def _moved_back(matte: Matte, moved: Array, stations: Stations) -> Matte:
     """The matte with each image moved back by (n, 3), as :func:`_displaced` found it."""
-    at = stations.uv_px[stations.inside]
-    centre = at.mean(axis=0)
-    size = float(np.sqrt(np.square(at - centre).sum(axis=1).mean()))
+    centre, size = _middle(stations)
     images = np.empty_like(matte.images)
     for k, (image, (dx, dy, turn)) in enumerate(zip(matte.images, moved, strict=True)):
         angle = turn / size
@@ -209,8 +221,9 @@ def _fingers(
     """The fingers with the chains of their outlines."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
+    near = _near(parts.rest)
     for part, contour in contours:
-        stations = _stations(contour, part, parts.rest)
+        stations = _stations(contour, part, near)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))

@@ -316,4 +316,5 @@ class _Fit(Jaws):
         for tip in self.tips:
             at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
         tcp = at_q @ best.covariance @ at_q.T
-        return JawMotion(of_each, self.placed is None, moved, travel, covariance, way, slope_sigma, tcp, turned)
+        depths = of_each, self.kept, self.placed is None
+        return JawMotion(*depths, moved, travel, covariance, way, slope_sigma, tcp, turned)
