@@ -88,8 +88,9 @@ def fit_motion(
 
 
 def _best_of(fits: Sequence[_Fit], *, loose: bool) -> tuple[_Fit, _Solved]:
-    """The first of the fits that explains the outlines, unless another one does clearly better: what perspective says
-    of a taper's sides, which aren't parallel, is wrong, and the motion shows it.
+    """The first of the fits, unless the outlines contradict it, as they contradict what perspective says of a taper's
+    sides, which aren't parallel, and another one explains them clearly better.  Where it doesn't, what disagrees are
+    the outlines, and the first agrees as far as the other one.
     """
     found: list[tuple[_Fit, _Solved]] = []
     why = Unfit("")
@@ -103,8 +104,12 @@ def _best_of(fits: Sequence[_Fit], *, loose: bool) -> tuple[_Fit, _Solved]:
         except Unfit as unfit:
             why = unfit
             continue
-        if not found or found[0][1].chi2 - best.chi2 > MORE_CHI2:
-            found = [(fit, best)]
+        if found and found[0][1].chi2 - best.chi2 <= MORE_CHI2:
+            found = [(found[0][0], replace(found[0][1], agreeing=max(found[0][1].agreeing, best.agreeing)))]
+            continue
+        found = [(fit, best)]
+        if best.agreeing >= AGREEING:
+            break
     if not found:
         raise why
     return found[0]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import LONG_PX, Outline, PlacedOutlines
+from gripmon.teach.finger_depth import Outline, PlacedOutlines
 from gripmon.teach.image_motion import TIP_SHARE, Unfit, along_finger, contact, rough_shift_px
 from gripmon.teach.image_outline import OpeningSeen
 
@@ -119,7 +119,6 @@ class Jaws:
             depth = np.concatenate([p[:, 2] for p in self.placed.points])
             q = np.where(np.isfinite(depth), 1.0 / depth, 1.0)
         self.pairs = self._corresponding(way) if len(self.fingers) == 2 else np.zeros((0, 2), int)
-        self.sliding = self._sliding(way)
         self.shape = q
         self.extra = 6 if self.placed is None else 2
         tail = np.zeros((len(self.openings), self.each))
@@ -137,13 +136,6 @@ class Jaws:
         nearest = [(i, int(j)) for i, j in enumerate(angle.argmin(axis=1)) if angle[i, j] < CORRESPOND_RAD]
         pairs = [(i, j) for i, j in nearest if angle[:, j].argmin() == i]
         return np.array([(self.tips[0][i], self.tips[1][j]) for i, j in pairs], int).reshape(-1, 2)
-
-    def _sliding(self, way: Array) -> NDArray[np.intp]:
-        """Long pieces (p, 2) that move along themselves, so that nothing shows how far away their ends are; a short one
-        may end where it passes behind another edge, farther away than that.
-        """
-        pieces = self.ends[::STATIONS][self.length_px >= LONG_PX]
-        return pieces[_slides(self.rays[pieces, :2], way)]
 
     def _planes(self, q: Array) -> Array:
         if self.placed is not None:
@@ -205,7 +197,6 @@ class Jaws:
         out = [
             (q - expected) / (OFF_PLANE if self.placed is None else AS_PLACED),
             self._off_beside(self.rays / q[:, None], way),
-            self._off_parallel(self.rays / q[:, None], way),
             way[2:] / SQUARE,
             (tail[:, 1:4] / self.common).ravel(),
         ]
@@ -235,21 +226,6 @@ class Jaws:
         between /= np.linalg.norm(between, axis=1)[:, None]
         return np.asarray(np.cross(between, way).ravel() / sigma)
 
-    def _off_parallel(self, points: Array, way: Array) -> Array:
-        """How far edges that move along themselves aren't parallel to the travel."""
-        if self.placed is not None:
-            return np.zeros(0)
-        run = points[self.sliding[:, 1]] - points[self.sliding[:, 0]]
-        run /= np.linalg.norm(run, axis=1)[:, None]
-        return np.asarray(np.cross(run, way).ravel() / BESIDE)
-
-
-def _slides(ends: Array, way: Array) -> NDArray[np.bool_]:
-    """Which pieces with ends (p, 2, 2) move along themselves if moved along ``way`` (2,)."""
-    along = ends[:, 1] - ends[:, 0]
-    across = np.abs(along[:, 0] * way[1] - along[:, 1] * way[0])
-    return np.asarray(across < math.sin(CORRESPOND_RAD) * np.linalg.norm(along, axis=1))
-
 
 def _shown(finger: Outline, way: Array) -> tuple[tuple[int, int], ...]:
     """The pieces whose depth the motion shows: not those behind the tip that move along themselves and end free, as the
@@ -259,7 +235,9 @@ def _shown(finger: Outline, way: Array) -> tuple[tuple[int, int], ...]:
     ahead = finger.xy @ finger.outwards
     behind = (ahead[pieces] < ahead.max() - TIP_SHARE * float(np.ptp(ahead))).any(axis=1)
     free = (np.bincount(pieces.ravel(), minlength=len(ahead))[pieces] == 1).any(axis=1)
-    unknown = behind & free & _slides(finger.xy[pieces], way)
+    along = finger.xy[pieces[:, 1]] - finger.xy[pieces[:, 0]]
+    across = np.abs(along[:, 0] * way[1] - along[:, 1] * way[0])
+    unknown = behind & free & (across < math.sin(CORRESPOND_RAD) * np.linalg.norm(along, axis=1))
     return tuple(piece for piece, left in zip(finger.pieces, unknown.tolist(), strict=True) if not left)
 
 
