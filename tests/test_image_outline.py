@@ -33,7 +33,7 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
     matte = Matte(usual, flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})
 
-    back = _moved_back(matte, _displaced(stations, found), stations).images
+    back = _moved_back(matte, _displaced(stations, found), uv_px[usable]).images
     inner = np.s_[20:-20, 20:-20]
     off, off_before = (np.abs(image[inner] - usual[inner]).max() for image in (back[0], turned))
     assert off < 0.1 * off_before

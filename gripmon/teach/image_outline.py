@@ -94,7 +94,7 @@ def see_opening(
             moved = _displaced(stations, found)
             if np.abs(moved).max() < LEAST_PLAY_PX:
                 break
-            matte = _moved_back(matte, moved, stations)
+            matte = _moved_back(matte, moved, stations.uv_px[found.usable])
         step()
     seen = _fingers(camera, matte, contours, parts, found.blur_px, step)
     return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest)
@@ -147,19 +147,18 @@ def _blurred(found: Transitions) -> dict[int, str]:
     }
 
 
-def _middle(stations: Stations) -> tuple[Array, float]:
-    """Centre (2,) of an outline in view, px, and its root mean square distance from it."""
-    at = stations.uv_px[stations.inside]
-    centre = at.mean(axis=0)
-    return centre, float(np.sqrt(np.square(at - centre).sum(axis=1).mean()))
+def _middle(at_px: Array) -> tuple[Array, float]:
+    """Centre (2,) of points (s, 2) and their root mean square distance from it, px."""
+    centre = at_px.mean(axis=0)
+    return centre, float(np.sqrt(np.square(at_px - centre).sum(axis=1).mean()))
 
 
 def _displaced(stations: Stations, found: Transitions) -> Array:
-    """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the outline's centre
-    in pixels at its usual distance from it (:func:`_middle`); robust least squares.
+    """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the centre of its
+    usable stations, in pixels at their usual distance from it (:func:`_middle`); robust least squares.
     """
     chosen = found.usable
-    centre, size = _middle(stations)
+    centre, size = _middle(stations.uv_px[chosen])
     normal, arm = stations.normal[chosen], stations.uv_px[chosen] - centre
     design = np.column_stack([normal, (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / size])
     out = np.zeros((len(found.worth), 3))
@@ -173,9 +172,9 @@ def _displaced(stations: Stations, found: Transitions) -> Array:
     return np.asarray(out - np.median(out, axis=0))
 
 
-def _moved_back(matte: Matte, moved: Array, stations: Stations) -> Matte:
-    """The matte with each image moved back by (n, 3), as :func:`_displaced` found it."""
-    centre, size = _middle(stations)
+def _moved_back(matte: Matte, moved: Array, usable_px: Array) -> Matte:
+    """The matte with each image moved back by (n, 3), as :func:`_displaced` found it by the usable stations (s, 2)."""
+    centre, size = _middle(usable_px)
     images = np.empty_like(matte.images)
     for k, (image, (dx, dy, turn)) in enumerate(zip(matte.images, moved, strict=True)):
         angle = turn / size
