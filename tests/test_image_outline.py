@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gripmon.model.staying import Edges
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import Stations, Transitions
-from gripmon.teach.staying import Edges
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
