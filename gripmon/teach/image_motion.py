@@ -41,13 +41,16 @@ class FingerMoved:
 
 @dataclass(frozen=True)
 class JawMotion:
-    """``q`` of each finger (v,): inverse depths of its vertices; ``moved`` by opening: each finger's motion over the
-    tips' depth; ``travel`` (o,) of the fingers against each other, over that depth, with its ``covariance`` (o, o);
-    ``direction`` (3,) of the travel, ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3)
-    of the tips' middle over that depth; ``turned``: why they turn while they move, if they do.
+    """``q`` of each finger (v,): inverse depths of its vertices, and its ``kept`` pieces, whose depth is known,
+    ``by_motion`` or by perspective; ``moved`` by opening: each finger's motion over the tips' depth; ``travel`` (o,) of
+    the fingers against each other, over that depth, with its ``covariance`` (o, o); ``direction`` (3,) of the travel,
+    ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3) of the tips' middle over that
+    depth; ``turned``: why they turn while they move, if they do.
     """
 
     q: tuple[Array, ...]
+    kept: tuple[tuple[tuple[int, int], ...], ...]
+    by_motion: bool
     moved: Mapping[float, Sequence[FingerMoved]]
     travel: Array
     covariance: Array

@@ -96,7 +96,7 @@ def see_opening(
             moved = _displaced(stations, found)
             if np.abs(moved).max() < LEAST_PLAY_PX:
                 break
-            matte = _moved_back(matte, moved, stations)
+            matte = _moved_back(matte, moved, stations.uv_px[found.usable])
         step()
     seen, borders = _fingers(camera, matte, contours, parts, found.blur_px, step)
     return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest, borders)
@@ -106,7 +106,8 @@ def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) ->
     """Stations along all contours, and the transitions measured there."""
     if not contours:
         raise NoResultError("nothing that stays has an outline; the gripper's fingertips in view")
-    each = [_stations(contour, part, rest) for part, contour in contours]
+    near = _near(rest)
+    each = [_stations(contour, part, near) for part, contour in contours]
     stations = Stations(
         np.vstack([s.uv_px for s in each]),
         np.vstack([s.normal for s in each]),
@@ -122,12 +123,19 @@ def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) ->
     return stations, found
 
 
-def _stations(contour: Array, part: Bits, rest: Bits) -> Stations:
-    """Stations along a part's contour; where it is cut off from the rest of what stays, or near it, isn't outline."""
-    stations = stations_along(contour, part)
+def _near(rest: Bits) -> Bits:
+    """Pixels (h, w) on what stays and is no finger, or beside it."""
     size = 2 * int(_BESIDE_PX) + 1
-    near = cv2.dilate(rest.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
-    column, row = np.clip(np.rint(contour).astype(int), 0, np.array(rest.shape[::-1]) - 1).T
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.asarray(cv2.dilate(rest.astype(np.uint8), shape) > 0)
+
+
+def _stations(contour: Array, part: Bits, near: Bits) -> Stations:
+    """Stations along a part's contour; where it is cut off from the rest of what stays, or ``near`` it, isn't
+    outline.
+    """
+    stations = stations_along(contour, part)
+    column, row = np.clip(np.rint(contour).astype(int), 0, np.array(near.shape[::-1]) - 1).T
     return replace(stations, inside=stations.inside & ~near[row, column])
 
 
@@ -141,14 +149,19 @@ def _blurred(found: Transitions) -> dict[int, str]:
     }
 
 
+def _middle(at_px: Array) -> tuple[Array, float]:
+    """Centre (2,) of points (s, 2) and their root mean square distance from it, px."""
+    centre = at_px.mean(axis=0)
+    return centre, float(np.sqrt(np.square(at_px - centre).sum(axis=1).mean()))
+
+
 def _displaced(stations: Stations, found: Transitions) -> Array:
-    """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the outline's centre
-    in pixels at its usual distance from it; robust least squares.
+    """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the centre of its
+    usable stations, in pixels at their usual distance from it (:func:`_middle`); robust least squares.
     """
     chosen = found.usable
-    normal, centre = stations.normal[chosen], stations.uv_px[chosen].mean(axis=0)
-    arm = stations.uv_px[chosen] - centre
-    size = float(np.sqrt(np.square(arm).sum(axis=1).mean()))
+    centre, size = _middle(stations.uv_px[chosen])
+    normal, arm = stations.normal[chosen], stations.uv_px[chosen] - centre
     design = np.column_stack([normal, (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / size])
     out = np.zeros((len(found.worth), 3))
     for k in range(len(out)):
@@ -161,11 +174,9 @@ def _displaced(stations: Stations, found: Transitions) -> Array:
     return np.asarray(out - np.median(out, axis=0))
 
 
-def _moved_back(matte: Matte, moved: Array, stations: Stations) -> Matte:
-    """The matte with each image moved back by (n, 3), as :func:`_displaced` found it."""
-    at = stations.uv_px[stations.inside]
-    centre = at.mean(axis=0)
-    size = float(np.sqrt(np.square(at - centre).sum(axis=1).mean()))
+def _moved_back(matte: Matte, moved: Array, usable_px: Array) -> Matte:
+    """The matte with each image moved back by (n, 3), as :func:`_displaced` found it by the usable stations (s, 2)."""
+    centre, size = _middle(usable_px)
     images = np.empty_like(matte.images)
     for k, (image, (dx, dy, turn)) in enumerate(zip(matte.images, moved, strict=True)):
         angle = turn / size
@@ -211,9 +222,9 @@ def _fingers(
     """The fingers with the chains of their outlines, and how much of each border that is."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
-    along = []
+    along, near = [], _near(parts.rest)
     for part, contour in contours:
-        stations = _stations(contour, part, parts.rest)
+        stations = _stations(contour, part, near)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))

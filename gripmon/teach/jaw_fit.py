@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,19 +75,44 @@ def fit_motion(
     direction: Array | None = None,
     loose: bool = False,
 ) -> JawMotion:
-    """The motion from the ``seen`` opening to those ``around``.  ``placed``: where perspective places the fingers, or
-    an assumption; ``travel``: their relative motion, over the TCP's depth, with its standard deviation, and
-    ``direction`` (3,), where a calibration tells both.  ``loose``: how one finger, or each of two, moves, whatever that
-    is; ``placed`` is needed then.  Raises :class:`Unfit`.
+    """The motion from the ``seen`` opening to those ``around``.  ``placed``: where perspective places the fingers,
+    which is used unless the motion contradicts it; ``travel``: their relative motion, over the TCP's depth, with its
+    standard deviation, and ``direction`` (3,), where a calibration tells both.  ``loose``: how one finger, or each of
+    two, moves, whatever that is; ``placed``, or an assumption, is needed then.  Raises :class:`Unfit`.
     """
-    fit = _Fit(camera, fingers, seen, around, placed, travel, direction, loose=loose)
-    best = fit.solve(LOOSE if loose else STRAIGHT)
-    if not loose:
-        other = min((fit.solve(ON_ARCS), fit.solve(UNEQUAL)), key=lambda solved: solved.chi2)
-        if best.chi2 - other.chi2 > MORE_CHI2:
-            best = other
+    make = partial(_Fit, camera, fingers, seen, around, loose=loose)
+    fits = [] if placed is None else [make(placed, None, None)]
+    fit, best = _best_of(fits if loose else [*fits, make(None, travel, direction)], loose=loose)
     turned = fit.turned(fit.checked(best))
     return fit.result(fit.finer(best), turned)
+
+
+def _best_of(fits: Sequence[_Fit], *, loose: bool) -> tuple[_Fit, _Solved]:
+    """The first of the fits, unless the outlines contradict it, as they contradict what perspective says of a taper's
+    sides, which aren't parallel, and another one explains them clearly better.  Where it doesn't, what disagrees are
+    the outlines, and the first agrees as far as the other one.
+    """
+    found: list[tuple[_Fit, _Solved]] = []
+    why = Unfit("")
+    for fit in fits:
+        try:
+            best = fit.solve(LOOSE if loose else STRAIGHT)
+            if not loose:
+                other = min((fit.solve(ON_ARCS), fit.solve(UNEQUAL)), key=lambda solved: solved.chi2)
+                if best.chi2 - other.chi2 > MORE_CHI2:
+                    best = other
+        except Unfit as unfit:
+            why = unfit
+            continue
+        if found and found[0][1].chi2 - best.chi2 <= MORE_CHI2:
+            found = [(found[0][0], replace(found[0][1], agreeing=max(found[0][1].agreeing, best.agreeing)))]
+            continue
+        found = [(fit, best)]
+        if best.agreeing >= AGREEING:
+            break
+    if not found:
+        raise why
+    return found[0]
 
 
 _Found = tuple[NDArray[np.intp], Array, Array]
@@ -283,7 +309,7 @@ class _Fit(Jaws):
         travel = np.exp(tail[:, 0])
         at = len(best.unknowns) - self.each * (len(travel) - np.arange(len(travel)))
         covariance = best.covariance[np.ix_(at, at)] * np.outer(travel, travel)
-        of_each = [q[self.finger == k] for k in range(len(self.fingers))]
+        of_each = tuple(q[self.finger == k] for k in range(len(self.fingers)))
         slopes = []
         for k in range(len(self.fingers)):
             own = np.flatnonzero(self.finger == k)
@@ -295,4 +321,5 @@ class _Fit(Jaws):
         for tip in self.tips:
             at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
         tcp = at_q @ best.covariance @ at_q.T
-        return JawMotion(tuple(of_each), moved, travel, covariance, way, slope_sigma, tcp, turned)
+        depths = of_each, self.kept, self.placed is None
+        return JawMotion(*depths, moved, travel, covariance, way, slope_sigma, tcp, turned)

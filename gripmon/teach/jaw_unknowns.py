@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import Outline, PlacedOutlines
-from gripmon.teach.image_motion import Unfit, along_finger, contact, rough_shift_px
+from gripmon.teach.image_motion import TIP_SHARE, Unfit, along_finger, contact, rough_shift_px
 from gripmon.teach.image_outline import OpeningSeen
 
 LARGEST_COMMON_MOTION = 0.2
@@ -69,7 +69,6 @@ class Jaws:
         self.first = np.concatenate([[0], np.cumsum([len(f.xy) for f in fingers])])
         self.rays = np.vstack([np.column_stack([f.xy, np.ones(len(f.xy))]) for f in fingers])
         self.finger = np.repeat(np.arange(len(fingers)), np.diff(self.first))
-        self._stations()
         self.each = 4 + len(fingers)
         self.around, self.blur_px = tuple(around.values()), seen.blur_px
         self.others = [_lines(camera, other) for other in around.values()]
@@ -77,8 +76,7 @@ class Jaws:
 
     def _stations(self) -> None:
         ends, finger = [], []
-        for k, outline in enumerate(self.fingers):
-            kept = outline.pieces if self.placed is None else self.placed.kept[k]
+        for k, kept in enumerate(self.kept):
             ends += [(a + self.first[k], b + self.first[k]) for a, b in kept]
             finger += [k] * len(kept)
         lengths = np.linalg.norm(np.subtract(*self.rays[np.reshape(ends, (-1, 2)).T]), axis=1)
@@ -105,6 +103,8 @@ class Jaws:
         foremost = [f.xy[(f.xy @ f.outwards).argmax()] for f in self.fingers]
         if len(foremost) == 2:
             way = way * np.sign(float(way @ (foremost[1] - foremost[0])))
+        self.kept = tuple(_shown(f, way) for f in self.fingers) if self.placed is None else self.placed.kept
+        self._stations()
         self.tips = [first + own for first, own in zip(self.first, contact(self.fingers, way)[0], strict=False)]
         self.sign = np.sign(apart @ way)
         along = common @ way / length
@@ -225,6 +225,20 @@ class Jaws:
             between, sigma = (last - first)[None], BESIDE_ROUGHLY
         between /= np.linalg.norm(between, axis=1)[:, None]
         return np.asarray(np.cross(between, way).ravel() / sigma)
+
+
+def _shown(finger: Outline, way: Array) -> tuple[tuple[int, int], ...]:
+    """The pieces whose depth the motion shows: not those behind the tip that move along themselves and end free, as the
+    border of a body does behind which the finger comes out; nothing tells how far that is away.
+    """
+    pieces = np.reshape(finger.pieces, (-1, 2)).astype(int)
+    ahead = finger.xy @ finger.outwards
+    behind = (ahead[pieces] < ahead.max() - TIP_SHARE * float(np.ptp(ahead))).any(axis=1)
+    free = (np.bincount(pieces.ravel(), minlength=len(ahead))[pieces] == 1).any(axis=1)
+    along = finger.xy[pieces[:, 1]] - finger.xy[pieces[:, 0]]
+    across = np.abs(along[:, 0] * way[1] - along[:, 1] * way[0])
+    unknown = behind & free & (across < math.sin(CORRESPOND_RAD) * np.linalg.norm(along, axis=1))
+    return tuple(piece for piece, left in zip(finger.pieces, unknown.tolist(), strict=True) if not left)
 
 
 def _roughly(finger: Outline, shift: Array, of_parts: Array) -> Array:

@@ -87,15 +87,13 @@ def _move(
 ) -> tuple[PlacedOutlines, Moved]:
     why = ""
     try:
-        if placed.flat:
-            direction = None if pose is None else pose[0][:, 0]
-            found = fit_motion(camera, fingers, seen, around, travel=travel, direction=direction)
-        else:
-            found = fit_motion(camera, fingers, seen, around, placed=placed)
+        direction = None if pose is None else pose[0][:, 0]
+        shown = None if placed.flat else placed
+        found = fit_motion(camera, fingers, seen, around, placed=shown, travel=travel, direction=direction)
         if found.turned:
             # Which of its points' distance the jaws report isn't known, and a gripper file's fingers don't turn.
             return placed, Moved({}, None, found.turned)
-        if placed.flat:
+        if found.by_motion:
             placed, found = place_by_motion(fingers, found, pose, absolute=travel is not None)
         return placed, Moved(found.moved, found)
     except Unfit as unfit:
@@ -121,14 +119,13 @@ def place_by_motion(
     if found.slope_sigma.max() > FLAT_SIGMA_RAD:
         raise Unfit("it leaves the fingers' tilt unknown")
     points = [np.column_stack([f.xy, np.ones(len(f.xy))]) / q[:, None] for f, q in zip(fingers, found.q, strict=True)]
-    kept = tuple(f.pieces for f in fingers)
     if pose is not None:
         rotation, tcp = pose
         # Unless the travel tells, the outermost point lies as far out as the TCP.
         reach = max(float((p @ rotation[:, 2]).max()) for p in points)
         depth = 1.0 if absolute else reach / float(rotation[:, 2] @ tcp)
         points = [p / depth for p in points]
-        return PlacedOutlines(tuple(points), kept, *pose, False, np.zeros(3), by_motion=True), found.over(depth)
+        return PlacedOutlines(tuple(points), found.kept, *pose, False, np.zeros(3), by_motion=True), found.over(depth)
     across = found.direction
     ways, spreads = zip(*[along_finger(f, p) for f, p in zip(fingers, points, strict=True)], strict=True)
     along = np.sum(ways, axis=0)
@@ -144,6 +141,6 @@ def place_by_motion(
     points, tcp = [p / depth for p in points], tcp / depth
     sigma = np.array([found.slope_sigma[1], found.slope_sigma[0], 0.0])
     sigma = np.hypot(sigma, 0.5 * float(np.mean(spreads)))
-    made = tuple(points), kept, rotation, tcp, False, sigma
+    made = tuple(points), found.kept, rotation, tcp, False, sigma
     found = found.over(depth)
     return PlacedOutlines(*made, by_motion=True, tcp_covariance=found.tcp_covariance), found

@@ -20,18 +20,22 @@ DISTINCT_M = 1e-4
 def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
     """The direction (3,) of most of the edges' length, gripper frame, and (e,) which edges run along it.
 
-    Where no way has most of it: zero, and all True, so that nothing is an end.
+    It is that of one of them, or their principal one: the four sides of a finger that tapers two ways all lie within
+    30 degrees of its middle, and of no side.  Where no way has most of the length: zero, and all True, so that nothing
+    is an end.
     """
     points_m = gripper.points_grip_m()
     way = points_m[gripper.edge_points[:, 1]] - points_m[gripper.edge_points[:, 0]]
     length = np.linalg.norm(way, axis=1)
     direction = way / length[:, None]
-    near = np.abs(direction @ direction.T) > PARALLEL_COSINE
-    together = near @ length
-    best = int(np.argmax(together))
-    if together[best] < 0.5 * length.sum():
-        return np.zeros(3), np.ones(len(length), dtype=bool)
-    return direction[best], np.asarray(near[best])
+    principal = np.linalg.svd(direction * np.sqrt(length)[:, None])[2][0]
+    for ways in (direction, principal[None]):
+        near = np.abs(ways @ direction.T) > PARALLEL_COSINE
+        together = near @ length
+        best = int(np.argmax(together))
+        if together[best] >= 0.5 * length.sum():
+            return ways[best], np.asarray(near[best])
+    return np.zeros(3), np.ones(len(length), dtype=bool)
 
 
 def has_lone_end(gripper: Gripper) -> bool:

@@ -1,0 +1,57 @@
+"""Which account of how fingers move is taken, and which of their edges the motion places."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gripmon.teach.finger_depth import Outline
+from gripmon.teach.image_motion import Unfit
+from gripmon.teach.jaw_fit import _best_of, _Solved
+from gripmon.teach.jaw_unknowns import _shown
+
+NONE = np.zeros(0)
+
+
+class Fit:
+    """Explains the outlines to a chi-squared, with a share of them that agrees."""
+
+    def __init__(self, chi2: float, agreeing: float):
+        self.chi2, self.agreeing = chi2, agreeing
+
+    def solve(self, common: Any) -> _Solved:
+        if not np.isfinite(self.chi2):
+            raise Unfit("a finger isn't found", 0.03)
+        return _Solved(NONE, NONE, NONE, self.chi2, self.agreeing, common, NONE > 0)
+
+
+@pytest.mark.parametrize(
+    ("perspective", "motion", "taken", "agreeing"),
+    [
+        ((60.0, 0.85), (20.0, 0.95), 0, 0.85),  # not contradicted
+        ((160.0, 0.43), (59.0, 0.86), 1, 0.86),
+        ((19.3, 0.79), (18.3, 0.94), 0, 0.94),  # the outlines themselves are off: no depths explain them better
+        ((np.inf, 0.0), (59.0, 0.86), 1, 0.86),
+        ((160.0, 0.43), (np.inf, 0.0), 0, 0.43),
+    ],
+)
+def test_the_motion_overrules_perspective_where_the_outlines_do(
+    perspective: tuple[float, float], motion: tuple[float, float], taken: int, agreeing: float
+) -> None:
+    fits: list[Any] = [Fit(*perspective), Fit(*motion)]
+    fit, best = _best_of(fits, loose=False)
+    assert fit is fits[taken] and best.agreeing == agreeing
+    with pytest.raises(Unfit, match="isn't found"):
+        _best_of([Fit(np.inf, 0.0)] * 2, loose=False)  # type: ignore[list-item]
+
+
+def test_a_border_behind_which_a_finger_comes_out_isnt_placed_by_its_motion() -> None:
+    """It moves along itself, and ends where it leaves the image; a tip's edge moves along itself as well."""
+    xy = np.array([[-0.4, -0.1], [-0.2, -0.1], [-0.05, 0.3], [0.0, 0.3], [0.0, -0.3]])
+    pieces = ((0, 1), (1, 2), (2, 3), (3, 4))
+    corner, lengths = np.array([False, True, True, True, False]), np.full(4, 100.0)
+    finger = Outline("left", xy, corner, pieces, np.array([0.0, 1.0]), lengths, np.zeros((0, 2, 2)), NONE)
+    assert _shown(finger, np.array([1.0, 0.0])) == pieces[1:]
+    assert _shown(finger, np.array([0.8, 0.6])) == pieces
